@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from meshsplats import ConversionOptions, convert, load_mesh, orbit, psnr, render, save_gaussians, simplify
+from meshsplats.chains import ChainOptions, make_chain
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gltf.document import GltfDocument
@@ -181,8 +183,33 @@ def test_a_chain(splats, tmp_path, capsys):
     assert not list(tmp_path.glob(".chain*"))
 
 
+def test_a_chain_without_the_command_line(tmp_path):
+    cloud, begun = make_scene(400), []
+
+    @contextmanager
+    def began(number, level):
+        begun.append((number, level.splats))
+        yield
+
+    options = ChainOptions(levels=2, width=64, format="npz")
+    table = make_chain(
+        cloud,
+        tmp_path / "chain",
+        options,
+        source="scene",
+        place=lambda mesh: replace(mesh, up=(0, 0, 1)),
+        on_level=began,
+    )
+    assert begun == [(0, 400), (1, 100)]
+    assert json.loads((tmp_path / "chain" / "levels.json").read_text()) == table
+    assert (table["source"], [row["screen_size"] for row in table["levels"]]) == ("scene", [64, 32])
+    assert load_mesh(tmp_path / "chain" / "level_1.npz").up[2] == 1
+    make_chain(cloud, tmp_path / "chain", replace(options, levels=1))  # in place of the older one
+    assert not (tmp_path / "chain" / "level_1.npz").exists()
+
+
 def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
-    import meshsplats.cli.levels as command
+    import meshsplats.chains as command
     from meshsplats.finetuning import Interrupted
 
     out = tmp_path / "chain"

@@ -17,10 +17,10 @@ import pytest
 from _photographs import write_photographs
 
 import meshsplats
+from meshsplats import _toml as toml
 from meshsplats import cli, demo_scene
 from meshsplats._core import library
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import toml
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.rendering import render_splats
@@ -90,7 +90,8 @@ def test_every_module_imports():
 
 
 def test_package_holds_its_core_its_kernels_and_its_type_marker():
-    for name in ("common", "lists", "raster", "image", "tape", "gradients", "filter", "training"):
+    kernels = ("common", "lists", "sorting", "raster", "triangles", "image", "tape", "gradients", "filter")
+    for name in (*kernels, "training"):
         assert (Path(meshsplats.__file__).parent / "webgpu" / f"{name}.wgsl").is_file()
     assert library.library_path("baseline") is not None
     assert (Path(meshsplats.__file__).parent / "py.typed").is_file()

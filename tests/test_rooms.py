@@ -12,7 +12,7 @@ ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 12
 LOWEST = (
     *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options", "_origin"),
-    *("colors", "errors", "face_splats", "spherical_harmonics"),
+    *("_toml", "colors", "errors", "face_splats", "spherical_harmonics"),
 )
 """Rooms that import no other room."""
 FLOORS = (
@@ -20,11 +20,11 @@ FLOORS = (
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),
-    ("conversion", "datasets", "viewer"),
+    ("conversion", "datasets"),
     ("evaluation",),
-    ("finetuning",),
+    ("finetuning", "viewer"),
     ("levels", "prior", "tiles", "training"),
-    ("blender",),
+    ("blender", "chains", "frames", "inspection", "installation", "jobs"),
     ("cli",),
     ("__main__",),
 )

@@ -7,6 +7,10 @@ class FileFormatError(ValueError):
     """A file that cannot be read: broken, truncated, hostile or of another format."""
 
 
+class OverwritingError(ValueError):
+    """An output would replace a file that is read, or another output."""
+
+
 class MissingDependencyError(ImportError):
     """An optional library is missing; the message says how to install it."""
 

@@ -11,10 +11,10 @@ from _blender_scenes import ball_splats
 from meshsplats import GaussianCloud, convert, orbit, render
 from meshsplats._geometry import vertex_normals
 from meshsplats.blender.linear import linear_colors
-from meshsplats.blender.normals import shading_normals
 from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
 from meshsplats.blender.subject import ground_height
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.conversion.normals import shading_normals
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.prior.surface import Grid
 

@@ -14,15 +14,16 @@ import numpy as np
 import pytest
 from _splats import few_splats
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
-from meshsplats.cli.batch import jobs
+from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.formats.splat_paths import subject_name
+from meshsplats.jobs import jobs
 
 
 def run(*arguments) -> int:

@@ -9,9 +9,10 @@ import pytest
 from _splats import few_splats
 from PIL import Image
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians

@@ -14,17 +14,19 @@ from conftest import make_link, words_of
 from PIL import Image
 
 import meshsplats
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import common, main, toml
+from meshsplats.cli import main
 from meshsplats.conversion import convert, simplify
 from meshsplats.evaluation.comparison import compare
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import render
+from meshsplats.rendering import previews, render
 from meshsplats.rendering.looks import draw_splats
 from meshsplats.rendering.samples import needed_samples
 
@@ -320,8 +322,8 @@ def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):
     camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
     assert needed_samples(mesh, [camera.scaled(0.5)]) >= 2
     for most, side in ((len(mesh.faces), 800), (len(mesh.faces) - 1, 400)):
-        monkeypatch.setattr(common, "PREVIEW_TRIANGLES", most)
-        common.draw_preview(mesh, tmp_path / "a.png")
+        monkeypatch.setattr(previews, "TRIANGLES", most)
+        assert previews.save_preview(mesh, tmp_path / "a.png")
         with Image.open(tmp_path / "a.png") as image:
             pixels = np.asarray(image) / 255
         assert pixels.shape == (side, side, 3)
@@ -390,8 +392,8 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
 
 def test_other_commands_choose_alpha_too(tmp_path):
     mesh = convert(nested_balls(0.95))
-    assert common.alpha_for_viewers(mesh, tmp_path / "a.npz") == {}
-    options = common.alpha_for_viewers(mesh, tmp_path / "a.GLB")
+    assert alpha_for_viewers(mesh, tmp_path / "a.npz") == {}
+    options = alpha_for_viewers(mesh, tmp_path / "a.GLB")
     assert options["alpha"] == "mask"
     save_mesh(mesh, tmp_path / "m.npz")
     assert main(["clean", str(tmp_path / "m.npz"), "-o", str(tmp_path / "c.glb")]) == 0

@@ -16,10 +16,11 @@ import pytest
 from _photographs import write_photographs
 from conftest import words_of
 
+from meshsplats import _toml as toml
 from meshsplats._files.locks import locked
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.conversion import convert
@@ -466,15 +467,15 @@ def test_dense_clouds_begin_as_their_conversion(splats, tmp_path, capsys):
 def test_a_timed_run_is_resumed_with_the_mesh_that_it_began_with(splats, tmp_path, capsys, monkeypatch):
     """Though the machine is as fast as a hundred by then."""
     slow, fast = Pace(1e-4, 1e-5, 1e-9), Pace(1e-6, 1e-9, 1e-9)
-    monkeypatch.setattr("meshsplats.cli.finetune.TIMED_SPLATS", 1)
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.TIMED_SPLATS", 1)
     monkeypatch.setattr("meshsplats.finetuning.pace.FEWEST_SPLATS", 50)
     monkeypatch.setattr("meshsplats.finetuning.pace.FEWEST_STEPS", 1000)
-    monkeypatch.setattr("meshsplats.cli.finetune.measure_pace", lambda *_, **__: slow)
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.measure_pace", lambda *_, **__: slow)
     words = (splats, "-o", tmp_path / "t.glb", *SMALL, "--opacity", "cutoff", "--json", "--force")
     assert run(*words, "--minutes", "0.03") == 0
     record = json.loads((tmp_path / "t.glb.run" / "start.json").read_text())
     assert 50 <= record["max_splats"] < 300
-    monkeypatch.setattr("meshsplats.cli.finetune.measure_pace", lambda *_, **__: fast)
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.measure_pace", lambda *_, **__: fast)
     capsys.readouterr()
     assert run(*words, "--minutes", "0.05", "--resume") == 0
     assert json.loads((tmp_path / "t.glb.run" / "start.json").read_text()) == record
@@ -503,7 +504,7 @@ def test_meshes_stand_as_asked_however_they_came_about(tmp_path):
 
 @pytest.mark.parametrize("option", ["colors", "detail", "footprint"])
 def test_conversion_options_that_need_cameras(splats, tmp_path, option, monkeypatch):
-    monkeypatch.setattr("meshsplats.cli.finetune.TIMED_SPLATS", 1)
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.TIMED_SPLATS", 1)
     words = (splats, "-o", tmp_path / "t.npz", *SMALL, "--set", f"{option}=cameras", "--force")
     assert run(*words, "--steps", "3") == 0
     assert run(*words, "--minutes", "0.02") == 0
@@ -523,8 +524,9 @@ def test_a_refused_resumption_changes_nothing(splats, tmp_path, capsys):
 
 
 def test_a_run_without_time_for_steps_is_not_begun(splats, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("meshsplats.cli.finetune.TIMED_SPLATS", 1)
-    monkeypatch.setattr("meshsplats.cli.finetune.measure_pace", lambda *_, **__: Pace(100.0, 1.0, 1.0))
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.TIMED_SPLATS", 1)
+    late = Pace(100.0, 1.0, 1.0)
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.measure_pace", lambda *_, **__: late)
     assert run(splats, "-o", tmp_path / "t.npz", *SMALL, "--minutes", "0.02") == 0
     printed = capsys.readouterr().out
     assert "0 steps in" in printed

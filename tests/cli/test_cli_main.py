@@ -286,10 +286,10 @@ def test_doctor(capsys, monkeypatch):
     assert "in use" in out
     assert f"gpu: {found['gpu']['adapter'] or found['gpu']['problem']}" in out
 
-    from meshsplats.cli import doctor
+    from meshsplats import installation
 
-    monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["no-such-thing>=1; extra == 'blender'"])
-    monkeypatch.setattr(doctor, "_draws", lambda *_: False)
+    monkeypatch.setattr(installation.metadata, "requires", lambda _: ["no-such-thing>=1; extra == 'blender'"])
+    monkeypatch.setattr(installation, "_draws", lambda *_: False)
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
     assert f"pip install {messages.quoted('no-such-thing>=1')}" in out

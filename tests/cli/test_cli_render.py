@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import look_at, orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud

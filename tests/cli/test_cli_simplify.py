@@ -9,8 +9,9 @@ import pytest
 from _splats import few_splats
 from conftest import shared_data
 
+from meshsplats import _toml as toml
 from meshsplats import load_gaussians, orbit, save_cameras, save_gaussians, simplify
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 
 
 @pytest.fixture

@@ -14,13 +14,15 @@ import urllib.request
 import numpy as np
 import pytest
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml, view
+from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
+from meshsplats.viewer import content
 from meshsplats.viewer.unpacking import unpack_mesh
 
 
@@ -102,7 +104,7 @@ def test_a_crop_leaves_less(folder, tmp_path, capsys):
 
 
 def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(view, "TRIANGLES", 800)
+    monkeypatch.setattr(content, "TRIANGLES", 800)
     page = tmp_path / "page.html"
     assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
     out, err = capsys.readouterr()
@@ -124,7 +126,7 @@ def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, ca
 
 
 def test_large_meshes_get_a_coarse_level_of_their_splats(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(view, "COARSE_TRIANGLES", 400)
+    monkeypatch.setattr(content, "COARSE_TRIANGLES", 400)
     page = tmp_path / "page.html"
 
     def made(name: str, *words: str) -> tuple[dict, str]:
@@ -167,7 +169,7 @@ def test_the_size_is_said_before_anything_is_packed(folder, tmp_path, monkeypatc
 
 
 def test_a_page_has_a_limit(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(view, "MOST_TRIANGLES", 1000)
+    monkeypatch.setattr(content, "MOST_TRIANGLES", 1000)
     for name, words in ("scene.ply", ["--whole"]), ("mesh.npz", []):
         assert main(["view", str(folder / name), "-o", str(tmp_path / "p.html"), *words]) == 2
         error = capsys.readouterr().err
@@ -246,13 +248,12 @@ def test_the_address_is_printed_and_answers_until_ctrl_c(folder):
 def test_a_machine_without_a_window_gets_the_address(folder, monkeypatch, capsys):
     import webbrowser
 
-    from meshsplats.cli import view
     from meshsplats.viewer import server
 
     asked: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda url: asked.append(url) or True)
     monkeypatch.setattr(server.PageServer, "serve_forever", lambda self: None)
-    monkeypatch.setattr(view.sys, "platform", "linux")
+    monkeypatch.setattr(server.sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert main(["view", str(folder / "mesh.npz")]) == 0

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from _photographs import write_photographs
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from _splats import few_splats
 
+from meshsplats import _toml as toml
 from meshsplats._files import atomic
 from meshsplats._files.atomic import (
     atomic_path,
@@ -31,7 +32,7 @@ from meshsplats._files.atomic import (
     write_bytes,
 )
 from meshsplats._files.locks import lock_of, locked
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
@@ -250,9 +251,11 @@ sys.exit(meshsplats.cli.main(sys.argv[1:]))
 """
 
 
-def killed_in_the_preview(folder: Path, *arguments: str, function: str = "draw_preview") -> None:
+def killed_in_the_preview(
+    folder: Path, *arguments: str, function: str = "draw_preview", module: str | None = None
+) -> None:
     """Runs a command there that is killed when its result is written and its preview is not."""
-    code = _HANGING_PREVIEW.format(arguments[0], function)
+    code = _HANGING_PREVIEW.format(module or arguments[0], function)
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments], cwd=folder, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -281,7 +284,7 @@ def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, opti
 @posix
 def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, monkeypatch):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    killed_in_the_preview(tmp_path, "clean", "scene.ply", "-o", "out.ply", function="_draw")
+    killed_in_the_preview(tmp_path, "clean", "scene.ply", "-o", "out.ply", function="save_strip")
     killed_in_the_preview(tmp_path, "simplify", "scene.ply", "-o", "out.ply", "--share", "0.5")
     assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == ["scene.ply"]
     monkeypatch.setattr(atomic, "_swept", set())
@@ -305,6 +308,19 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys):
         process.kill()
     assert main(arguments) == 0
     assert not _temporaries(tmp_path)
+
+
+@posix
+def test_a_run_that_is_killed_in_its_preview_is_resumed_whole(tmp_path):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    options = ["--steps", "2", "--views", "2", "--held-out", "1", "--width", "16"]
+    words = ["finetune", "scene.ply", "-o", "tuned.npz", *options]
+    killed_in_the_preview(tmp_path, *words, module="training")
+    assert [name for name in os.listdir(tmp_path) if name.startswith("tuned")] == ["tuned.npz.run"]
+    words[1], words[3] = str(tmp_path / "scene.ply"), str(tmp_path / "tuned.npz")
+    assert main([*words, "--resume"]) == 0
+    made = {"tuned.npz", "tuned.npz.config.toml", "tuned.npz.preview.png", "tuned.npz.run"}
+    assert {name for name in os.listdir(tmp_path) if name.startswith("tuned")} == made
 
 
 def test_files_that_belong_together_appear_together(tmp_path):

@@ -18,7 +18,7 @@ from _splat_files import random_splats
 
 import meshsplats as ms
 from meshsplats.cli import main
-from meshsplats.cli.batch import sources
+from meshsplats.jobs import sources
 from meshsplats.errors import FileFormatError
 from meshsplats.formats import _zipped, splat_formats
 from meshsplats.formats.content import Content

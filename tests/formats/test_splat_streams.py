@@ -31,7 +31,6 @@ from meshsplats import (
     save_gaussians,
     stream_gaussians,
 )
-from meshsplats.cli.batch import sources
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.benchmarks import find_input
@@ -43,6 +42,7 @@ from meshsplats.formats.splats import _spz_streams
 from meshsplats.formats.splats import dot_splat as dot_splat_module
 from meshsplats.formats.splats import sog as sog_module
 from meshsplats.formats.splats import spz as spz_module
+from meshsplats.jobs import sources
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 VALUES = random_splats(n=600, degree=1)

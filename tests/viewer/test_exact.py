@@ -131,7 +131,7 @@ def test_the_page_writes_the_uniform_of_the_python_host(browser, cameras):
     }
     arguments = (pinhole, counts, 4000, [180, 190, 250], 0.7, 60000)
     page = browser.page("about:blank#uniform", WIDTH, HEIGHT)
-    source = re.sub(r"^export |^import .*$", "", _read("exact.js"), flags=re.MULTILINE)
+    source = re.sub(r"^export |^import .*$", "", _read("arrays.js"), flags=re.MULTILINE)
     written = page.run(f"{source}; [...new Uint32Array(frameUniform(...{json.dumps(arguments)}).buffer)]")
     page.close()
     settings = DrawSettings(filter_px2=0.7, budget=60000)

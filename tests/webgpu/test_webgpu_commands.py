@@ -14,8 +14,8 @@ import meshsplats
 from meshsplats import render, save_mesh
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import main
-from meshsplats.cli.records import CAMERAS, beside
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats.outputs import CAMERAS, beside
 from meshsplats.images.reading import load_image
 
 

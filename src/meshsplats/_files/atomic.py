@@ -31,6 +31,18 @@ _waiting: list[_Finished] | None = None
 """Finished files that wait for others; see ``together``."""
 
 
+def replace_folder(finished: Path, target: Path) -> None:
+    """Renames the folder ``finished`` to ``target``, in place of an older one."""
+    if not target.exists():
+        os.rename(finished, target)
+        return
+    old = target.with_name(f".{target.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    os.rename(target, old)
+    os.rename(finished, target)
+    shutil.rmtree(old)
+
+
 @contextmanager
 def atomic_path(
     path: str | os.PathLike[str],

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats.blender.normals import views_around
 from meshsplats.camera import Camera
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
+from meshsplats.conversion.normals import views_around
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render

@@ -16,9 +16,9 @@ import numpy as np
 
 from meshsplats._cells import Cells
 from meshsplats._geometry import vertex_normals
-from meshsplats.blender.normals import typical_spacing, unit, views_around
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
+from meshsplats.conversion.normals import typical_spacing, unit, views_around
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.surface import MIN_PART, Grid, grid_around, signed_distances
 

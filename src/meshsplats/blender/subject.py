@@ -10,10 +10,10 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
-from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
+from meshsplats.conversion.normals import shading_normals, typical_spacing
 from meshsplats.mesh import SplatMesh
 
 _FLOOR = 0.002

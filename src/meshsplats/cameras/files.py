@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from meshsplats._json import read_json
 from meshsplats._kinds import need_all, need_path
 from meshsplats.camera import Camera
 from meshsplats.cameras.camera_path import cameras_of_path, is_camera_path
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 
 MAX_CAMERAS = 20_000
 
@@ -66,6 +67,18 @@ def load_cameras(
         )
     found = [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
     return [camera.relative_to(point) for camera in found]
+
+
+def cameras_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
+    """The training cameras in a model folder ``source``, relative to ``origin``; None where there are none. A
+    DataWarning says where they cannot be read."""
+    if not (source / "cameras.json").is_file():
+        return None
+    try:
+        return load_cameras(source, origin=origin)
+    except FileFormatError as error:
+        warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
+        return None
 
 
 def _file_in(folder: Path) -> Path:

@@ -175,6 +175,14 @@ def warn_of_strays(scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.n
     )
 
 
+def warn_of_strays_in(scene: GaussianCloud | SplatMesh) -> None:
+    """``warn_of_strays`` of a whole scene."""
+    points = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
+    if len(points):
+        size = float(scene.scales.max()) if isinstance(scene, GaussianCloud) else 0.0
+        warn_of_strays(scene, points.min(axis=0), points.max(axis=0), size)
+
+
 def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np.ndarray:
     """(k,) bool: points that are not in floaters, separate parts of little weight.
 

@@ -13,8 +13,8 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import tyro
 
+from meshsplats import _toml as toml
 from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
-from meshsplats.cli import toml
 from meshsplats.cli.messages import OK, UsageError, flag, say
 from meshsplats.cli.values import converted, from_text, short
 
@@ -300,7 +300,10 @@ def _with_flags(text: str, options: Collection[str]) -> str:
 
 def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """The options in ``file``, and the values that it says they lead to."""
-    record = toml.load(file)
+    try:
+        record = toml.load(file)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
     _refuse_unknown(record, TABLES, f"{file}: no such table or key")
     if record.get("command", name) != name:
         raise UsageError(f"{file}: of the command {short(record['command'])}, not {name}")

@@ -15,14 +15,12 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     ViewOptions,
-    alpha_for_viewers,
     check_mesh_suffix,
-    check_outputs,
-    placed,
     plural,
-    say_origin,
     size_of,
+    written,
 )
+from meshsplats.formats.outputs import check_outputs
 
 
 @dataclass(frozen=True)
@@ -55,6 +53,7 @@ class Bake(Command):
     def execute(self) -> None:
         from meshsplats.conversion import bake_filter
         from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
+        from meshsplats.evaluation.viewers import alpha_for_viewers
         from meshsplats.formats.meshes import load_mesh, save_mesh
 
         start = time.perf_counter()
@@ -69,8 +68,7 @@ class Bake(Command):
             )
         cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
         baked = bake_filter(mesh, cameras, filter_px2=px2)
-        say_origin(baked.origin, self.origin)
-        save_mesh(placed(baked, self.origin), self.output, **alpha_for_viewers(baked, self.output))
+        save_mesh(written(baked, self.origin), self.output, **alpha_for_viewers(baked, self.output))
         seconds = time.perf_counter() - start
         if self.json:
             result = {

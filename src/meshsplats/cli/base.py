@@ -17,13 +17,12 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     check_mesh_suffix,
-    check_outputs,
     load_scene,
-    placed,
-    say_origin,
     size_of,
+    written,
 )
 from meshsplats.cli.messages import UsageError, command_line
+from meshsplats.formats.outputs import check_outputs
 from meshsplats.mesh import SplatMesh
 
 
@@ -75,8 +74,7 @@ class Base(Command):
         )
         assert base.colors is not None
         mesh = SplatMesh(base.vertices, base.faces, base.colors, up=base.up, origin=base.origin)
-        say_origin(mesh.origin, self.origin)
-        save_mesh(placed(mesh, self.origin), self.output)
+        save_mesh(written(mesh, self.origin), self.output)
         seconds = time.perf_counter() - start
         if self.json:
             result = {"mesh": str(self.output), "triangles": len(base.faces), "seconds": round(seconds, 2)}

@@ -26,7 +26,6 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     ViewOptions,
-    check_outputs,
     load_scene,
     open_tileset,
     parse_color,
@@ -35,7 +34,8 @@ from meshsplats.cli.common import (
     view_names,
 )
 from meshsplats.cli.messages import UsageError, say
-from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, write_configuration
+from meshsplats.cli.records import write_configuration
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 

@@ -5,36 +5,29 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
-from meshsplats.camera import Camera
-from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Count,
     Origin,
     Output,
     SplatOptions,
-    alpha_for_viewers,
     check_mesh_suffix,
-    check_outputs,
     load_scene,
-    placed,
-    say_origin,
     size_of,
+    written,
 )
 from meshsplats.cli.messages import UsageError, shown_path
-from meshsplats.cli.records import PREVIEW, beside
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove
+from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove, save_strip
 from meshsplats.errors import StraysWarning
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 _RULES = {
@@ -46,7 +39,6 @@ _RULES = {
     "min_part": "in parts below {:.1%} of all opacity",
 }
 """Names of the rules in the table."""
-_SIDE = 480
 
 
 if TYPE_CHECKING:
@@ -86,6 +78,7 @@ class Clean(Command):
     """Overwrite existing outputs."""
 
     def execute(self) -> None:
+        from meshsplats.evaluation.viewers import alpha_for_viewers
         from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.formats.meshes import save_mesh
 
@@ -104,18 +97,16 @@ class Clean(Command):
         found = find(scene, rules)
         left = remove(scene, found)
         alpha = {}
-        written = placed(left, self.origin)
-        if not self.preview_only:
-            say_origin(left.origin, self.origin, splats=isinstance(left, GaussianCloud))
+        result = left if self.preview_only else written(left, self.origin)
         if isinstance(left, SplatMesh) and not self.preview_only:
             alpha = alpha_for_viewers(left, self.output, self.threads)
         with together():
             if not self.preview_only:
-                if isinstance(written, SplatMesh):
-                    save_mesh(written, self.output, **alpha)
+                if isinstance(result, SplatMesh):
+                    save_mesh(result, self.output, **alpha)
                 else:
-                    save_gaussians(written, self.output)
-            _draw(scene, left, found, preview, self.threads)
+                    save_gaussians(result, self.output)
+            save_strip(scene, left, found, preview, self.threads)
         self._print_result(rules, found, left, preview, time.perf_counter() - start)
 
     def _print_result(
@@ -158,44 +149,3 @@ class Clean(Command):
         if not self.preview_only:
             print(f"{self.output} ({size_of(self.output)})")
         print(f"preview, before | removed, in red | after: {preview}")
-
-
-def _draw(
-    scene: GaussianCloud | SplatMesh,
-    left: GaussianCloud | SplatMesh,
-    found: Findings,
-    path: Path,
-    threads: int | None,
-) -> None:
-    """Saves the strip of three images: two that show the whole, one that shows the rest."""
-    from meshsplats.images.writing import save_image, strip
-
-    lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
-    whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
-    shown = ((scene, whole), (_marked(scene, found), whole), (left, rest))
-    images = [_image(part, camera, threads) for part, camera in shown]
-    save_image(path, strip(images, ("before", "removed", "after")))
-
-
-def _image(scene: GaussianCloud | SplatMesh, camera: Camera, threads: int | None) -> np.ndarray:
-    from meshsplats.rendering import render_splats
-    from meshsplats.rendering.looks import image_of
-
-    white: Sequence[float] = (1.0, 1.0, 1.0)
-    if isinstance(scene, SplatMesh):
-        return np.clip(image_of(scene, camera, white, samples=2, threads=threads)[0], 0, 1)
-    return np.clip(render_splats(scene, camera, background=white, threads=threads).color, 0, 1)
-
-
-def _marked(scene: GaussianCloud | SplatMesh, found: Findings) -> GaussianCloud | SplatMesh:
-    """The scene with the removed splats in red, the rest in dull colours."""
-    red = np.array([0.95, 0.05, 0.05], np.float32)
-    if isinstance(scene, GaussianCloud):
-        plain = scene.sh[:, :1] * np.float32(0.4)
-        plain[~found.kept] = ((red - 0.5) / SH_C0)[None, None]
-        return replace(scene, sh=plain)
-    colors = scene.colors.copy()
-    colors[:, :3] = 0.5 + 0.4 * (colors[:, :3] - 0.5)
-    gone = scene.faces[~found.kept[found.owner]]
-    colors[gone.ravel(), :3] = red
-    return replace(scene, colors=colors)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import math
-import os
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,19 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
-from meshsplats._arrays import subsample
-from meshsplats._core.library import processors
 from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats.camera import MAX_SIDE, Camera
-from meshsplats.cameras.files import load_cameras
-from meshsplats.cameras.framing import guess_up, warn_of_strays
+from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cameras.framing import guess_up, warn_of_strays_in
 from meshsplats.cameras.trajectories import dome, look_around, orbit
 from meshsplats.cli.arguments import spelled
 from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
-from meshsplats.datasets.views import WHITE, Dataset
-from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.evaluation.backgrounds import Background
+from meshsplats.datasets.views import Dataset
+from meshsplats.errors import FileFormatError
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import listed, y_up_suffixes
 from meshsplats.gaussians import GaussianCloud
@@ -96,29 +91,18 @@ class SplatOptions:
     strict: tyro.conf.Fixed[bool] = False
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
-    def load(
-        self,
-        path: Path,
-        origin: np.ndarray | None = None,
-        *,
-        up: str | None = None,
-        quiet: bool = False,
-    ) -> GaussianCloud:
-        """The splats of a file, relative to ``origin``. Says what its header names, unless ``quiet``; ``up``:
-        the option that counts in its place."""
+    def load(self, path: Path, origin: np.ndarray | None = None, *, up: str | None = None) -> GaussianCloud:
+        """The splats of a file, relative to ``origin``. Says what its header names; ``up``: the option that
+        counts in its place."""
         from meshsplats.formats.gaussians import load_gaussians
 
         try:
-            cloud = load_gaussians(path, origin=origin, **self._arguments)
+            cloud = load_gaussians(path, origin=origin, **self.arguments)
         except FileFormatError:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
-        if len(cloud):
-            size = float(cloud.scales.max())
-            warn_of_strays(cloud, cloud.means.min(axis=0), cloud.means.max(axis=0), size)
-        if quiet:
-            return cloud
+        warn_of_strays_in(cloud)
         if up is None and cloud.up is not None:
             say(f"up: {direction_in_words(cloud.up)}, from the file's header")
         if self.kernel == "auto" and cloud.kernel != "3dgs":
@@ -131,7 +115,7 @@ class SplatOptions:
         """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
         from meshsplats.formats.streaming import stream_gaussians
 
-        stream = stream_gaussians(path, origin=origin, **self._arguments)
+        stream = stream_gaussians(path, origin=origin, **self.arguments)
         if up is None and (told := stream.up) is not None:
             say(f"up: {direction_in_words(told)}, from the files' headers")
         return stream
@@ -148,7 +132,8 @@ class SplatOptions:
         return {f.name for f in fields(self) if getattr(self, f.name) != f.default}
 
     @property
-    def _arguments(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
+        """Those of ``load_gaussians``."""
         return {
             "strict": self.strict,
             "axes": self.axes,
@@ -389,6 +374,12 @@ def placed(scene: Scene, origin: Origin) -> Scene:
     return replace(scene, origin=np.zeros(3))
 
 
+def written(scene: Scene, origin: Origin) -> Scene:
+    """``placed``; also says where the file will stand in the world."""
+    say_origin(scene.origin, origin, splats=isinstance(scene, GaussianCloud))
+    return placed(scene, origin)
+
+
 def say_origin(found: np.ndarray, origin: Origin, *, splats: bool = False) -> None:
     """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
     ``splats`` does not tell other programs."""
@@ -412,44 +403,8 @@ def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> G
     from meshsplats.formats.meshes import load_mesh
 
     mesh = load_mesh(path)
-    if len(mesh.vertices):
-        warn_of_strays(mesh, mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), 0.0)
+    warn_of_strays_in(mesh)
     return mesh
-
-
-def cameras_beside(source: Path, origin: np.ndarray) -> list[Camera] | None:
-    """The training cameras in a model folder, relative to ``origin``, or None."""
-    if not (source / "cameras.json").is_file():
-        return None
-    try:
-        return load_cameras(source, origin=origin)
-    except FileFormatError as error:
-        warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
-        return None
-
-
-def chosen_background(
-    color: str | None,
-    photographs: Dataset | None,
-    scenes: Mapping[str, GaussianCloud | SplatMesh],
-    source: Path | None,
-    threads: int | None,
-    *,
-    whole: bool = True,
-) -> Background:
-    """The background of images of ``scenes``: ``color``; else white, or beside ``photographs`` the one that
-    the model folder ``source`` names or that fits the scenes best. Warns where scenes and photographs
-    disagree, as they must for scenes that are not ``whole``."""
-    from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_other_worlds
-
-    rgb = None if color is None else parse_color(color)
-    if photographs is None:
-        return Background(rgb or WHITE, "usual" if rgb is None else "given")
-    named = None if source is None else model_background(source)
-    found = find_background(photographs, scenes, given=rgb, named=named, threads=threads)
-    if whole:
-        warn_of_other_worlds(found)
-    return found
 
 
 def parse_up(text: str) -> np.ndarray:
@@ -488,6 +443,11 @@ def parse_color(text: str) -> tuple[float, float, float]:
     return numbers
 
 
+def optional_color(text: str | None) -> tuple[float, float, float] | None:
+    """``parse_color`` of an option that may not be given."""
+    return None if text is None else parse_color(text)
+
+
 def _numbers(text: str) -> tuple[float, float, float] | None:
     try:
         x, y, z = (float(part) for part in text.split(","))
@@ -502,44 +462,6 @@ def check_mesh_suffix(path: Path) -> None:
 
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
-
-
-def check_outputs(
-    paths: Sequence[Path], force: bool, folder: Path | None = None, *, inputs: Sequence[Path] = ()
-) -> None:
-    """Checks outputs before the work. ``folder`` holds all of them and is made later, but not the one above
-    it: a misspelt path must not make a tree of folders.
-
-    Raises:
-        OSError: an output exists already (unless ``force``) or cannot be written.
-        UsageError: an output is one of ``inputs``, with ``force``, too.
-    """
-    from meshsplats._files.atomic import refuse_existing
-
-    read = [file_of(source) for source in inputs if source.exists()]
-    for path in paths:
-        if path.exists() and any(path.samefile(source) for source in read):
-            raise UsageError(f"{path} is read by this command: give another name for the output")
-    refuse_existing(paths, force)
-    if folder is not None and folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, "must be a folder, this is a file", str(folder))
-    exists = folder is not None and folder.exists()
-    places = {folder} if exists else {(folder or path).absolute().parent for path in paths}
-    for above in filter(None, places):
-        if not above.is_dir():
-            raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
-        if not os.access(above, os.W_OK):
-            raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
-
-
-def file_of(source: Path) -> Path:
-    """The file that is read where ``source`` is a folder."""
-    from meshsplats.formats.splat_paths import splat_file
-
-    try:
-        return splat_file(source) if source.is_dir() else source
-    except FileFormatError:
-        return source
 
 
 @contextmanager
@@ -574,40 +496,14 @@ def plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
-PREVIEW_TRIANGLES = 1_000_000
-"""Triangles of a mesh above which its preview is half as wide, with the fewest samples. Of 2 to 17 million
-triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."""
-PREVIEW_FRAGMENTS = 1e9
-"""Fragments above which a preview is made smaller, or not at all: some 10 s of one processor. Of real scenes,
-previews have 1e7 to 4e8."""
-
-
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None) -> None:
-    """Saves an image of ``scene`` from ``camera``; by default from the front and a little to the side."""
-    from meshsplats.images.writing import save_image
-    from meshsplats.rendering import render_splats
-    from meshsplats.rendering.layers import affordable, layers
-    from meshsplats.rendering.looks import image_of
-    from meshsplats.rendering.samples import FEWEST, needed_samples
+    """Saves a preview, or says why there is none."""
+    from meshsplats.rendering.layers import layers
+    from meshsplats.rendering.previews import preview_camera, save_preview
 
-    if camera is None:  # more of the shape than from the front
-        camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]
-    if isinstance(scene, SplatMesh):
-        if len(scene.faces) <= PREVIEW_TRIANGLES:
-            samples = needed_samples(scene, [camera])
-        else:
-            camera, samples = camera.scaled(0.5), 1 if scene.filter_px2 else FEWEST
-    else:
-        samples = 1
-    small = affordable(scene, camera, samples, PREVIEW_FRAGMENTS)
-    if small is None:
-        count = layers(scene, camera)
+    if not save_preview(scene, path, camera):
+        count = layers(scene, camera or preview_camera(scene))
         say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
-        return
-    if isinstance(scene, SplatMesh):
-        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples)[0])
-    else:
-        save_image(path, render_splats(scene, small).color)
 
 
 LONG_SECONDS = 10
@@ -618,30 +514,15 @@ def announce_cost(
     scene: SplatMesh | GaussianCloud, cameras: Sequence[Camera], samples: int, threads: int | None
 ) -> None:
     """Says before the work how long images may take, where layers upon layers make it long."""
-    from meshsplats.rendering.layers import FRAGMENTS_A_SECOND, fragments, layers
+    from meshsplats.rendering.layers import MANY_LAYERS, estimated_seconds, layers
 
-    some = subsample(cameras, 8)
-    count = layers(scene, some[0])
-    if count <= MANY_LAYERS:
-        return
-    each = float(np.mean([fragments(scene, camera, samples) for camera in some]))
-    seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or processors())
-    if seconds > LONG_SECONDS:
+    count = layers(scene, cameras[0])
+    if (
+        count > MANY_LAYERS
+        and (seconds := estimated_seconds(scene, cameras, samples, threads)) > LONG_SECONDS
+    ):
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
-
-
-MANY_LAYERS = 1000
-"""More layers than real scenes have: 4 to 70 of triangles, up to 230 of splats."""
-
-
-def alpha_for_viewers(mesh: SplatMesh, path: Path, threads: int | None = None) -> dict[str, Any]:
-    """Arguments of ``save_mesh`` for the alpha mode that suits viewers that do not sort, where ``path`` is a
-    file for them."""
-    from meshsplats.evaluation.viewers import choose_alpha
-
-    glb = path.suffix.lower() == ".glb" and len(mesh.faces)
-    return choose_alpha(mesh, threads=threads).options if glb else {}
 
 
 def alpha_record(choice: AlphaChoice | None) -> dict[str, Any] | None:

@@ -19,15 +19,16 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     ViewOptions,
-    check_outputs,
-    chosen_background,
+    optional_color,
     parse_color,
     track,
     view_names,
 )
-from meshsplats.cli.records import CAMERAS, CONFIGURATION, write_configuration, write_json
+from meshsplats.cli.records import write_configuration, write_json
 from meshsplats.errors import FileFormatError
+from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.evaluation.comparison import Comparison, compare_views
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, check_outputs
 from meshsplats.formats.sniff import identify
 from meshsplats.rendering.looks import comparison_in_words, mesh_samples
 
@@ -96,8 +97,12 @@ class Compare(Command):
                 raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
             mesh = self.part.of(load_mesh(self.mesh, origin=cloud.origin))
         start = time.perf_counter()
-        background = chosen_background(
-            self.draw.background, photographs, {"splats": cloud}, self.splats, self.draw.threads
+        background = choose_background(
+            optional_color(self.draw.background),
+            photographs,
+            {"splats": cloud},
+            self.splats,
+            self.draw.threads,
         )
         scores = []
         samples = self.draw.samples or mesh_samples(self.look, mesh, cameras)

@@ -15,14 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from meshsplats._arrays import subsample
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import unit_up
-from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
-from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources, without_results
 from meshsplats.cli.common import (
     Count,
     File,
@@ -34,15 +31,15 @@ from meshsplats.cli.common import (
     Text,
     alpha_in_words,
     alpha_record,
-    cameras_beside,
+    check_mesh_suffix,
     draw_preview,
     parse_up,
-    placed,
     plural,
     say_origin,
     size_of,
     track,
     warnings_kept,
+    written,
 )
 from meshsplats.cli.messages import (
     FAILED,
@@ -56,15 +53,18 @@ from meshsplats.cli.messages import (
     say,
     shown_path,
 )
-from meshsplats.cli.records import CONFIGURATION, beside, changes_since, write_configuration
+from meshsplats.cli.records import changes_since, write_configuration
 from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.options import PRESETS
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
+from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
+from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.outputs import CONFIGURATION, beside
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.jobs import Job, is_batch, jobs, sources, without_results
 from meshsplats.mesh import SplatMesh, checked_cutoff
 
 _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
@@ -76,8 +76,6 @@ _FOR_SPLATS = (
 """Options of the command that have one."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
-_GLB_ALPHA = ("mask", "hybrid")
-"""Values of --alpha that only .glb files have."""
 ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 """What meshes for a depth buffer gain in three.js with MSAA: docs/viewers.md."""
 
@@ -185,7 +183,9 @@ class Convert(Command):
         preview = not (self.no_preview or self.stream)
         if formats:
             found = without_results(found, self.input, self.output, formats)
-        todo = jobs(found, self.output, formats, preview=preview, sidecars=not self.no_sidecar)
+        todo = jobs(
+            found, self.output, formats, preview=preview, sidecars=not self.no_sidecar, shown=shown_path
+        )
         cameras = self._cameras()
         if not folder:
             self._print_result(self._convert(todo[0], cameras), todo[0], cameras)
@@ -204,11 +204,11 @@ class Convert(Command):
         """Suffixes to write in a folder; none for a single file."""
         if not folder:
             if not self.as_splats:
-                check_file(self.output)
+                _check_file(self.output)
             elif self.output.suffix.lower() != ".ply":
                 raise UsageError(f"--as-splats writes .ply, got {self.output.name!r}")
             return ()
-        check_folder(self.output)
+        _check_folder(self.output)
         if not self.as_splats:
             return self.formats or ("glb",)
         if self.formats and self.formats != ("ply",):
@@ -231,7 +231,7 @@ class Convert(Command):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
         if self.smooth and not self.lit:
             raise UsageError("--smooth has no effect without --lit")
-        only_glb = self.color_type != "uint16" or self.alpha in _GLB_ALPHA or self.compression != "none"
+        only_glb = self.color_type != "uint16" or self.alpha in GLB_ALPHA or self.compression != "none"
         if not glb and only_glb:
             raise UsageError("--alpha mask or hybrid, --compression and --set color_type are for .glb files")
         if self.cutoff is not None:
@@ -351,29 +351,19 @@ class Convert(Command):
                 f"{job.shown} holds splats: --alpha hybrid is for a mesh with solid triangles, as finetune"
                 " --opacity cutoff --soft-share makes"
             )
-        times = [time.perf_counter()]
+        start = time.perf_counter()
         cloud = self.reading.load(job.source, up=self.up)
         cameras = _seen_from(cameras, job.source, cloud.origin)
-        times.append(time.perf_counter())
+        read = time.perf_counter()
         up = None if self.up is None else parse_up(self.up)
         mesh = convert(cloud, self.conversion, preset=self.preset, cameras=cameras, up=up)
-        mesh = self._with_normals(self._cut(mesh), cameras)
-        times.append(time.perf_counter())
-        choice = self._choice(mesh, job, cameras)
-        times.append(time.perf_counter())
-        self._write(mesh, job, choice)
-        times.append(time.perf_counter())
-        if job.preview:
-            draw_preview(mesh, job.preview)
-        read, made, compared, saved = np.diff(times).round(4).tolist()
+        mesh = self._files.prepared(mesh, cameras)
+        times = {"read": read - start, "convert": time.perf_counter() - read}
         return {
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
             "merged": self._merges(),
-            "triangles": len(mesh.faces),
-            "vertices": len(mesh.vertices),
-            "alpha": alpha_record(choice),
-            "seconds": {"read": read, "convert": made, "choose alpha": compared, "save": saved},
+            **self._finish(mesh, job, cameras, times),
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
 
@@ -446,7 +436,7 @@ class Convert(Command):
         suffix = path.suffix.lower()
         if suffix != ".glb":
             alone = replace(alone, color_type="uint16", compression="none")
-            if self.alpha in _GLB_ALPHA:
+            if self.alpha in GLB_ALPHA:
                 alone = replace(alone, alpha="auto", cutoff=None)
         lit = suffix == ".glb" or suffix.startswith(".usd")
         return alone if lit else replace(alone, lit=False, smooth=False)
@@ -456,46 +446,12 @@ class Convert(Command):
         limits = (self.conversion.max_splats, self.conversion.max_triangles)
         return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
 
-    def _cut(self, mesh: SplatMesh) -> SplatMesh:
-        """``mesh``, or its solid part if that is asked for."""
-        from meshsplats.formats.cutting import CUTOFF, cut_mesh
-
-        if self.alpha != "opaque":
-            return mesh
-        return cut_mesh(mesh, CUTOFF if self.cutoff is None else self.cutoff)
-
-    def _with_normals(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
-        """``mesh`` with smooth normals if they are asked for."""
-        if not self.smooth:
-            return mesh
-        from meshsplats.blender.normals import shading_normals
-
-        return replace(mesh, normals=shading_normals(mesh, cameras))
-
-    def _choice(self, mesh: SplatMesh, job: Job, cameras: Sequence[Camera] = ()) -> AlphaChoice | None:
-        """The alpha mode of the .glb of ``job`` where it is left to the measurement."""
-        glb = any(path.suffix.lower() == ".glb" for path in job.outputs)
-        return choose_alpha(mesh, cameras) if glb and self.alpha == "auto" and len(mesh.faces) else None
-
-    def _write(self, mesh: SplatMesh, job: Job, choice: AlphaChoice | None) -> None:
-        from meshsplats.formats.meshes import save_mesh
-
-        own: dict[str, Any] = {"alpha": self.alpha if self.alpha in _GLB_ALPHA else None}  # or cut already
-        own["cutoff"] = self.cutoff if self.alpha == "mask" else None
-        found, mesh = mesh.origin, placed(mesh, self.origin)
-        say_origin(found, self.origin)
-        with self._recorded(job):
-            for path in job.outputs:
-                glb = path.suffix.lower() == ".glb"
-                alpha = (own if choice is None else choice.options) if glb else {}
-                save_mesh(
-                    mesh,
-                    path,
-                    lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
-                    color_type=self.color_type if glb and self.color_type != "uint16" else None,
-                    compression=self.compression if glb and self.compression != "none" else None,
-                    **alpha,
-                )
+    @property
+    def _files(self) -> MeshFileOptions:
+        """How meshes are saved."""
+        return MeshFileOptions(
+            self.alpha, self.cutoff, self.lit, self.smooth, self.color_type, self.compression
+        )
 
     def _fidelity(
         self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera]
@@ -503,16 +459,32 @@ class Convert(Command):
         """Scores of the mesh against its splats."""
         if self.fidelity is None:
             return None
-        from meshsplats.evaluation.comparison import compare
+        from meshsplats.evaluation.comparison import fidelity
 
         if self.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.conversion.crop)
-        views = [camera.within(400) for camera in subsample(cameras, self.fidelity)] or orbit(
-            mesh, self.fidelity, elevation=15, width=400, height=400
-        )
-        look = self._look
-        mean = compare(cloud, mesh, views, look=look).to_dict()["mean"]
-        return {"views": len(views), "look": look, "psnr": mean["psnr"], "ssim": mean["ssim"]}
+        return fidelity(cloud, mesh, cameras, self.fidelity, self._look)
+
+    def _finish(
+        self, mesh: SplatMesh, job: Job, cameras: Sequence[Camera], times: dict[str, float]
+    ) -> dict[str, Any]:
+        """Writes ``mesh``, which is prepared, and its preview. Its part of the result; ``times``: of what was
+        done before, in seconds."""
+        start = time.perf_counter()
+        choice = self._files.choice(mesh, job.outputs, cameras)
+        chosen = time.perf_counter()
+        placed = written(mesh, self.origin)
+        with self._recorded(job):
+            self._files.save(placed, job.outputs, choice)
+        times |= {"choose alpha": chosen - start, "save": time.perf_counter() - chosen}
+        if job.preview:
+            draw_preview(mesh, job.preview)
+        return {
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "alpha": alpha_record(choice),
+            "seconds": {name: round(value, 4) for name, value in times.items()},
+        }
 
     def _save_again(self, job: Job) -> dict[str, Any]:
         """The mesh of ``job`` in another format."""
@@ -525,26 +497,13 @@ class Convert(Command):
             flags = ", ".join(spelled(type(self), name) for name in idle)
             raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
         self.reading.refuse_for(job.source)
-        times = [time.perf_counter()]
+        start = time.perf_counter()
         mesh = load_mesh(job.source)
         if self.up is not None:
             mesh = replace(mesh, up=unit_up(parse_up(self.up)))
-        mesh = self._with_normals(self._cut(mesh))
-        times.append(time.perf_counter())
-        choice = self._choice(mesh, job)
-        times.append(time.perf_counter())
-        self._write(mesh, job, choice)
-        times.append(time.perf_counter())
-        if job.preview:
-            draw_preview(mesh, job.preview)
-        read, compared, saved = np.diff(times).round(4).tolist()
-        return {
-            "triangles": len(mesh.faces),
-            "vertices": len(mesh.vertices),
-            "alpha": alpha_record(choice),
-            "seconds": {"read": read, "choose alpha": compared, "save": saved},
-            "fidelity": None,
-        }
+        mesh = self._files.prepared(mesh)
+        times = {"read": time.perf_counter() - start}
+        return {**self._finish(mesh, job, (), times), "fidelity": None}
 
     def _save_splats(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The splats themselves, as .ply."""
@@ -563,11 +522,10 @@ class Convert(Command):
         if merging and count is not None:
             seen = _seen_from(cameras, job.source, kept.origin)
             kept = simplify(kept, count, cameras=seen or None)
-        written = placed(kept, self.origin)
-        say_origin(kept.origin, self.origin, splats=True)
+        result = written(kept, self.origin)
         with self._recorded(job):
             for path in job.outputs:
-                save_gaussians(written, path)
+                save_gaussians(result, path)
         seconds = time.perf_counter() - start
         if job.preview:
             draw_preview(kept, job.preview)
@@ -641,6 +599,20 @@ class Convert(Command):
         words += [*self.reading.again(), "-o", self.output.with_suffix(".solid.glb")]
         command = command_line([*words, "--opacity", "cutoff", "--soft-share", "0.05"])
         return f"{command} ({ENGINE_GAIN})"
+
+
+def _check_folder(output: Path) -> None:
+    """UsageError if ``output`` names a mesh file, where a folder for several is wanted."""
+    if output.suffix.lower() in MESH_SUFFIXES and not output.is_dir():
+        raise UsageError(f"several inputs or formats need a folder: -o {output.with_suffix('')}, say")
+
+
+def _check_file(output: Path) -> None:
+    """UsageError if no mesh can be written as ``output``."""
+    try:
+        check_mesh_suffix(output)
+    except UsageError as error:
+        raise UsageError(f"{error}; for a folder, name the formats: --formats glb") from None
 
 
 def _seen_from(cameras: list[Camera] | None, source: Path, origin: np.ndarray) -> list[Camera]:

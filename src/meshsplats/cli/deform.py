@@ -16,7 +16,6 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     check_mesh_suffix,
-    check_outputs,
     placed,
     plural,
     say_origin,
@@ -24,6 +23,7 @@ from meshsplats.cli.common import (
     track,
 )
 from meshsplats.cli.messages import UsageError
+from meshsplats.formats.outputs import check_outputs
 from meshsplats.mesh import SplatMesh
 
 

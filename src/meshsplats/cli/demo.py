@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import check_outputs
+from meshsplats.formats.outputs import check_outputs
 
 STEPS = (
     "convert scene.ply -o scene.glb",

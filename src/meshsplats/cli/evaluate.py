@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from meshsplats._arrays import spread_indices
 from meshsplats._origin import shared_origin
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli.arguments import Command
@@ -27,21 +26,20 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     Text,
-    check_outputs,
-    chosen_background,
     load_scene,
+    optional_color,
     parse_color,
     track,
     view_names,
 )
 from meshsplats.cli.messages import UsageError, flag
-from meshsplats.cli.records import CONFIGURATION, write_configuration, write_json
+from meshsplats.cli.records import write_configuration
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import FileFormatError
-from meshsplats.evaluation.backgrounds import Background
+from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.benchmarks import (
     BENCHMARKS,
     Benchmark,
@@ -50,18 +48,25 @@ from meshsplats.evaluation.benchmarks import (
     run_benchmark,
 )
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, ScoredView, evaluate
+from meshsplats.evaluation.results import (
+    PER_VIEW,
+    REPORT,
+    RESULTS,
+    TABLE,
+    Strips,
+    notes,
+    save_benchmark,
+    save_report,
+)
 from meshsplats.evaluation.strips import (
     image_folder,
-    markdown_table,
+    mesh_names,
     score_table,
-    view_crop,
-    view_strip,
 )
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.looks import GROUND_TRUTHS
 
-RESULTS, PER_VIEW, REPORT, TABLE = "results.json", "per_view.json", "report.json", "table.md"
 Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 
 
@@ -172,7 +177,7 @@ class Evaluate(Command):
             print(json.dumps({"scenes": [r.to_dict() for r in reports], "seconds": seconds}, indent=1))
             return
         _print_table(reports)
-        for note in _notes(reports):
+        for note in notes(reports):
             print(note)
         print(f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/")
 
@@ -194,6 +199,8 @@ class Evaluate(Command):
             raise UsageError("--cluster is for the scenes of --protocol")
         if self.tune is not None:
             raise UsageError("--tune is for --protocol; otherwise use meshsplats finetune, then evaluate")
+        if len(set(map(os.path.abspath, self.mesh))) < len(self.mesh):
+            raise UsageError("a mesh was given twice")
         if not self.mesh and self.images is None and (self.splats is None or self.data is None):
             raise UsageError("nothing to score: give a mesh, --images, or --splats with --data")
         if self.data is None and self.splats is None:
@@ -254,7 +261,7 @@ class Evaluate(Command):
     ) -> Background:
         known = {name: scene for name, scene in scenes.items() if scene is not None}
         photographs = None if self.data is None else dataset
-        return chosen_background(self.background, photographs, known, source, self.threads)
+        return choose_background(optional_color(self.background), photographs, known, source, self.threads)
 
     def _score(
         self,
@@ -272,19 +279,14 @@ class Evaluate(Command):
         views = dataset.test or dataset.views
         images = None if self.images is None else image_folder(self.images, [v.camera for v in views])
         lpips = load_lpips(list(self.lpips) or None, network=self.network)
-        with_strips = set(spread_indices(len(views), self.strips))
-        names = view_names(len(views))
         folder.mkdir(exist_ok=True)
         here = self.cluster.cluster is None  # workers share a terminal
         bar = iter(track(range(len(views)), "scoring", len(views)) if here else range(len(views)))
         next(bar, None)
-        count = 0
+        save_strips = Strips(folder, view_names(len(views)), self.strips, self.amplify)
 
         def keep(scored: ScoredView) -> None:
-            nonlocal count
-            if count in with_strips:
-                _save_strips(folder, names[count], scored, self.amplify)
-            count += 1
+            save_strips(scored)
             next(bar, None)
 
         report = evaluate(
@@ -306,10 +308,7 @@ class Evaluate(Command):
         if self.cameras is not None:
             about["held_out"] = None  # it is unknown what a mesh was trained on
         report = replace(report, about={**report.about, **about})
-        write_json(folder / RESULTS, report.results())
-        write_json(folder / PER_VIEW, report.per_view())
-        write_json(folder / REPORT, report.to_dict())
-        _write_text(folder / TABLE, markdown_table([report], notes=_notes([report])))
+        save_report(report, folder)
         return report
 
     def _run_benchmark(self, benchmark: Benchmark) -> list[Report]:
@@ -331,10 +330,8 @@ class Evaluate(Command):
                 downscale=self.downscale,
                 workers=workers,
             )
-        write_json(self.output / RESULTS, result.means())
-        write_json(self.output / PER_VIEW, result.per_view())
-        write_json(self.output / REPORT, {"protocol": self.protocol, **result.to_dict()})
-        _write_text(self.output / TABLE, result.table(_notes(result.reports)))
+        assert self.protocol is not None
+        save_benchmark(result, self.output, self.protocol)
         return list(result.reports)
 
     def _score_scene(
@@ -354,53 +351,10 @@ class Evaluate(Command):
         return Candidates(_tuned(mesh, dataset, self.tune, self.threads), scene, mesh)
 
 
-def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """A name for each mesh in tables: ``mesh`` for a single one, else that of its file, with the folders
-    above that make names differ."""
-    if len(paths) == 1:
-        return {"mesh": paths[0]}
-    whole = [Path(os.path.abspath(path)) for path in paths]
-    longest = max((len(path.parts) for path in whole), default=0)
-    forms = [[path.stem for path in whole], [path.name for path in whole]]
-    forms += [["/".join(path.parts[-k:]) for path in whole] for k in range(2, longest + 1)]
-    for names in forms:
-        if len(set(names)) == len(names):
-            return dict(zip(names, paths, strict=True))
-    raise UsageError("a mesh was given twice")
-
-
 def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) -> SplatMesh:
     from meshsplats.finetuning import RunOptions, finetune, make_config
 
     return finetune(mesh, dataset, make_config(preset), run=RunOptions(threads=threads, report_every=0))
-
-
-def _save_strips(folder: Path, name: str, scored: ScoredView, amplify: float) -> None:
-    from meshsplats.images.writing import save_image
-
-    makers: dict[str, Callable[[ScoredView, float], np.ndarray]] = {"strips": view_strip, "crops": view_crop}
-    for part, make in makers.items():
-        (folder / part).mkdir(exist_ok=True)
-        save_image(folder / part / name, make(scored, amplify))
-
-
-def _write_text(path: Path, text: str) -> None:
-    from meshsplats._files.atomic import write_text
-
-    write_text(path, text)
-
-
-def _notes(reports: Sequence[Report]) -> list[str]:
-    """Notes under the table: the ground truth, the samples and the background of each scene."""
-    notes = []
-    for report in reports:
-        about, scene = report.about, "" if len(reports) == 1 else f"{report.scene}: "
-        samples = f"meshes with {about['samples']} x {about['samples']} samples per pixel"
-        notes.append(f"{scene}Ground truth: {about['ground_truth']}; {samples}.")
-        if about["splats"] is not None and about["ground_truth"] not in GROUND_TRUTHS.values():
-            notes.append(f"{scene}Splats: {GROUND_TRUTHS['splats'].removeprefix('splats ')}.")
-        notes.append(f"{scene}Background: {about['background_description']}.")
-    return notes
 
 
 def _print_table(reports: Sequence[Report]) -> None:

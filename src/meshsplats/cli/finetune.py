@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import tyro
 
-from meshsplats._arrays import subsample
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import (
@@ -26,10 +24,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
-    Display,
     Plan,
-    RunFiles,
-    Setup,
     ShowProgress,
     Trained,
     TrainingCommand,
@@ -39,8 +34,6 @@ from meshsplats.cli.training import (
 )
 from meshsplats.cluster import Shared
 from meshsplats.conversion import ConversionOptions
-from meshsplats.conversion.budget import usual_triangles_each
-from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
@@ -53,22 +46,13 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
-from meshsplats.finetuning.baseline import SHARES, SizeScores, converted, measure_baseline, partly
+from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
-from meshsplats.finetuning.memory import available_memory
-from meshsplats.finetuning.pace import (
-    BRIEF_RATES,
-    BRIEF_ZOOMS,
-    StartRecord,
-    is_brief,
-    measure_pace,
-    most_splats,
-    of_brief_run,
-    worthwhile_steps,
-)
-from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores, scored_count
+from meshsplats.finetuning.on_splats import SAVE_SECONDS, SplatRun, SplatTuning, log_scores
+from meshsplats.finetuning.run_files import RunFiles
+from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -84,20 +68,6 @@ else:
         without=("look",),  # that of the targets
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
-
-
-SETUP_SHARE = 0.2
-"""Largest share of the time, of a run with a length in minutes, before its first step."""
-FEWEST_BRIEF_STEPS = 3
-"""With less time left than for so many steps, a brief run is not begun."""
-BASELINE_SHARE = 0.05
-"""Share of it in which the conversion is scored, and the result afterwards."""
-OVERTIME = 5.0
-"""Seconds that may be added to it for a result that is better than the conversion."""
-SAVE_SECONDS = 2e-6
-"""Time to write a triangle, to choose its alpha mode and to draw it in the preview, with some to spare."""
-TIMED_SPLATS = 10_000
-"""Steps are timed for clouds from this size on."""
 
 
 @dataclass(frozen=True)
@@ -178,66 +148,27 @@ class Finetune(TrainingCommand):
         earlier: Checkpoint | None,
         setup: Setup,
     ) -> Plan:
-        """On images of the splats: as much as there is time for, and never below the conversion."""
-        if earlier is None:
-            record = self._timed(cloud, dataset, config, setup)
-        else:
-            record = StartRecord.load(self.files().folder)
-        if record.brief_steps is not None:
-            given = {name for name, value in asdict(self.tuning).items() if value is not None}
-            config = of_brief_run(config, record.brief_steps, given)
-            dataset = self._targets(cloud, config, earlier, BRIEF_ZOOMS)
-        used = cloud
-        if record.max_splats is not None:
-            setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
-            used = simplify_in_blocks(cloud, record.max_splats, threads=self.threads)
-        setup.phase(f"converting {len(used):,} splats")
-        conversion = self._conversion(used, dataset, config)
-        setup.phase("scoring the conversion")
-        seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
-        baseline = measure_baseline(conversion, cloud, dataset, config, threads=self.threads, seconds=seconds)
-        if record.brief_steps is not None:
-            mesh = conversion
-        else:
-            begun, resumed = as_begun(config, earlier), earlier is not None
-            mesh = self._start(used, dataset, begun, record, setup, resumed=resumed)
-        scorings = 1 if record.brief_steps is None else 2
-        saving = SAVE_SECONDS * len(mesh.faces)
-        reserve = scorings * baseline.seconds + saving
+        """On images of the splats (``SplatTuning``)."""
+        run = SplatRun(
+            cloud,
+            lambda chosen, zooms: dataset if zooms is None else self._targets(cloud, chosen, earlier, zooms),
+            config,
+            self._start_options(dataset),
+            self.files().folder,
+            as_begun(config, earlier),
+            resumed=earlier is not None,
+            fixed=[name for name, value in asdict(self.tuning).items() if value is not None],
+            threads=self.threads,
+            device=self.device,
+        )
+        tuning = SplatTuning(run, setup)
 
-        def optimise(run: RunOptions, show: Display) -> Trained:
-            if not self._has_time(record, setup, reserve) and earlier is None:
-                return self._trained(mesh, config, baseline.compared_with_itself())
-            if earlier is None:
-                record.save(self.files().folder)
-            tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
-            show.phase("scoring the result")
-            sizes = baseline.compare(tuned, config, self.threads)
-            if not sizes.loses:
-                return self._trained(tuned, config, sizes)
-            for share in SHARES if record.brief_steps is not None else ():
-                late = setup.spent + baseline.seconds + saving - (setup.seconds or np.inf)
-                if late > OVERTIME:
-                    break
-                less = partly(mesh, tuned, share)
-                if less is not None and not (found := baseline.compare(less, config, self.threads)).loses:
-                    self._log_scores(less, dataset, config)
-                    return self._trained(less, config, found)
-            best = mesh
-            if record.brief_steps is None:
-                best = self._conversion(used, dataset, config)
-            self._log_scores(best, dataset, config)
-            return self._trained(best, config, sizes)
+        def optimise(options: RunOptions, show: Display) -> Trained:
+            mesh, sizes = tuning.optimise(options, show)
+            return self._trained(mesh, tuning.config, sizes)
 
-        rates = {name: getattr(config, name) for name in BRIEF_RATES} if record.brief_steps else {}
-        return Plan(mesh, dataset, _summary(mesh, cloud), None, optimise, reserve, rates=rates)
-
-    def _has_time(self, record: StartRecord, setup: Setup, reserve: float) -> bool:
-        """Whether what is left of the time is worth beginning a brief run."""
-        if setup.seconds is None or record.brief_steps is None:
-            return True
-        step = (1 - SETUP_SHARE) * setup.seconds / record.brief_steps
-        return setup.seconds - setup.spent - reserve >= FEWEST_BRIEF_STEPS * step
+        summary = _summary(tuning.mesh, cloud)
+        return Plan(tuning.mesh, tuning.dataset, summary, None, optimise, tuning.reserve, rates=tuning.rates)
 
     def _trained(self, mesh: SplatMesh, config: FinetuneConfig, sizes: SizeScores | None = None) -> Trained:
         count = len(mesh.faces)
@@ -245,80 +176,18 @@ class Finetune(TrainingCommand):
         alpha: Literal["hybrid"] | None = "hybrid" if hybrid else None
         return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", alpha, sizes)
 
-    def _timed(
-        self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, setup: Setup
-    ) -> StartRecord:
-        """What the time leaves of the start, by the speed of this machine."""
-        chosen, pixels = self.conversion, dataset.train[0].camera.width * dataset.train[0].camera.height
-        limited = chosen.max_splats is not None or chosen.max_triangles is not None
-        own = any(value is not None for value in (chosen.mode, chosen.detail, chosen.sides, chosen.rings))
-        may_be_brief = config.opacity == "blended" and dataset.look == "area" and not own
-        steps: float | None = config.total_steps(len(dataset.train))
-        count, timed = len(cloud), setup.seconds is not None and len(cloud) >= TIMED_SPLATS
-        if not limited:
-            count = min(count, most_splats(available_memory()) or count)
-        if timed:
-            setup.phase("timing steps")
-            options = self._start_options(dataset)
-            pace = measure_pace(cloud, dataset, config, options, self.threads, self.device)
-            left = (1 - SETUP_SHARE) * (setup.seconds or 0)
-            if config.opacity == "cutoff" and not limited:
-                count = pace.splats(count, worthwhile_steps(config), left)
-            steps = pace.steps(self._limited(count), left)
-        brief = may_be_brief and steps is not None and is_brief(self._limited(count), pixels, steps, timed)
-        return StartRecord(
-            max_splats=count if count < len(cloud) else None,
-            brief_steps=max(1, round(steps)) if brief and steps is not None else None,
-        )
-
-    def _limited(self, splats: int) -> int:
-        """How many of them the options leave."""
-        chosen = self.conversion
-        if chosen.max_triangles is not None:
-            splats = min(splats, max(chosen.max_triangles // usual_triangles_each(), 1))
-        return min(splats, chosen.max_splats or splats)
-
-    def _start(
-        self,
-        cloud: GaussianCloud,
-        dataset: Dataset,
-        config: FinetuneConfig | None,
-        record: StartRecord | None = None,
-        setup: Setup | None = None,
-        *,
-        resumed: bool = False,
-    ) -> SplatMesh:
-        """The starting mesh. ``record`` notes the images that there was time for, or says it, if the run is
-        ``resumed``."""
-        options = self._start_options(dataset)
-        on_image = None
-        if record is not None and setup is not None:
-            goes_on = setup.observer("choosing numbers of triangles", SETUP_SHARE)
-            recorded = record.images
-
-            def on_image(done: int, total: int) -> bool:
-                in_time = goes_on(done, total)
-                if resumed:
-                    return recorded is None or done < recorded
-                record.images = done
-                return in_time
-
+    def _start(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig | None) -> SplatMesh:
         return starting_mesh(
             cloud,
             [view.camera for view in dataset.train],
-            options,
+            self._start_options(dataset),
             preset=self._start_preset,
             config=config,
             threads=self.threads,
-            on_image=on_image,
         )
 
     def _start_options(self, dataset: Dataset) -> ConversionOptions:
         return replace(self.conversion, crop=None, look=dataset.look)  # cropped already
-
-    def _conversion(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig) -> SplatMesh:
-        cameras = [view.camera for view in dataset.train]
-        return converted(cloud, config, self._start_options(dataset), cameras)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
         scene = load_scene(self.input, self.reading)
@@ -366,28 +235,12 @@ class Finetune(TrainingCommand):
                 shared = Shared(partial(_cell_scene, command, color))
                 shared.hold(CellScene(scene, dataset))
                 mesh = finetune_cells(shared, config, options, run, workers=workers, on_progress=show).mesh()
-            self._log_scores(mesh, dataset, config)
+            log_scores(self.files().folder, mesh, dataset, config, self.threads)
             triangles = len(mesh.faces)
             return Trained(mesh, mesh, {"triangles": triangles, "cells": count}, f"{triangles:,} triangles")
 
         summary = f"{len(scene):,} splats in {plural(count, 'cell')}"
         return Plan(None, dataset, summary, background, optimise)
-
-    def _log_scores(self, mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig) -> None:
-        """Logs the scores of ``mesh``, which is not that of the last step, on the held-out views."""
-        from meshsplats.finetuning.journal import Journal
-
-        if not dataset.test:
-            return
-        journal = Journal(self.files().folder)
-        views = subsample(dataset.test, scored_count(journal) or SCORED_VIEWS)
-        decibels, similarity = held_out_scores(mesh, views, config, self.threads)
-        lines = journal.metrics()
-        if lines and lines[-1].get("psnr") == decibels:
-            return  # of a run that had ended, resumed again
-        last = max((line["step"] for line in lines), default=0)
-        count = len(mesh.faces)
-        journal.log_metrics(last, psnr=decibels, ssim=similarity, views=len(views), triangles=count)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         if self.target.data is None and plan.dataset.test:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
+from meshsplats.chains import TABLE, ChainOptions, make_chain, partial_folder
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
@@ -22,41 +23,21 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     Text,
-    alpha_record,
-    check_outputs,
     parse_up,
     placed,
     say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, flag, say
-from meshsplats.cli.records import (
-    CONFIGURATION,
-    configuration,
-    recorded_options,
-    write_configuration,
-    write_json,
-)
+from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.cli.training import progress_display
 from meshsplats.errors import FileFormatError
-from meshsplats.evaluation.viewers import choose_alpha
-from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
+from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs, recorded_options
 from meshsplats.formats.sniff import identify
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.levels import (
-    SAMPLES,
-    Level,
-    level_targets,
-    likeness,
-    make_level,
-    merged,
-    merges_further,
-    plan_levels,
-    views_to_score,
-)
+from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words
 
-TABLE = "levels.json"
 MINUTES = 2.0
 """Default length of the fine-tuning of a level."""
 _CHANGEABLE = ("output", "threads")
@@ -122,36 +103,46 @@ class Levels(Command):
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
         cloud = self.reading.load(self.input, up=self.up)
         say_origin(cloud.origin, self.origin)
-        most = len(cloud) if self.max_splats is None else min(self.max_splats, len(cloud))
-        chain = plan_levels(most, self.levels, factor=self.factor, width=self.width)
-        folder = self._partial()
-        rows = []
-        source, waiting = cloud, list[Level]()  # splats that are merged further, and for which levels
-        for number, level in enumerate(chain):
-            done = folder / f"level_{number}.json"
-            waiting.append(level)
-            if not done.is_file():
-                try:
-                    row, source = self._make(cloud, source, number, waiting, config, folder)
-                    waiting = []
-                except Interrupted as stop:
-                    say(f"stopped in level {number}: the same command with --resume continues with it")
-                    return 128 + (stop.signal or signal.SIGINT)
-                write_json(done, row)
-            rows.append(json.loads(done.read_text(encoding="utf-8")))
-        table = {
-            "source": str(self.input),
-            "splats": len(cloud),
-            "factor": self.factor,
-            "look": "area",
-            "samples": SAMPLES,
-            "levels": rows,
-        }
-        self._finish(folder, table)
+        level_now = 0
+
+        @contextmanager
+        def shown(number: int, level: Level) -> Iterator[Callable[[Progress], None]]:
+            nonlocal level_now
+            level_now = number
+            say(f"level {number}: {level.splats:,} splats for {level.width} pixels")
+            with progress_display() as show:
+                yield show
+
+        options = ChainOptions(
+            levels=self.levels,
+            factor=self.factor,
+            width=self.width,
+            max_splats=self.max_splats,
+            format=self.format,
+            alpha=self.alpha,
+            up=None if self.up is None else parse_up(self.up),
+            sh_degree=self.sh_degree,
+            threads=self.threads,
+        )
+        options.plan(len(cloud))  # before the folder is made
+        self._begin()
+        try:
+            table = make_chain(
+                cloud,
+                self.output,
+                options,
+                config,
+                source=str(self.input),
+                place=partial(placed, origin=self.origin),
+                on_level=shown,
+            )
+        except Interrupted as stop:
+            say(f"stopped in level {level_now}: the same command with --resume continues with it")
+            return 128 + (stop.signal or signal.SIGINT)
         if self.json:
             print(json.dumps(table | {"folder": str(self.output)}, indent=1))
         else:
-            self._print_table(rows)
+            self._print_table(table["levels"])
         return 0
 
     def resolved(self) -> dict[str, Any]:
@@ -180,15 +171,11 @@ class Levels(Command):
             return make_config("default", steps=self.steps)
         return make_config("default", minutes=MINUTES if self.minutes is None else self.minutes)
 
-    @property
-    def _partial_folder(self) -> Path:
-        return self.output.with_name(f"{self.output.name}.partial")
-
     def _check_output(self) -> None:
         """OSError, before the work, if the folder cannot appear."""
         if self.output.suffix:
             raise UsageError(f"-o must name a folder, got {self.output.name!r}")
-        partial = self._partial_folder
+        partial = partial_folder(self.output)
         check_outputs([self.output], self.force)
         if self.output.exists() and not (self.output / TABLE).is_file():
             raise FileExistsError(f"{self.output} is there and holds no {TABLE}: give another folder")
@@ -199,87 +186,23 @@ class Levels(Command):
                 f"{partial} is left from an earlier run: --resume continues it, --force starts again"
             )
 
-    def _partial(self) -> Path:
-        """The folder of unfinished levels; with --resume that of the same command, else an empty one."""
-        partial = self._partial_folder
+    def _begin(self) -> None:
+        """Makes the folder of unfinished levels, empty; with --resume it must be that of the same command."""
+        unfinished = partial_folder(self.output)
         if self.resume:
-            before = recorded_options(partial / CONFIGURATION, "levels") or {}
-            for name, value in configuration("levels", self, partial)["options"].items():
+            before = recorded_options(unfinished / CONFIGURATION, "levels") or {}
+            for name, value in configuration("levels", self, unfinished)["options"].items():
                 if name not in _CHANGEABLE and before.get(name) != value:
                     raise UsageError(
-                        f"{partial} was started with {flag(name)} {before.get(name)}, not {value}"
+                        f"{unfinished} was started with {flag(name)} {before.get(name)}, not {value}"
                     )
-            return partial
-        if partial.exists():
-            if not (partial / CONFIGURATION).is_file():
-                raise FileExistsError(f"{partial} exists and is not of this command: remove it")
-            shutil.rmtree(partial)
-        partial.mkdir()
-        write_configuration(partial / CONFIGURATION, "levels", self)
-        return partial
-
-    def _make(
-        self,
-        cloud: GaussianCloud,
-        source: GaussianCloud,
-        number: int,
-        waiting: Sequence[Level],
-        config: FinetuneConfig | None,
-        folder: Path,
-    ) -> tuple[dict[str, Any], GaussianCloud]:
-        """Writes the mesh of the last level ``waiting``; its row of the table, and the splats that the
-        next levels are made of. ``source``: those of this one and the levels before it that wait."""
-        from meshsplats.formats.meshes import save_mesh
-
-        start = time.perf_counter()
-        level = waiting[-1]
-        say(f"level {number}: {level.splats:,} splats for {level.width} pixels")
-        up = None if self.up is None else parse_up(self.up)
-        options = {"up": up, "sh_degree": self.sh_degree, "threads": self.threads}
-        targets = level_targets(cloud, level, config, **options)
-        cameras = [view.camera for view in targets.test]
-        splats = source
-        for each in waiting if config is None else ():
-            if each is level or merges_further(each):
-                seen = level_targets(cloud, each, config, **options).test
-                splats = merged(source, each, [view.camera for view in seen], self.threads)
-                source = splats if merges_further(each) else source
-        run = RunOptions(threads=self.threads, spent=time.perf_counter() - start)
-        with progress_display() as show:
-            mesh = make_level(splats, level, targets, config, run=run, on_progress=show, up=up)
-        path = folder / f"level_{number}.{self.format}"
-        choice = None
-        if self.alpha == "auto" and self.format == "glb":
-            choice = choose_alpha(mesh, cameras, threads=self.threads)
-        asked = {} if self.alpha == "auto" else {"alpha": self.alpha}
-        save_mesh(placed(mesh, self.origin), path, **(asked if choice is None else choice.options))
-        scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces), len(cloud))]
-        score = likeness(mesh, cloud, scored, sh_degree=self.sh_degree, threads=self.threads)
-        row = {
-            "file": path.name,
-            "splats": mesh.splat_count,
-            "triangles": len(mesh.faces),
-            "bytes": path.stat().st_size,
-            "screen_size": level.width,
-            "psnr": round(score, 3),
-            "views": len(scored),
-            "alpha": alpha_record(choice) if choice else asked or None,
-            "seconds": round(time.perf_counter() - start, 2),
-        }
-        return row, source
-
-    def _finish(self, folder: Path, table: dict[str, Any]) -> None:
-        """The finished folder under its name, in place of an older one."""
-        for number in range(self.levels):
-            (folder / f"level_{number}.json").unlink()
-        write_json(folder / TABLE, table)
-        if not self.output.exists():
-            os.rename(folder, self.output)
             return
-        old = self.output.with_name(f".{self.output.name}.old")
-        os.rename(self.output, old)
-        os.rename(folder, self.output)
-        shutil.rmtree(old)
+        if unfinished.exists():
+            if not (unfinished / CONFIGURATION).is_file():
+                raise FileExistsError(f"{unfinished} exists and is not of this command: remove it")
+            shutil.rmtree(unfinished)
+        unfinished.mkdir()
+        write_configuration(unfinished / CONFIGURATION, "levels", self)
 
     def _print_table(self, rows: list[dict[str, Any]]) -> None:
         heads = (

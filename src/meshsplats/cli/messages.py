@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
-from meshsplats.errors import ClusterError, DeviceError
+from meshsplats.errors import ClusterError, DeviceError, OverwritingError
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a full disk, as in ``_files.atomic``."""
@@ -47,7 +47,7 @@ class Terminated(BaseException):
 
 def exit_code(error: BaseException) -> int:
     """The exit code for ``error``."""
-    if isinstance(error, UsageError):
+    if isinstance(error, (UsageError, OverwritingError)):
         return USAGE
     if isinstance(error, FileExistsError):
         return EXISTS

@@ -15,8 +15,6 @@ from meshsplats.cli.common import File, Number, Output, SplatOptions
 from meshsplats.cli.messages import UsageError, quoted
 from meshsplats.cli.training import (
     Plan,
-    RunFiles,
-    Setup,
     ShowProgress,
     Trained,
     TrainingCommand,
@@ -28,6 +26,8 @@ from meshsplats.cli.training import (
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FinetuneConfig, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.run_files import RunFiles
+from meshsplats.finetuning.setup import Setup
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS

@@ -9,19 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from meshsplats.cli import toml
+from meshsplats import _toml as toml
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
-from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.messages import shown_path
 from meshsplats.cli.values import relative_to
-
-CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
-"""Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
-
-
-def beside(output: Path, record: str) -> Path:
-    """Name of a record of the file ``output``: with the whole name of that, so that records of ``mesh.glb``
-    and ``mesh.png`` are different files."""
-    return output.with_name(f"{output.name}.{record}")
+from meshsplats.formats.outputs import recorded_options
 
 
 def write_configuration(
@@ -51,16 +43,6 @@ def configuration(
         "resolved": resolved,
         "result": dict(result or {}),
     }
-
-
-def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:
-    """The options in the configuration file at ``path``; None if there is none, or of another command than
-    ``name``."""
-    try:
-        record = toml.load(path)
-        return dict(record["options"]) if name in (None, record["command"]) else None
-    except (OSError, UsageError, ValueError, KeyError, TypeError):
-        return None
 
 
 def changes_since(path: Path, name: str, command: Command, idle: Collection[str] = ()) -> str | None:

@@ -8,9 +8,8 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-import numpy as np
 import tyro
 
 from meshsplats.camera import Camera, hiding_near_plane
@@ -25,10 +24,9 @@ from meshsplats.cli.common import (
     SplatOptions,
     ViewOptions,
     announce_cost,
-    check_outputs,
-    chosen_background,
     load_scene,
     open_tileset,
+    optional_color,
     parse_color,
     plural,
     size_of,
@@ -36,14 +34,15 @@ from meshsplats.cli.common import (
     view_names,
 )
 from meshsplats.cli.messages import UsageError
-from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, recorded_options, write_configuration
-from meshsplats.cluster import Shared
+from meshsplats.cli.records import write_configuration
 from meshsplats.errors import DataWarning
+from meshsplats.evaluation.backgrounds import choose_background
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, recorded_options
+from meshsplats.frames import FrameOptions, Scene, depth_unit, draw_frames
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-
-if TYPE_CHECKING:
-    from meshsplats.tiles.tileset import Tileset
+from meshsplats.tiles.drawing import MAX_ERROR
+from meshsplats.tiles.tileset import Tileset
 
 
 @dataclass(frozen=True)
@@ -140,18 +139,35 @@ class Render(Command):
         unit = None
         if self.depth == "png" and isinstance(scene, SplatMesh):
             points = tileset.root.corners() if tileset else scene.vertices
-            result["depth_unit"] = unit = _depth_unit(points, cameras)
+            result["depth_unit"] = unit = depth_unit(points, cameras)
         color = (0.0, 0.0, 0.0)
         if not self.transparent:
             kind = "splats" if isinstance(scene, GaussianCloud) else "mesh"
-            background = chosen_background(
-                self.draw.background, photographs, {kind: scene}, self.input, self.draw.threads, whole=False
+            background = choose_background(
+                optional_color(self.draw.background),
+                photographs,
+                {kind: scene},
+                self.input,
+                self.draw.threads,
+                whole=False,
             )
             color = background.color
             result |= background.to_dict()
         if not single:
             _remove_older(self.output, files.every)
-        self._draw(tileset or scene, cameras, files, unit, color)
+        drawing = FrameOptions(
+            background=color,
+            transparent=self.transparent,
+            samples=self.draw.samples,
+            sh_degree=self.draw.sh_degree,
+            max_layers=self.draw.max_layers,
+            cutoff=self.cutoff,
+            device=self.draw.device,
+            depth=self.depth,
+            depth_unit=unit,
+            max_error=MAX_ERROR if self.max_error is None else self.max_error,
+        )
+        self._draw(tileset or scene, cameras, files, drawing)
         if files.turntable:
             from meshsplats.images.reading import load_image
             from meshsplats.images.writing import save_animation
@@ -233,105 +249,25 @@ class Render(Command):
 
         return convert(scene)
 
-    def load(self) -> GaussianCloud | SplatMesh | Tileset:
+    def load(self) -> Scene:
         """The scene of the images, from the input."""
         tileset = open_tileset(self.input, self.part, self.max_error)
         return tileset or self._drawable(self.part.of(load_scene(self.input, self.reading, up=self.views.up)))
 
-    def _draw(
-        self,
-        scene: GaussianCloud | SplatMesh | Tileset,
-        cameras: Sequence[Camera],
-        files: _Files,
-        unit: float | None,
-        background: tuple[float, ...],
-    ) -> None:
+    def _draw(self, scene: Scene, cameras: Sequence[Camera], files: _Files, chosen: FrameOptions) -> None:
         from meshsplats._files.atomic import write_bytes
-        from meshsplats.colors import srgb_to_linear
-        from meshsplats.rendering.samples import needed_samples
-        from meshsplats.tiles.drawing import MAX_ERROR, samples_for
-        from meshsplats.tiles.tileset import Tileset
 
-        # A mesh for linear light is blended in it and encoded for display afterwards.
-        linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
-        if linear:
-            background = tuple(srgb_to_linear(np.array(background)).tolist())
-        samples = self.draw.samples
-        most = MAX_ERROR if self.max_error is None else self.max_error
-        if samples is None:
-            if isinstance(scene, Tileset):
-                samples = samples_for(scene, cameras, most)
-            else:
-                samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
+        chosen = chosen.for_scene(scene, cameras)
         if not isinstance(scene, Tileset):
-            announce_cost(scene, cameras, samples, self.draw.threads)
-        shared = Shared(self.load)
-        shared.hold(scene)
+            announce_cost(scene, cameras, chosen.samples or 1, self.draw.threads)
         with self.cluster.workers(self.draw.threads) as workers:
-            frames = _Frames(self, shared, samples, background, linear, unit, most, workers.threads)
-            for i, (image, depth) in track(workers.run(frames.draw, cameras), "rendering", len(cameras)):
+            drawn = draw_frames(scene, cameras, chosen, workers=workers, load=self.load)
+            for i, (image, depth) in track(drawn, "rendering", len(cameras)):
                 if not files.images[i].parent.exists():
                     files.images[i].parent.mkdir()  # not before there is something to write
                 write_bytes(files.images[i], image)
                 if depth is not None:
                     write_bytes(files.depths[i], depth)
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Draws the images, each in a task."""
-
-    command: Render
-    scene: Shared[GaussianCloud | SplatMesh | Tileset]
-    samples: int
-    background: tuple[float, ...]
-    linear: bool
-    unit: float | None
-    """Of 16-bit depth images; None for float arrays."""
-    max_error: float
-    threads: int | None
-
-    def draw(self, camera: Camera) -> tuple[bytes, bytes | None]:
-        """The contents of the files of a camera: image, and depth if there is one."""
-        from meshsplats.colors import linear_to_srgb
-        from meshsplats.images.writing import encode_array, encode_depth_png, encode_image, straight_rgba
-        from meshsplats.rendering import render, render_splats
-        from meshsplats.tiles.drawing import render_tiles
-        from meshsplats.tiles.tileset import Tileset
-
-        command, scene = self.command, self.scene.get()
-        draw = command.draw
-        options: dict[str, Any] = {
-            "background": self.background,
-            "samples": self.samples,
-            "threads": self.threads,
-        }
-        if isinstance(scene, GaussianCloud):
-            drawn = render_splats(scene, camera, sh_degree=draw.sh_degree, **options)
-        else:
-            options |= {"max_layers": draw.max_layers, "depth": command.depth != "none"}
-            options |= {"cutoff": command.cutoff, "device": draw.device}
-            if isinstance(scene, Tileset):
-                drawn = render_tiles(scene, camera, max_error=self.max_error, **options)
-            else:
-                drawn = render(scene, camera, **options)
-        image = straight_rgba(drawn.color, drawn.alpha) if command.transparent else drawn.color
-        if self.linear:
-            image[..., :3] = linear_to_srgb(image[..., :3])
-        content = encode_image("view.png", image)
-        if drawn.depth is None:
-            return content, None
-        mean = drawn.mean_depth(empty=0)
-        return content, encode_array(mean) if self.unit is None else encode_depth_png(mean, self.unit)
-
-
-def _depth_unit(points: np.ndarray, cameras: Sequence[Camera]) -> float:
-    """Scene units per step of a 16-bit depth image: the farthest of ``points`` (n, 3) in all views fits."""
-    corners = points if len(points) else np.zeros((1, 3), np.float32)
-    farthest = max(
-        float((corners @ c.world_to_camera[2, :3] + c.world_to_camera[2, 3]).max()) for c in cameras
-    )
-    return max(farthest, 1e-6) / 65535
 
 
 def _remove_older(folder: Path, kept: Sequence[Path]) -> None:

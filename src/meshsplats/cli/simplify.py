@@ -12,7 +12,7 @@ import tyro
 
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
@@ -23,17 +23,15 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     SplatOptions,
-    cameras_beside,
-    check_outputs,
     draw_preview,
-    placed,
-    say_origin,
     size_of,
+    written,
 )
 from meshsplats.cli.messages import UsageError
-from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside, write_configuration
+from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
 from meshsplats.formats.sniff import identify
 
 
@@ -90,10 +88,9 @@ class Simplify(Command):
         assert count is not None
         kept = simplify(cloud, count, cameras=cameras, threads=self.threads)
         seconds = time.perf_counter() - start
-        written = placed(kept, self.origin)
-        say_origin(kept.origin, self.origin, splats=True)
+        placed = written(kept, self.origin)
         with together():
-            save_gaussians(written, self.output)
+            save_gaussians(placed, self.output)
             write_configuration(config, "simplify", self)
             if not self.no_preview:
                 draw_preview(kept, preview)

@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 import tyro
 
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli.arguments import spelled
-from meshsplats.cli.common import Count, File, Folder, Missing, Text, cameras_beside, parse_up
+from meshsplats.cli.common import Count, File, Folder, Missing, Text, parse_up
 from meshsplats.cli.messages import UsageError
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset

@@ -24,14 +24,14 @@ from meshsplats.cli.common import (
     SplatOptions,
     Text,
     alpha_in_words,
-    check_outputs,
     parse_up,
     say_origin,
 )
 from meshsplats.cli.messages import Terminated, UsageError, say
-from meshsplats.cli.records import CONFIGURATION, beside, write_configuration
+from meshsplats.cli.records import write_configuration
 from meshsplats.conversion import ConversionOptions
 from meshsplats.errors import ClusterError
+from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
 
 if TYPE_CHECKING:
     from meshsplats.tiles.options import TileOptions

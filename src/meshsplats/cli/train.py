@@ -10,12 +10,10 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import File, Output, check_mesh_suffix, check_outputs, placed, say_origin
+from meshsplats.cli.common import File, Output, check_mesh_suffix, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.training import (
     Plan,
-    RunFiles,
-    Setup,
     ShowProgress,
     Trained,
     TrainingCommand,
@@ -25,7 +23,10 @@ from meshsplats.evaluation.backgrounds import BLACK, Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
+from meshsplats.finetuning.run_files import RunFiles
+from meshsplats.finetuning.setup import Setup
 from meshsplats.finetuning.step import samples_of
+from meshsplats.formats.outputs import check_outputs
 from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.run import SO_FAR, check_training_memory, train
 

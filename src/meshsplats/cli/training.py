@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from meshsplats._files.locks import locked
+from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.common import (
@@ -23,31 +22,25 @@ from meshsplats.cli.common import (
     Number,
     Origin,
     Output,
-    alpha_for_viewers,
-    check_outputs,
-    chosen_background,
     draw_preview,
-    placed,
+    optional_color,
     plural,
-    say_origin,
     size_of,
+    written,
 )
 from meshsplats.cli.messages import UsageError, say
-from meshsplats.cli.records import (
-    CONFIGURATION,
-    PREVIEW,
-    beside,
-    configuration,
-    recorded_options,
-    write_configuration,
-)
+from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.views import Dataset
-from meshsplats.evaluation.backgrounds import Background
+from meshsplats.evaluation.backgrounds import Background, choose_background
+from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
 from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
 from meshsplats.finetuning.config import LENGTHS, PRESETS, with_changes
+from meshsplats.finetuning.run_files import RunFiles
+from meshsplats.finetuning.setup import Display, Setup
+from meshsplats.formats.outputs import recorded_options
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
@@ -63,15 +56,6 @@ _CHANGEABLE = {
 }
 """Options that may change when a run is resumed."""
 ShowProgress = Callable[[Progress], None]
-
-
-class Display(Protocol):
-    """Shows a set-up and the steps after it."""
-
-    def phase(self, text: str, share: float | None = None) -> None:
-        """Shows what begins, or how much of it is done, 0 to 1."""
-
-    def __call__(self, progress: Progress) -> None: ...
 
 
 def tuning_options(about: str, default_of: Callable[[str], str]) -> type[FinetuneConfig]:
@@ -90,76 +74,6 @@ if TYPE_CHECKING:
     TuningOptions = FinetuneConfig
 else:
     TuningOptions = tuning_options("In parentheses: the values of the presets.", of_presets(PRESETS))
-
-
-@dataclass(frozen=True)
-class RunFiles:
-    """The files of a run. ``mesh`` is the result; with ``in_cells``, of a run in cells."""
-
-    mesh: Path
-    in_cells: bool = False
-
-    @property
-    def config(self) -> Path:
-        return beside(self.mesh, CONFIGURATION)
-
-    @property
-    def preview(self) -> Path:
-        return beside(self.mesh, PREVIEW)
-
-    @property
-    def folder(self) -> Path:
-        """Metrics, previews and the checkpoint."""
-        return beside(self.mesh, "run")
-
-    @property
-    def command(self) -> Path:
-        """The configuration, from the start of the run."""
-        return self.folder / "command.toml"
-
-    @property
-    def held_out(self) -> Path:
-        """Cameras of held-out images of splats."""
-        return self.folder / "held_out.cameras.json"
-
-    def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
-        """OSError if something would be overwritten, cannot be written, or is missing for --resume."""
-        from meshsplats.finetuning.cells import RECORD
-        from meshsplats.finetuning.journal import CHECKPOINT
-
-        checkpoint = self.folder / (RECORD if self.in_cells else CHECKPOINT)
-        if resume and not checkpoint.is_file():
-            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to start again")
-        for left in (self.folder / CHECKPOINT, self.folder / RECORD):
-            if left.exists() and not (resume or force):
-                raise FileExistsError(
-                    f"{left} is left from an earlier run: --resume continues it, --force starts again"
-                )
-        if resume and self.mesh.exists() and not force:
-            raise FileExistsError(
-                f"{self.mesh} exists: the run has ended, or there was one before;"
-                " --resume --force continues it and overwrites the mesh"
-            )
-        check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
-
-    @contextmanager
-    def claimed(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> Iterator[None]:
-        """While the block runs, no other process writes this run. FileExistsError if one does, and the errors
-        of ``check``, as one may have ended meanwhile."""
-        self.folder.mkdir(exist_ok=True)
-        try:
-            with locked(self.folder / ".lock") as ours:
-                if not ours:
-                    raise FileExistsError(
-                        errno.EEXIST,
-                        "another process is writing this run; give another name for the output",
-                        str(self.folder),
-                    )
-                self.check(inputs, resume=resume, force=force)
-                yield
-        finally:
-            with suppress(OSError):
-                self.folder.rmdir()  # where nothing was written
 
 
 @dataclass(frozen=True)
@@ -197,34 +111,6 @@ class Plan:
     """Learning rates that differ from those of the configuration."""
     needed: int | None = None
     """Estimated memory in bytes, which is there; None: that of fine-tuning ``mesh``, if there is one."""
-
-
-class Setup:
-    """What a command does before its first step: shown in phases, and with an eye on the clock."""
-
-    def __init__(self, show: Display, start: float, minutes: float | None) -> None:
-        self._show, self._start = show, start
-        self.seconds = None if minutes is None else 60 * minutes
-        """Time for the whole command; None: not limited."""
-
-    def phase(self, text: str) -> None:
-        """Shows what begins now."""
-        self._show.phase(text)
-
-    @property
-    def spent(self) -> float:
-        """Seconds since the command began."""
-        return time.perf_counter() - self._start
-
-    def observer(self, text: str, share: float) -> Callable[[int, int], bool]:
-        """For images of a set-up (``convert``): shows their number, and ends them after this ``share`` of the
-        command's time."""
-
-        def on_image(done: int, total: int) -> bool:
-            self._show.phase(text, done / total)
-            return self.seconds is None or self.spent < share * self.seconds
-
-        return on_image
 
 
 @dataclass(frozen=True)
@@ -322,13 +208,14 @@ class TrainingCommand(Command):
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
         given = {"alpha": trained.alpha} if trained.alpha else alpha_for_viewers(trained.saved, files.mesh)
-        say_origin(trained.saved.origin, self.origin)
-        save_mesh(placed(trained.saved, self.origin), files.mesh, **given)
+        mesh = written(trained.saved, self.origin)
         scored = self._scored(config, plan.dataset)
         background = {} if plan.background is None else plan.background.to_dict()
-        write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
-        self.save_more(files, plan, trained)
-        draw_preview(trained.shown, files.preview, self.preview_camera(plan))
+        with together():  # a run that is killed before has no result, and its checkpoint
+            save_mesh(mesh, files.mesh, **given)
+            write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
+            self.save_more(files, plan, trained)
+            draw_preview(trained.shown, files.preview, self.preview_camera(plan))
         self._print_result(files, time.perf_counter() - start, earlier, trained, scored)
         if not self.json:
             for line in self.next_steps(files, config, plan):
@@ -515,7 +402,7 @@ def over_background(
     configuration or the model folder ``source`` names, else the one that fits ``scene`` best. Prints it."""
     color = config.background if config.background in ("black", "white") else None
     kind = "splats" if isinstance(scene, GaussianCloud) else "mesh"
-    found = chosen_background(color, dataset, {kind: scene}, source, threads, whole=whole)
+    found = choose_background(optional_color(color), dataset, {kind: scene}, source, threads, whole=whole)
     say(f"background: {found.describe()}")
     return dataset.over(found.color), found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
@@ -21,71 +21,25 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     Text,
-    cameras_beside,
-    check_outputs,
-    chosen_background,
     load_scene,
+    optional_color,
     parse_color,
     parse_up,
     plural,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, say, shown_path
-from meshsplats.cli.records import CONFIGURATION, beside, write_configuration
+from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.views import Dataset
+from meshsplats.evaluation.backgrounds import choose_background
+from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.viewer import content
+from meshsplats.viewer.content import Content
 
 if TYPE_CHECKING:
     from meshsplats.viewer.page import Page
-
-SIDE = 400
-"""Largest side of the image by which the errors of merging and quantisation are measured."""
-MEASURED_FRAGMENTS = 1e9
-"""Largest number of its fragments: of a scene that has more, the image is smaller."""
-
-TRIANGLES = 4_000_000
-"""Default of --max-triangles: more take seconds to sort and draw, and pages of more than 40 MB."""
-
-COARSE_TRIANGLES = 300_000
-"""Triangles of the coarse level, which any phone draws; meshes with more get one."""
-
-MOST_TRIANGLES = 20_000_000
-"""Triangles of a page at most: browsers hold no more."""
-
-
-@dataclass(frozen=True)
-class _Merging:
-    """Splats that were merged, as the page cannot hold all."""
-
-    splats: int
-    """How many there were."""
-    psnr: float
-    """dB between images of all splats and of those that are left, in one view."""
-
-    def sentence(self, kept: int) -> str:
-        return (
-            f"{self.splats:,} splats were merged to {kept:,}: an image of them with {SIDE} pixels has"
-            f" {self.psnr:.1f} dB against that of all; --max-triangles N or --whole keeps more"
-        )
-
-
-@dataclass(frozen=True)
-class _Content:
-    """What a page shows."""
-
-    mesh: SplatMesh
-    splats: GaussianCloud | None
-    kept: int = 0
-    """Splats of the mesh, where it was made of splats."""
-    merging: _Merging | None = None
-    coarse: SplatMesh | None = None
-
-    @property
-    def summary(self) -> str:
-        parts = [plural(len(self.mesh.faces), "triangle")]
-        parts += [] if self.coarse is None else [f"a coarse level of {len(self.coarse.faces):,}"]
-        return ", ".join(parts if self.splats is None else [*parts, plural(len(self.splats), "splat")])
 
 
 @dataclass(frozen=True)
@@ -146,11 +100,11 @@ class View(Command):
         scene = self._scene()
         photographs = self._photographs(scene.origin)
         cameras = self._cameras(photographs, scene.origin)
-        content = self._content(scene, cameras)
+        shown = self._content(scene, cameras)
         del scene  # large, and partly copied
-        self._announce(content)
-        page = self._page(content, photographs, cameras)
-        result = self._measured(content, page, cameras)
+        self._announce(shown)
+        page = self._page(shown, photographs, cameras)
+        result = content.measured(shown, page, cameras)
         if self.output is not None:
             self._write(page, result)
         else:
@@ -168,9 +122,9 @@ class View(Command):
         for first, second in self.EXCLUSIVE:
             if getattr(self, first) and getattr(self, second):
                 raise UsageError(f"give --{first} or --{second.replace('_', '-')}, not both")
-        if self.max_triangles is not None and not 8 <= self.max_triangles <= MOST_TRIANGLES:
+        if self.max_triangles is not None and not 8 <= self.max_triangles <= content.MOST_TRIANGLES:
             raise UsageError(
-                f"--max-triangles must be from 8, one splat's, to {MOST_TRIANGLES:,},"
+                f"--max-triangles must be from 8, one splat's, to {content.MOST_TRIANGLES:,},"
                 f" got {self.max_triangles}"
             )
         if self.background is not None:
@@ -187,27 +141,23 @@ class View(Command):
             return scene
         if self.splats is not None:
             raise UsageError(f"{shown_path(self.input)} is splats: --splats is for a mesh")
-        return _degree_0(scene)
+        return scene
 
-    def _content(self, scene: GaussianCloud | SplatMesh, cameras: list[Camera]) -> _Content:
+    def _content(self, scene: GaussianCloud | SplatMesh, cameras: list[Camera]) -> Content:
         """What the page will show."""
-        if isinstance(scene, SplatMesh):
-            _check_size(len(scene.faces), "fine-tune it with --max-triangles, or make 'meshsplats tiles'")
+        try:
+            if isinstance(scene, GaussianCloud):
+                advice = "leave --whole out, or make 'meshsplats tiles'"
+                most = None if self.whole else self.max_triangles or content.TRIANGLES
+                shown = not self.without_splats
+                return content.content_of_splats(scene, cameras, max_triangles=most, shown=shown)
+            advice = "fine-tune it with --max-triangles, or make 'meshsplats tiles'"
             splats = None
             if self.splats is not None:
-                splats = _degree_0(self.part.of(self.reading.load(self.splats, scene.origin)))
-            return _Content(scene, splats, coarse=_coarse(scene, splats))
-        from meshsplats.conversion import convert
-        from meshsplats.conversion.budget import usual_triangles_each
-        from meshsplats.conversion.merging import simplify_in_blocks
-
-        each = usual_triangles_each()
-        count = len(scene) if self.whole else max(1, (self.max_triangles or TRIANGLES) // each)
-        _check_size(each * min(count, len(scene)), "leave --whole out, or make 'meshsplats tiles'")
-        splats = simplify_in_blocks(scene, count)
-        merging = None if splats is scene else _Merging(len(scene), _likeness(scene, splats, cameras))
-        mesh, shown = convert(splats), None if self.without_splats else splats
-        return _Content(mesh, shown, len(splats), merging, _coarse(mesh, splats))
+                splats = self.part.of(self.reading.load(self.splats, scene.origin))
+            return content.content_of_mesh(scene, splats)
+        except content.TooManyTrianglesError as error:
+            raise UsageError(f"{error}: {advice}") from None
 
     def _photographs(self, origin: np.ndarray) -> Dataset | None:
         if self.data is None:
@@ -223,26 +173,30 @@ class View(Command):
             return load_cameras(self.cameras, origin=origin)
         return cameras_beside(self.input, origin) or []
 
-    def _announce(self, content: _Content) -> None:
+    def _announce(self, shown: Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""
         from meshsplats._files.atomic import in_words
         from meshsplats.viewer.page import estimated_size
 
         if self.json:
             return  # the result has the same numbers
-        if content.merging is not None:
-            say(content.merging.sentence(content.kept))
+        if shown.merged_from is not None:
+            say(
+                f"{shown.merged_from:,} splats were merged to {shown.kept:,}: an image of them with"
+                f" {content.SIDE} pixels has {shown.merging_psnr:.1f} dB against that of all;"
+                " --max-triangles N or --whole keeps more"
+            )
         if self.output is not None:
-            size = in_words(estimated_size(content.mesh, content.splats, content.coarse))
-            say(f"{self.output} will have about {size}: {content.summary}")
+            size = in_words(estimated_size(shown.mesh, shown.splats, shown.coarse))
+            say(f"{self.output} will have about {size}: {_sizes(shown)}")
 
-    def _page(self, content: _Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
+    def _page(self, shown: Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
         from meshsplats.viewer.page import PageOptions, make_page
 
-        background = chosen_background(
-            self.background,
+        background = choose_background(
+            optional_color(self.background),
             photographs,
-            {"mesh": content.mesh},
+            {"mesh": shown.mesh},
             self.input,
             None,
             whole=self.part.crop is None,
@@ -252,38 +206,11 @@ class View(Command):
             title=self.title or ("scene" if name == "-" else Path(name).resolve().stem),
             background=background.color,
             up=None if self.up is None else parse_up(self.up),
-            merged_from=None if content.merging is None else content.merging.splats,
+            merged_from=shown.merged_from,
         )
         return make_page(
-            content.mesh, splats=content.splats, coarse=content.coarse, cameras=cameras, options=options
+            shown.mesh, splats=shown.splats, coarse=shown.coarse, cameras=cameras, options=options
         )
-
-    def _measured(self, content: _Content, page: Page, cameras: list[Camera]) -> dict[str, Any]:
-        """Sizes, and the errors that merging and quantisation make."""
-        from meshsplats.rendering import render
-        from meshsplats.rendering.layers import SMALLEST, affordable
-
-        mesh, packed = content.mesh, page.mesh
-        camera = _camera(mesh, cameras)
-        camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
-        images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
-        merged: dict[str, Any] = {}
-        if content.merging is not None:
-            merged = {"merged_from": content.merging.splats, "merging_psnr": round(content.merging.psnr, 2)}
-        return {
-            "triangles": len(mesh.faces),
-            "coarse_triangles": 0 if content.coarse is None else len(content.coarse.faces),
-            "splats": 0 if content.splats is None else len(content.splats),
-            **merged,
-            "viewpoints": len(cameras),
-            "bytes": len(page.html.encode("utf-8")),
-            "bytes_a_triangle": round(packed.bytes_a_triangle, 2),
-            "position_error": packed.position_error,
-            "position_error_radii": packed.relative_error,
-            "color_error_levels": packed.color_error,
-            "alpha_error_levels": packed.alpha_error,
-            "image_error_levels": 255 * float(np.abs(images[0] - images[1]).max()),
-        }
 
     def _write(self, page: Page, result: dict[str, Any]) -> None:
         from meshsplats._files.atomic import write_text
@@ -316,43 +243,10 @@ class View(Command):
                 say("ended")
 
 
-def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
-    """``cloud`` without the colours that a page does not show: up to three quarters of its memory."""
-    return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
-
-
-def _coarse(mesh: SplatMesh, splats: GaussianCloud | None) -> SplatMesh | None:
-    """The coarse level of a mesh with many triangles, made of its splats."""
-    if splats is None or len(mesh.faces) <= COARSE_TRIANGLES:
-        return None
-    from meshsplats.conversion import convert
-    from meshsplats.conversion.budget import usual_triangles_each
-    from meshsplats.conversion.merging import simplify_in_blocks
-
-    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each()), up=mesh.up)
-
-
-def _check_size(triangles: int, advice: str) -> None:
-    if triangles > MOST_TRIANGLES:
-        raise UsageError(
-            f"a page holds at most {MOST_TRIANGLES:,} triangles, and these would be {triangles:,}: {advice}"
-        )
-
-
-def _camera(scene: SplatMesh | GaussianCloud, cameras: list[Camera]) -> Camera:
-    """The view of the measurements."""
-    from meshsplats.cameras.trajectories import orbit
-
-    return cameras[0].within(SIDE) if cameras else orbit(scene, 1, azimuth=30, width=SIDE, height=SIDE)[0]
-
-
-def _likeness(cloud: GaussianCloud, merged: GaussianCloud, cameras: list[Camera]) -> float:
-    """dB between the images of two clouds."""
-    from meshsplats.evaluation.metrics import psnr
-    from meshsplats.rendering import render_splats
-
-    camera = _camera(cloud, cameras)
-    return psnr(*(render_splats(each, camera).color for each in (merged, cloud)))
+def _sizes(shown: Content) -> str:
+    parts = [plural(len(shown.mesh.faces), "triangle")]
+    parts += [] if shown.coarse is None else [f"a coarse level of {len(shown.coarse.faces):,}"]
+    return ", ".join(parts if shown.splats is None else [*parts, plural(len(shown.splats), "splat")])
 
 
 def _contents(result: dict[str, Any]) -> str:

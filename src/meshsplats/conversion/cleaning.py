@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
 from meshsplats._cells import Cells
 from meshsplats._geometry import spacing
 from meshsplats._options import Range, check_options
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
@@ -184,3 +187,48 @@ def _splats(
     ends = np.concatenate([across * high[:, None], across * low[:, None]], axis=1)
     opacities = np.maximum.reduceat(scene.colors[scene.faces, 3].max(axis=1), starts)
     return centers, ends, opacities, splats.of_face
+
+
+_SIDE = 480
+
+
+def save_strip(
+    scene: GaussianCloud | SplatMesh,
+    left: GaussianCloud | SplatMesh,
+    found: Findings,
+    path: Path,
+    threads: int | None,
+) -> None:
+    """Saves a strip of three images of ``scene`` to ``path``: as it is; with what was ``found`` in red; and
+    what is ``left``."""
+    from meshsplats.images.writing import save_image, strip
+
+    lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
+    whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
+    shown = ((scene, whole), (_marked(scene, found), whole), (left, rest))
+    images = [_image(part, camera, threads) for part, camera in shown]
+    save_image(path, strip(images, ("before", "removed", "after")))
+
+
+def _image(scene: GaussianCloud | SplatMesh, camera: Camera, threads: int | None) -> np.ndarray:
+    from meshsplats.rendering import render_splats
+    from meshsplats.rendering.looks import image_of
+
+    white: Sequence[float] = (1.0, 1.0, 1.0)
+    if isinstance(scene, SplatMesh):
+        return np.clip(image_of(scene, camera, white, samples=2, threads=threads)[0], 0, 1)
+    return np.clip(render_splats(scene, camera, background=white, threads=threads).color, 0, 1)
+
+
+def _marked(scene: GaussianCloud | SplatMesh, found: Findings) -> GaussianCloud | SplatMesh:
+    """The scene with the removed splats in red, the rest in dull colours."""
+    red = np.array([0.95, 0.05, 0.05], np.float32)
+    if isinstance(scene, GaussianCloud):
+        plain = scene.sh[:, :1] * np.float32(0.4)
+        plain[~found.kept] = ((red - 0.5) / SH_C0)[None, None]
+        return replace(scene, sh=plain)
+    colors = scene.colors.copy()
+    colors[:, :3] = 0.5 + 0.4 * (colors[:, :3] - 0.5)
+    gone = scene.faces[~found.kept[found.owner]]
+    colors[gone.ravel(), :3] = red
+    return replace(scene, colors=colors)

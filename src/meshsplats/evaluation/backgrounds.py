@@ -286,3 +286,25 @@ def _coarse(values: np.ndarray) -> np.ndarray:
     side = max(1, min(height, width) // _BLOCKS)
     rows, columns = height // side, width // side
     return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
+
+
+def choose_background(
+    given: Sequence[float] | None,
+    photographs: Dataset | None,
+    scenes: Mapping[str, GaussianCloud | SplatMesh],
+    source: Path | None,
+    threads: int | None = None,
+    *,
+    whole: bool = True,
+) -> Background:
+    """The background of images of ``scenes``: the ``given`` one, display RGB in [0, 1]; else white, or beside
+    ``photographs`` the one that the model folder ``source`` names or that fits the scenes best. Warns where
+    scenes and photographs disagree, as they must for scenes that are not ``whole``."""
+    if photographs is None:
+        red, green, blue = WHITE if given is None else given
+        return Background((red, green, blue), "usual" if given is None else "given")
+    named = None if source is None else model_background(source)
+    found = find_background(photographs, scenes, given=given, named=named, threads=threads)
+    if whole:
+        warn_of_other_worlds(found)
+    return found

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats._kinds import need, need_all
 from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.datasets.views import View
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
@@ -162,3 +164,15 @@ def compare(
         device=device,
     )
     return Comparison(tuple(view.score for view in views))
+
+
+def fidelity(
+    cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera], count: int, look: Look = "area"
+) -> dict[str, Any]:
+    """Mean scores of ``mesh`` against its splats in ``count`` views of at most 400 pixels, of the ``cameras``
+    or, without any, around it; for JSON."""
+    views = [camera.within(400) for camera in subsample(cameras, count)] or orbit(
+        mesh, count, elevation=15, width=400, height=400
+    )
+    mean = compare(cloud, mesh, views, look=look).to_dict()["mean"]
+    return {"views": len(views), "look": look, "psnr": mean["psnr"], "ssim": mean["ssim"]}

@@ -105,6 +105,21 @@ def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> I
     return at
 
 
+def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """A name for each mesh in tables: ``mesh`` for a single one, else that of its file, with the folders
+    above that make names differ. Raises ValueError if two are the same."""
+    if len(paths) == 1:
+        return {"mesh": paths[0]}
+    whole = [Path(os.path.abspath(path)) for path in paths]
+    longest = max((len(path.parts) for path in whole), default=0)
+    forms = [[path.stem for path in whole], [path.name for path in whole]]
+    forms += [["/".join(path.parts[-k:]) for path in whole] for k in range(2, longest + 1)]
+    for names in forms:
+        if len(set(names)) == len(names):
+            return dict(zip(names, paths, strict=True))
+    raise ValueError("a mesh was given twice")
+
+
 def markdown_table(
     reports: Sequence[Report],
     *,

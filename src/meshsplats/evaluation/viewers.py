@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -110,6 +111,15 @@ def choose_alpha(
         return AlphaChoice("blend")
     views = cheap
     return choose_by_views(((mesh, view) for view in views), threads=threads)
+
+
+def alpha_for_viewers(
+    mesh: SplatMesh, path: str | os.PathLike[str], threads: int | None = None
+) -> dict[str, Any]:
+    """Arguments of ``save_mesh`` for the alpha mode of ``choose_alpha``, where ``path`` is a .glb; none for
+    other files and empty meshes."""
+    glb = os.fspath(path).lower().endswith(".glb") and len(mesh.faces)
+    return choose_alpha(mesh, threads=threads).options if glb else {}
 
 
 def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int | None = None) -> AlphaChoice:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats._core.library import processors
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -16,6 +19,8 @@ _REACH = 3.0
 FRAGMENTS_A_SECOND = 1.5e8
 """Of one thread, where layers are many. Nine scenes of 4 to 70 layers have 0.2 to 0.9 of it, a scene of
 51,000 layers 1.2."""
+MANY_LAYERS = 1000
+"""More layers than real scenes have: 4 to 70 of triangles, up to 230 of splats."""
 SMALLEST = 1 / 8
 """How far an image is made smaller at most, to cost less."""
 
@@ -63,6 +68,14 @@ def layers(scene: SplatMesh | GaussianCloud, camera: Camera) -> float:
 def fragments(scene: SplatMesh | GaussianCloud, camera: Camera, samples: int) -> float:
     """Number of fragments of an image, with ``samples`` x ``samples`` in each pixel."""
     return layers(scene, camera) * camera.width * camera.height * samples**2
+
+
+def estimated_seconds(
+    scene: SplatMesh | GaussianCloud, cameras: Sequence[Camera], samples: int, threads: int | None = None
+) -> float:
+    """Time that images from ``cameras`` take where layers are many, by up to eight of them."""
+    each = float(np.mean([fragments(scene, camera, samples) for camera in subsample(cameras, 8)]))
+    return each * len(cameras) / FRAGMENTS_A_SECOND / (threads or processors())
 
 
 def affordable(scene: SplatMesh | GaussianCloud, camera: Camera, samples: int, most: float) -> Camera | None:

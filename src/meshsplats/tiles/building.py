@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._files.atomic import atomic_path
+from meshsplats._files.atomic import atomic_path, replace_folder
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
 from meshsplats.camera import Camera
@@ -120,14 +120,7 @@ def build_tiles(
         _check_folders(target, unfinished, resume, replace_old)
         build = _Build(source, unfinished, chosen, conversion, threads, workers, on_progress)
         summary = build.run()
-        if target.exists():
-            old = target.with_name(f".{target.name}.old")
-            shutil.rmtree(old, ignore_errors=True)
-            os.rename(target, old)
-            os.rename(unfinished / "tileset", target)
-            shutil.rmtree(old)
-        else:
-            os.rename(unfinished / "tileset", target)
+        replace_folder(unfinished / "tileset", target)
         shutil.rmtree(unfinished)
     return summary
 

@@ -29,7 +29,10 @@ from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_mesh
 from meshsplats.webgpu import device, frames, kernels
 
-MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
+MODULES = (
+    *("scene.js", "camera.js", "controls.js", "crop.js", "order.js", "sorted.js", "arrays.js"),
+    *("exact.js", "status.js", "app.js"),
+)
 """The scripts of the page, in the order in which they are joined."""
 
 MOST_CAMERAS = 2000

@@ -25,9 +25,9 @@ const NO_GROUP = 0xffffffffu;
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 
-// `mesh` holds the faces, three vertex indices each; from runs_at on the runs, first face | (count - 1) << 29;
-// with depth groups, from face_groups_at on the group of each face, from group_faces_at on the largest face of
-// each group.
+// `mesh` holds the faces, three vertex indices each; from runs_at on the runs, first face | (count - 1) <<
+// 29; with depth groups, from face_groups_at on the group of each face, from group_faces_at on the largest
+// face of each group.
 struct Run { first: u32, count: u32 };
 fn unpack_run(bits: u32) -> Run { return Run(bits & 0x1fffffffu, (bits >> 29u) + 1u); }
 
@@ -37,10 +37,10 @@ fn pack_depth(q: f32) -> u32 { return 0xffffffu - min((bitcast<u32>(q) >> 7u) + 
 fn unpack_depth(x: u32) -> f32 { return bitcast<f32>((0xffffffu - (x & 0xffffffu)) << 7u); }
 const NO_TILE = 0xffffu;
 
-// ------------------------------------------------------------------------------------------------ pairs of numbers
+// -------------------------------------------------------------------------------- pairs of numbers
 //
-// A vec2f stands for the sum of its two numbers: twice the precision (Dekker 1971). Compilers may contract, reassociate
-// and take a + b - a for b, but not across integers: `kept` has the value of x, rounded.
+// A vec2f stands for the sum of its two numbers: twice the precision (Dekker 1971). Compilers may contract,
+// reassociate and take a + b - a for b, but not across integers: `kept` has the value of x, rounded.
 
 fn kept(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ bitcast<u32>(frame.right.w)); }
 fn sum_of(a: f32, b: f32) -> vec2f {
@@ -70,16 +70,17 @@ fn invert_pair(a: vec2f) -> vec2f {
   return sum_of(inverse, inverse * (((1.0 - one.x) - one.y) - inverse * a.y));
 }
 
-// ------------------------------------------------------------------------------------------------ projected vertices
+// -------------------------------------------------------------------------------- projected vertices
 //
-// Of a vertex beyond the near plane, x and y in samples and 1 / z are stored with 37 bits each, in four words: float32
-// with an exponent of six bits, and 13 bits of what rounding left, in 1/8190 of a unit in the last place. The words:
+// Of a vertex beyond the near plane, x and y in samples and 1 / z are stored with 37 bits each, in four
+// words: float32 with an exponent of six bits, and 13 bits of what rounding left, in 1/8190 of a unit in the
+// last place. The words:
 //   sign of x, 2 bits of its rest, exponent, mantissa
 //   the same of y
 //   3 bits of the rest of 1 / z, exponent, mantissa; never 0
 //   11 bits of the rest of x, 11 of y, 10 of 1 / z, from the lowest bit on
-// Coordinates reach from 2^-20 to 2^43, 1 / z to 2^-61 of that of the near plane. A nearer vertex has the words
-// (fx X + cx Z, fy Y + cy Z, 0, Z), as float32.
+// Coordinates reach from 2^-20 to 2^43, 1 / z to 2^-61 of that of the near plane. A nearer vertex has the
+// words (fx X + cx Z, fy Y + cy Z, 0, Z), as float32.
 
 struct Place { x: vec2f, y: vec2f, w: vec2f };  // beyond the near plane: pairs; w is 1 / z
 
@@ -89,7 +90,9 @@ fn least_exponents() -> vec3u {  // less 1, of x, y and 1 / z, in place
   let near = bitcast<u32>(frame.near) >> 23u;
   return vec3u(106u, 106u, max(254u - min(near, 192u), 62u) - 62u) << vec3u(23u);
 }
-fn last_place(x: vec3f) -> vec3f { return bitcast<vec3f>(bitcast<vec3u>(x) & vec3u(0x7f800000u)) * 1.1920929e-7; }
+fn last_place(x: vec3f) -> vec3f {
+  return bitcast<vec3f>(bitcast<vec3u>(x) & vec3u(0x7f800000u)) * 1.1920929e-7;
+}
 fn pack_place(p: Place) -> vec4u {
   let x = vec3f(p.x.x, p.y.x, p.w.x);
   let rest = vec3f(p.x.y, p.y.y, p.w.y);
@@ -102,7 +105,8 @@ fn pack_place(p: Place) -> vec4u {
     sign | ((r.xy >> vec2u(11u)) << vec2u(29u)) | bits.xy, max(bits.z, 1u) | ((r.z >> 10u) << 29u),
     (r.x & 0x7ffu) | ((r.y & 0x7ffu) << 11u) | ((r.z & 0x3ffu) << 22u));
 }
-// (x, y, 1 / z, 0), rounded to float32; (fx X + cx Z, fy Y + cy Z, 0, Z) where it is nearer than the near plane.
+// (x, y, 1 / z, 0), rounded to float32; (fx X + cx Z, fy Y + cy Z, 0, Z) where it is nearer than the near
+// plane.
 fn unpack_vertex(v: vec4u) -> vec4f {
   if (v.z == 0u) { return bitcast<vec4f>(v); }
   let bits = v.xyz & vec3u(FLOAT);

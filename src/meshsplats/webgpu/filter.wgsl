@@ -1,13 +1,16 @@
-// Backward pass of the low-pass filter: replaces the gradients of the moved vertices of each fan by those of its own
-// positions, and adds those of opacities. Both are in the axes of the camera.
+// Backward pass of the low-pass filter: replaces the gradients of the moved vertices of each fan by those of
+// its own positions, and adds those of opacities. Both are in the axes of the camera.
 //
 // A A = I + s M^-1. For a gradient G of A, the Sylvester equation A X + X A = G has the solution
-// X = (det A G + adj A G adj A) / (2 tr A det A), and H = -s M^-1 X M^-1 is the gradient of M. With C that of the mean,
-// the density of opacity has the gradient (q^T H q + C . q - H : M) / mass at q, relative to the mean; the integrals
-// of lists.wgsl take it to opacities, positions and areas. All is relative to the mean, along the axes of the fan.
+// X = (det A G + adj A G adj A) / (2 tr A det A), and H = -s M^-1 X M^-1 is the gradient of M. With C that of
+// the mean, the density of opacity has the gradient (q^T H q + C . q - H : M) / mass at q, relative to the
+// mean; the integrals of lists.wgsl take it to opacities, positions and areas. All is relative to the mean,
+// along the axes of the fan.
 
-@group(0) @binding(22) var<storage, read_write> gradients: array<vec4f>;   // two by vertex: position, RGB and opacity
-@group(0) @binding(23) var<storage, read> vertex_corners: array<u32>;      // (vertices + 1) first corner; then 3 face + corner
+// two by vertex: position, RGB and opacity
+@group(0) @binding(22) var<storage, read_write> gradients: array<vec4f>;
+// (vertices + 1) first corner; then 3 face + corner
+@group(0) @binding(23) var<storage, read> vertex_corners: array<u32>;
 
 // Whether a corner is the first of its vertex: loops over the triangles of a fan meet each vertex once so.
 fn is_first(corner: u32, vertex: u32) -> bool {
@@ -23,7 +26,9 @@ fn congruence(a: vec3f, b: vec3f) -> vec3f {
 }
 fn apply(m: vec3f, x: vec2f) -> vec2f { return vec2f(m.x * x.x + m.y * x.y, m.y * x.x + m.z * x.y); }
 fn turn(axis: vec2f, x: vec2f) -> vec2f { return vec2f(dot(axis, x), axis.x * x.y - axis.y * x.x); }
-fn turn_back(axis: vec2f, x: vec2f) -> vec2f { return vec2f(axis.x * x.x - axis.y * x.y, axis.y * x.x + axis.x * x.y); }
+fn turn_back(axis: vec2f, x: vec2f) -> vec2f {
+  return vec2f(axis.x * x.x - axis.y * x.y, axis.y * x.x + axis.x * x.y);
+}
 
 // From the gradient g of a position p in the image, relative to the principal point, to camera space.
 fn to_position(g: vec2f, p: vec2f, w: f32) -> vec3f { return vec3f(frame.lens.xy * g * w, -dot(g, p) * w); }
@@ -34,7 +39,9 @@ fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
   let begin = fans[id.x];
   let end = fans[id.x + 1u];
   var reached = false;
-  for (var c = 3u * begin; c < 3u * end; c++) { reached = reached || any(gradients[2u * mesh[c]].xyz != vec3f(0.0)); }
+  for (var c = 3u * begin; c < 3u * end; c++) {
+    reached = reached || any(gradients[2u * mesh[c]].xyz != vec3f(0.0));
+  }
   if (!reached) { return; }
   let fan = fan_of(begin, end);
   if (!fan.moves) { return; }
@@ -63,7 +70,8 @@ fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
     gradients[2u * i] = vec4f(frame.lens.xy * unmoved * w, t.z + depth * w, 0.0);
   }
   let det = fan.a.x * fan.a.z - fan.a.y * fan.a.y;
-  let by_a = (det * grad_a + congruence(vec3f(fan.a.z, -fan.a.y, fan.a.x), grad_a)) / (2.0 * (fan.a.x + fan.a.z) * det);
+  let by_a = (det * grad_a + congruence(vec3f(fan.a.z, -fan.a.y, fan.a.x), grad_a)) /
+    (2.0 * (fan.a.x + fan.a.z) * det);
   let m = fan.covariance + vec3f(MIN_VARIANCE * s, 0.0, MIN_VARIANCE * s);
   let h = -s * congruence(vec3f(m.z, -m.y, m.x) / (m.x * m.z - m.y * m.y), by_a);
   let level = h.x * fan.covariance.x + 2.0 * h.y * fan.covariance.y + h.z * fan.covariance.z;
@@ -100,11 +108,13 @@ fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
     var integral = 0.0;
     var by_alpha: vec3f;
     for (var j = 0u; j < 3u; j++) {
-      by_alpha[j] = sum_h_sum + 2.0 * dot(q[j].xy, h_sum) + (quadratic.x + quadratic.y + quadratic.z) + 2.0 * quadratic[j]
+      by_alpha[j] = sum_h_sum + 2.0 * dot(q[j].xy, h_sum) + (quadratic.x + quadratic.y + quadratic.z) +
+        2.0 * quadratic[j]
         + 5.0 * (linear.x + linear.y + linear.z + linear[j]) - 20.0 * level;
       integral += a[j] * by_alpha[j];
       grad[j] = vec3f(
-        scale * (2.0 * (total + a[j]) * h_sum + 2.0 * h_alpha + 2.0 * (total + 2.0 * a[j]) * hq[j] + 5.0 * (total + a[j]) * c),
+        scale * (2.0 * (total + a[j]) * h_sum + 2.0 * h_alpha + 2.0 * (total + 2.0 * a[j]) * hq[j] +
+          5.0 * (total + a[j]) * c),
         0.0);
     }
     let grad_normal = integral / fan.mass * normal / select(1.0, area, area > 0.0);
@@ -121,5 +131,6 @@ fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
       grad_k += grad[j].z * p[j].z;
     }
   }
-  gradients[2u * mesh[3u * begin]].z += grad_k / fan.origin.z;  // k is proportional to the depth of the first vertex
+  // k is proportional to the depth of the first vertex
+  gradients[2u * mesh[3u * begin]].z += grad_k / fan.origin.z;
 }

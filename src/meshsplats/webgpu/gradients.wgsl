@@ -1,26 +1,33 @@
 // Backward pass: from the tape to the gradients of vertices.
 //
-// With B_k, the radiance behind fragment k, B_k = a_{k+1} c_{k+1} + (1 - a_{k+1}) B_{k+1} and the background at the
-// end, dC/dc_k = T_k a_k and dC/da_k = T_k (c_k - B_k). `find_behind` goes through the tape of a sample from back to
-// front, so nothing is divided by 1 - a.
+// With B_k, the radiance behind fragment k, B_k = a_{k+1} c_{k+1} + (1 - a_{k+1}) B_{k+1} and the background
+// at the end, dC/dc_k = T_k a_k and dC/da_k = T_k (c_k - B_k). `find_behind` goes through the tape of a
+// sample from back to front, so nothing is divided by 1 - a.
 //
-// Values are v = sum_j b_j v_j with the weights b_j = s_j / sum s of the corners j, s = A p, p = (x, y, 1), and A the
-// inverse of the matrix V whose columns are the corners, (x, y, 1) times depth. As ds = -A dV s, a gradient g of v
-// gives
-//     R_j = dL/dv_j = sum b_j g,  dL/dV_j = -sum_k A_k^T (R_j . (v_k - v_0) - N_j),  N_j = sum b_j g . (v - v_0)
-// with sums over the samples. So a triangle needs fifteen sums. Those of each tile have a place of their own; a
-// triangle adds its tiles and a vertex its triangles, in fixed orders: gradients have the same bits every time.
+// Values are v = sum_j b_j v_j with the weights b_j = s_j / sum s of the corners j, s = A p, p = (x, y, 1),
+// and A the inverse of the matrix V whose columns are the corners, (x, y, 1) times depth. As ds = -A dV s, a
+// gradient g of v gives
+//     R_j = dL/dv_j = sum b_j g,  N_j = sum b_j g . (v - v_0),
+//     dL/dV_j = -sum_k A_k^T (R_j . (v_k - v_0) - N_j)
+// with sums over the samples. So a triangle needs fifteen sums. Those of each tile have a place of their own;
+// a triangle adds its tiles and a vertex its triangles, in fixed orders: gradients have the same bits every
+// time.
 
-@group(0) @binding(10) var<storage, read> offsets: array<u32>;             // by run: its first pair in the order of emit
-@group(0) @binding(11) var<storage, read> run_boxes: array<vec2u>;         // by run: its tiles, as bound_runs has them
+@group(0) @binding(10) var<storage, read> offsets: array<u32>;  // by run: its first pair in the order of emit
+// by run: its tiles, as bound_runs has them
+@group(0) @binding(11) var<storage, read> run_boxes: array<vec2u>;
 @group(0) @binding(12) var<storage, read> plan: array<u32>;                // at 9 the count of pairs
 @group(0) @binding(13) var<storage, read_write> fragment_starts: array<u32>;  // by sorted pair
 @group(0) @binding(14) var<storage, read_write> sum_starts: array<u32>;    // by pair in the order of emit
-@group(0) @binding(15) var<storage, read_write> marked: array<u32>;        // likewise: its triangles with fragments, one bit each
-@group(0) @binding(16) var<storage, read_write> tile_sums: array<vec4f>;   // four of each triangle in each tile: R_0, R_1, R_2, N
+// likewise: its triangles with fragments, one bit each
+@group(0) @binding(15) var<storage, read_write> marked: array<u32>;
+// four of each triangle in each tile: R_0, R_1, R_2, N
+@group(0) @binding(16) var<storage, read_write> tile_sums: array<vec4f>;
 @group(0) @binding(17) var<storage, read_write> face_sums: array<vec4f>;   // the same by face
-@group(0) @binding(18) var<storage, read> vertex_corners: array<u32>;      // (vertices + 1) first corner; then 3 face + corner
-@group(0) @binding(19) var<storage, read_write> gradients: array<vec4f>;   // two by vertex: position, RGB and opacity
+// (vertices + 1) first corner; then 3 face + corner
+@group(0) @binding(18) var<storage, read> vertex_corners: array<u32>;
+// two by vertex: position, RGB and opacity
+@group(0) @binding(19) var<storage, read_write> gradients: array<vec4f>;
 
 const MOST_FRAGMENTS = 60000u;  // of a sample
 
@@ -35,7 +42,7 @@ fn emitted(pair: vec2u) -> u32 {
   return offsets[run] + (tile / frame.tiles_x - (box.y & 0xffffu)) * columns + (tile % frame.tiles_x - x0);
 }
 
-// ------------------------------------------------------------------------------------------------ places on the tape
+// -------------------------------------------------------------------------------- places on the tape
 
 @compute @workgroup_size(256)
 fn count_marks(@builtin(global_invocation_id) id: vec3u) {
@@ -85,9 +92,10 @@ fn place_marks(@builtin(global_invocation_id) id: vec3u) {
 }
 fn add_limited(a: u32, b: u32) -> u32 { return min(a, 0xffffffffu - b) + b; }
 
-// ------------------------------------------------------------------------------------------------ samples
+// -------------------------------------------------------------------------------- samples
 
-// Replaces a record of the tape by the gradients of the fragment's colour, per gradient of the sample's, and opacity.
+// Replaces a record of the tape by the gradients of the fragment's colour, per gradient of the sample's, and
+// opacity.
 @compute @workgroup_size(8, 8)
 fn find_behind(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= frame.width || id.y >= frame.height) { return; }
@@ -105,7 +113,7 @@ fn find_behind(@builtin(global_invocation_id) id: vec3u) {
   if (at != NONE) { atomicStore(&counters[15], 1u); }
 }
 
-// ------------------------------------------------------------------------------------------------ triangles
+// -------------------------------------------------------------------------------- triangles
 
 // Adds the samples of a triangle in a tile.
 @compute @workgroup_size(256)
@@ -137,7 +145,8 @@ fn add_tile(i: u32, k: u32) {
   if (!all(scale > vec3f(0.0))) {
     let z = vec3f(depth_of(p[0].p), depth_of(p[1].p), depth_of(p[2].p));
     scale = vec3f(
-      select(1.0, z.y * z.z, scale.y > 0.0 && scale.z > 0.0), select(1.0, z.z * z.x, scale.z > 0.0 && scale.x > 0.0),
+      select(1.0, z.y * z.z, scale.y > 0.0 && scale.z > 0.0),
+        select(1.0, z.z * z.x, scale.z > 0.0 && scale.x > 0.0),
       select(1.0, z.x * z.y, scale.x > 0.0 && scale.y > 0.0));
   }
   var at = atomicLoad(&counters[first_of(source)]);
@@ -174,7 +183,8 @@ fn edge_of(e: Edge, p: vec2f) -> f32 { return edge_at(vec4f(e.a, e.b, e.x, e.y),
 var<workgroup> parts: array<array<vec4f, 4>, 64>;
 @compute @workgroup_size(64)
 fn add_tiles(
-  @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) size: vec3u, @builtin(local_invocation_index) t: u32) {
+  @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) size: vec3u,
+    @builtin(local_invocation_index) t: u32) {
   let r = wg.y * size.x + wg.x;
   if (r >= frame.runs) { return; }
   let k = t % RUN;
@@ -197,7 +207,7 @@ fn add_tiles(
   if (t < run.count) { for (var c = 0u; c < 4u; c++) { face_sums[4u * (run.first + t) + c] = parts[t][c]; } }
 }
 
-// ------------------------------------------------------------------------------------------------ vertices
+// -------------------------------------------------------------------------------- vertices
 
 // The rows of A for the origin o, in the image.
 struct Inverse { a: array<vec3f, 3>, o: vec2f };

@@ -1,6 +1,7 @@
 // The part of raster.wgsl for images: a sample ends when nothing more is visible, and nothing is recorded.
 
-@group(0) @binding(3) var<storage, read> values: array<vec4f>;   // by vertex: RGB, normal or world position; opacity
+// by vertex: RGB, normal or world position; opacity
+@group(0) @binding(3) var<storage, read> values: array<vec4f>;
 fn value_of(vertex: u32) -> vec4f { return values[vertex]; }
 
 const TRANSPARENT = false;     // whether fragments without opacity count
@@ -10,7 +11,8 @@ fn keep_source(at: u32, source: u32) {}
 fn move_source(to: u32, at: u32) {}
 
 fn is_open() -> bool {
-  return through > 0.0 && through >= frame.min_transmittance && (frame.max_layers == 0u || layers < frame.max_layers);
+  return through > 0.0 && through >= frame.min_transmittance &&
+    (frame.max_layers == 0u || layers < frame.max_layers);
 }
 
 fn blend_front() {
@@ -50,5 +52,7 @@ fn resume(index: u32, state_index: u32) -> bool {
 
 fn suspend(index: u32, state_index: u32, again: bool, needed: bool) {
   samples[index] = bitcast<vec4u>(vec4f(rgb, through));
-  if (needed) { samples[state_index] = vec4u(bitcast<u32>(floor_q), floor_face, layers, select(0u, 1u, again)); }
+  if (needed) {
+    samples[state_index] = vec4u(bitcast<u32>(floor_q), floor_face, layers, select(0u, 1u, again));
+  }
 }

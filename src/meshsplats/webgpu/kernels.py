@@ -34,7 +34,7 @@ OUTPUTS: tuple[Output, ...] = ("color", "depth", "vertex_normals", "face_normals
 
 def lists_source() -> str:
     """WGSL of the kernels that make the tile lists, and of ``resolve``."""
-    return _text("common.wgsl") + _text("lists.wgsl")
+    return _text("common.wgsl") + _text("lists.wgsl") + _text("sorting.wgsl")
 
 
 def raster_source(queue: int = QUEUE, *, output: Output = "color", groups: bool = False) -> str:
@@ -70,7 +70,8 @@ def training_source() -> str:
 def _raster_source(queue: int, output: Output, groups: bool) -> str:
     if queue < 2:
         raise ValueError(f"queue must be at least 2, got {queue}")
-    text = _text("raster.wgsl").replace("$OUTPUT", str(OUTPUTS.index(output)))
+    text = _text("raster.wgsl") + _text("triangles.wgsl")
+    text = text.replace("$OUTPUT", str(OUTPUTS.index(output)))
     text = text.replace("$GROUPS", str(groups).lower()).replace("$K", str(queue))
     return _text("common.wgsl") + text
 

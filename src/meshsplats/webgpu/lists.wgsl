@@ -3,36 +3,38 @@
 @group(0) @binding(1) var<storage, read> vertices: array<f32>;             // (vertices, 3) world space
 @group(0) @binding(2) var<storage, read> values: array<vec4f>;             // by vertex: RGB and opacity
 @group(0) @binding(3) var<storage, read> mesh: array<u32>;
-@group(0) @binding(4) var<storage, read> fans: array<u32>;                 // (fans + 1) first face of each fan
+@group(0) @binding(4) var<storage, read> fans: array<u32>;  // (fans + 1) first face of each fan
 @group(0) @binding(5) var<storage, read> projected: array<vec4u>;
 @group(0) @binding(6) var<storage, read_write> projected_out: array<vec4u>;
-@group(0) @binding(7) var<storage, read_write> group_bounds: array<atomic<u32>>;  // by group: largest 1 / z, complement of the least
-@group(0) @binding(8) var<storage, read_write> boxes_out: array<vec2u>;    // by run: x0 | x1 << 16, y0 | y1 << 16, in tiles
+// by group: largest 1 / z, complement of the least
+@group(0) @binding(7) var<storage, read_write> group_bounds: array<atomic<u32>>;
+// by run: x0 | x1 << 16, y0 | y1 << 16, in tiles
+@group(0) @binding(8) var<storage, read_write> boxes_out: array<vec2u>;
 @group(0) @binding(9) var<storage, read> boxes: array<vec2u>;
 @group(0) @binding(10) var<storage, read_write> scanned: array<u32>;
 @group(0) @binding(11) var<storage, read_write> sums: array<u32>;
 @group(0) @binding(12) var<storage, read_write> plan_out: array<u32>;
-@group(0) @binding(13) var<storage, read> plan: array<u32>;                // dispatch sizes; at 9 the count of pairs
+@group(0) @binding(13) var<storage, read> plan: array<u32>;  // dispatch sizes; at 9 the count of pairs
 @group(0) @binding(14) var<storage, read> offsets: array<u32>;             // by run: its first pair
 @group(0) @binding(15) var<storage, read_write> pairs_out: array<vec2u>;
 @group(0) @binding(16) var<storage, read> pairs: array<vec2u>;
 @group(0) @binding(17) var<uniform> digit: Digit;
-@group(0) @binding(18) var<storage, read_write> work_out: array<u32>;      // from 4 on, four words for each tile
+@group(0) @binding(18) var<storage, read_write> work_out: array<u32>;  // from 4 on, four words for each tile
 @group(0) @binding(19) var<storage, read_write> counters: array<atomic<u32>>;
 @group(0) @binding(20) var<storage, read> samples_in: array<vec4u>;
 @group(0) @binding(21) var<storage, read_write> pixels: array<vec4f>;
 
 struct Digit { shift: u32, word: u32, of_table: u32, unused: u32 };
 
-// ------------------------------------------------------------------------------------------------ vertices
+// -------------------------------------------------------------------------------- vertices
 
 fn rotate(d: vec3f) -> vec3f {
   return vec3f(dot(frame.right.xyz, d), dot(frame.down.xyz, d), dot(frame.forward.xyz, d));
 }
 fn world(i: u32) -> vec3f { return vec3f(vertices[3u * i], vertices[3u * i + 1u], vertices[3u * i + 2u]); }
 
-// Positions in the image are computed with pairs of numbers: a sample of a tiny triangle is easily on the wrong side
-// of an edge, and two layers easily in the wrong order.
+// Positions in the image are computed with pairs of numbers: a sample of a tiny triangle is easily on the
+// wrong side of an edge, and two layers easily in the wrong order.
 fn along(axis: vec4f, rest: vec4f, x: vec2f, y: vec2f, z: vec2f) -> vec2f {
   let xy = add_pairs(multiply_pairs(vec2f(axis.x, rest.x), x), multiply_pairs(vec2f(axis.y, rest.y), y));
   return add_pairs(xy, multiply_pairs(vec2f(axis.z, rest.z), z));
@@ -56,8 +58,10 @@ fn to_camera(p: vec3f) -> vec3f {
 fn place_of(c: Point) -> Place {
   let inverse = invert_pair(c.z);
   return Place(
-    add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.x, frame.lens_rest.x), c.x), inverse), vec2f(frame.lens.z, frame.lens_rest.z)),
-    add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.y, frame.lens_rest.y), c.y), inverse), vec2f(frame.lens.w, frame.lens_rest.w)),
+    add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.x, frame.lens_rest.x), c.x), inverse),
+      vec2f(frame.lens.z, frame.lens_rest.z)),
+    add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.y, frame.lens_rest.y), c.y), inverse),
+      vec2f(frame.lens.w, frame.lens_rest.w)),
     inverse);
 }
 
@@ -79,15 +83,16 @@ fn project(@builtin(global_invocation_id) id: vec3u) {
   }
 }
 
-// ------------------------------------------------------------------------------------------------ low-pass filter
+// -------------------------------------------------------------------------------- low-pass filter
 //
-// Moves the projected vertices p of each fan to c + A (p - c), A = (I + s M^-1)^(1/2), where c and M are mean and
-// covariance of its opacity in the image and s the variance of the filter. For a triangle of area T with opacities
-// a_i at q_i, a = sum a_i, Q = sum q_i and B = sum a_i q_i, the integrals of opacity times 1, q and q q^T are
-// T a / 3, T / 12 (a Q + B) and T / 60 (a Q Q^T + B Q^T + Q B^T + sum (a + 2 a_i) q_i q_i^T).
+// Moves the projected vertices p of each fan to c + A (p - c), A = (I + s M^-1)^(1/2), where c and M are mean
+// and covariance of its opacity in the image and s the variance of the filter. For a triangle of area T with
+// opacities a_i at q_i, a = sum a_i, Q = sum q_i and B = sum a_i q_i, the integrals of opacity times 1, q and
+// q q^T are T a / 3, T / 12 (a Q + B) and T / 60 (a Q Q^T + B Q^T + Q B^T + sum (a + 2 a_i) q_i q_i^T).
 //
-// In f32, the narrow direction of a needle would drown in its length. So a first loop finds the axes of the fan, and
-// a second one takes the moments along them. Positions are relative to a vertex of the fan from the start.
+// In f32, the narrow direction of a needle would drown in its length. So a first loop finds the axes of the
+// fan, and a second one takes the moments along them. Positions are relative to a vertex of the fan from the
+// start.
 
 const MIN_VARIANCE = 1e-4;  // added to M, as a share of the filter's variance
 const DEPTH_SHARE = 0.1;    // extent of depth, against that in the image, in the area of a triangle
@@ -162,7 +167,8 @@ fn fan_of(begin: u32, end: u32) -> Fan {
   fan.mean = m.mean / m.mass;
   let s = frame.filter_variance;
   let mean = fan.mean;
-  fan.covariance = vec3f(m.xx / m.mass - mean.x * mean.x, m.xy / m.mass - mean.x * mean.y, m.yy / m.mass - mean.y * mean.y);
+  fan.covariance = vec3f(m.xx / m.mass - mean.x * mean.x, m.xy / m.mass - mean.x * mean.y,
+    m.yy / m.mass - mean.y * mean.y);
   let uu = m.xx / m.mass - mean.x * mean.x + MIN_VARIANCE * s;
   let uv = m.xy / m.mass - mean.x * mean.y;
   let vv = m.yy / m.mass - mean.y * mean.y + MIN_VARIANCE * s;
@@ -191,7 +197,8 @@ fn widen(@builtin(global_invocation_id) id: vec3u) {
       let p = fan_position(i, fan.first, fan.origin).xy - fan.middle;
       let q = vec2f(dot(fan.axis, p), fan.axis.x * p.y - fan.axis.y * p.x) - fan.mean;
       let r = fan.mean + vec2f(fan.a.x * q.x + fan.a.y * q.y, fan.a.y * q.x + fan.a.z * q.y);
-      let moved = fan.middle + vec2f(fan.axis.x * r.x - fan.axis.y * r.y, fan.axis.y * r.x + fan.axis.x * r.y);
+      let moved = fan.middle + vec2f(fan.axis.x * r.x - fan.axis.y * r.y,
+        fan.axis.y * r.x + fan.axis.x * r.y);
       let x = add_pairs(start.x, vec2f(moved.x, 0.0));
       let y = add_pairs(start.y, vec2f(moved.y, 0.0));
       let unmoved = projected_out[i];
@@ -201,10 +208,10 @@ fn widen(@builtin(global_invocation_id) id: vec3u) {
   }
 }
 
-// ------------------------------------------------------------------------------------------------ depth groups
+// -------------------------------------------------------------------------------- depth groups
 //
-// Behind the vertices, `projected` holds two vec4f for each group: (x, y, 1 / z there, unused) and (slope along x,
-// along y, least 1 / z, largest 1 / z) of the plane of its largest face.
+// Behind the vertices, `projected` holds two vec4f for each group: (x, y, 1 / z there, unused) and (slope
+// along x, along y, least 1 / z, largest 1 / z) of the plane of its largest face.
 
 @compute @workgroup_size(256)
 fn bound_groups(@builtin(global_invocation_id) id: vec3u) {
@@ -213,7 +220,8 @@ fn bound_groups(@builtin(global_invocation_id) id: vec3u) {
   if (g == NO_GROUP) { return; }
   for (var k = 0u; k < 3u; k++) {
     let p = unpack_vertex(projected[mesh[3u * id.x + k]]);
-    let bits = bitcast<u32>(select(1.0 / frame.near, p.z, p.z > 0.0));  // floats > 0 are ordered as their bits
+    // floats > 0 are ordered as their bits
+    let bits = bitcast<u32>(select(1.0 / frame.near, p.z, p.z > 0.0));
     atomicMax(&group_bounds[2u * g], bits);
     atomicMax(&group_bounds[2u * g + 1u], ~bits);
   }
@@ -253,7 +261,7 @@ fn plane_slope(p: vec4f, q: vec4f, r: vec4f) -> vec3f {
   return vec3f(0.0);
 }
 
-// ------------------------------------------------------------------------------------------------ tiles of runs
+// -------------------------------------------------------------------------------- tiles of runs
 
 // How far outside of its box rounding may find a sample inside of a triangle.
 fn slack(low: vec2f, high: vec2f) -> vec2f { return vec2f(1e-3) + 1e-6 * max(abs(low), abs(high)); }
@@ -269,7 +277,8 @@ fn bound_runs(@builtin(global_invocation_id) id: vec3u) {
   for (var i = 0u; i < run.count; i++) {
     let f = 3u * (run.first + i);
     let p = array<vec4f, 3>(
-      unpack_vertex(projected[mesh[f]]), unpack_vertex(projected[mesh[f + 1u]]), unpack_vertex(projected[mesh[f + 2u]]));
+      unpack_vertex(projected[mesh[f]]), unpack_vertex(projected[mesh[f + 1u]]),
+        unpack_vertex(projected[mesh[f + 2u]]));
     var a = vec2f(3e38);
     var b = vec2f(-3e38);
     var visible = 0u;
@@ -312,87 +321,10 @@ fn bound_runs(@builtin(global_invocation_id) id: vec3u) {
   scanned[id.x] = count;
 }
 
-// ------------------------------------------------------------------------------------------------ exclusive prefix sums
-//
-// In three dispatches, of the counts by run, of the table of digits (of_table is 1), or of counts by pair (2). Sums
-// saturate: too many pairs stay too many.
+// -------------------------------------------------------------------------------- pairs
 
-const BLOCK = 2048u;  // items of one workgroup
-fn blocks(n: u32) -> u32 { return (n + BLOCK - 1u) / BLOCK; }
-fn add_saturated(a: u32, b: u32) -> u32 { return min(a, 0xffffffffu - b) + b; }
-fn scan_length() -> u32 {
-  if (digit.of_table == 1u) { return 256u * blocks(plan[9]); }
-  if (digit.of_table == 2u) { return plan[9]; }
-  return frame.runs;
-}
-
-var<workgroup> parts: array<u32, 256>;
-fn scan_workgroup(t: u32, value: u32) -> u32 {  // inclusive
-  parts[t] = value;
-  workgroupBarrier();
-  for (var step = 1u; step < 256u; step *= 2u) {
-    var sum = parts[t];
-    if (t >= step) { sum = add_saturated(sum, parts[t - step]); }
-    workgroupBarrier();
-    parts[t] = sum;
-    workgroupBarrier();
-  }
-  return parts[t];
-}
-fn before(t: u32) -> u32 {  // the sum of the invocations before t, after scan_workgroup
-  if (t == 0u) { return 0u; }
-  return parts[t - 1u];
-}
-
-@compute @workgroup_size(256)
-fn scan_blocks(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: u32) {
-  let n = scan_length();
-  let at = wg.x * BLOCK + 8u * t;
-  var items: array<u32, 8>;
-  var sum = 0u;
-  for (var k = 0u; k < 8u; k++) {
-    if (at + k < n) { items[k] = scanned[at + k]; }
-    sum = add_saturated(sum, items[k]);
-  }
-  let all = scan_workgroup(t, sum);
-  var start = before(t);
-  for (var k = 0u; k < 8u; k++) {
-    if (at + k < n) { scanned[at + k] = start; }
-    start = add_saturated(start, items[k]);
-  }
-  if (t == 255u) { sums[wg.x] = all; }
-}
-
-// One workgroup. The total goes behind the sums.
-@compute @workgroup_size(256)
-fn scan_sums(@builtin(local_invocation_index) t: u32) {
-  let n = blocks(scan_length());
-  var carry = 0u;
-  for (var at = 0u; at < n; at += 256u) {
-    var value = 0u;
-    if (at + t < n) { value = sums[at + t]; }
-    scan_workgroup(t, value);
-    if (at + t < n) { sums[at + t] = add_saturated(carry, before(t)); }
-    carry = add_saturated(carry, parts[255]);
-    workgroupBarrier();
-  }
-  if (t == 0u) { sums[n] = carry; }
-}
-
-@compute @workgroup_size(256)
-fn scan_add(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: u32) {
-  let n = scan_length();
-  let start = sums[wg.x];
-  for (var k = 0u; k < 8u; k++) {
-    let i = wg.x * BLOCK + k * 256u + t;
-    if (i < n) { scanned[i] = add_saturated(scanned[i], start); }
-  }
-}
-
-// ------------------------------------------------------------------------------------------------ pairs
-
-// Writes how many workgroups the later dispatches have. Lists that are too short stay empty: the host enlarges them
-// and renders again.
+// Writes how many workgroups the later dispatches have. Lists that are too short stay empty: the host
+// enlarges them and renders again.
 @compute @workgroup_size(1)
 fn make_plan() {
   let needed = sums[blocks(frame.runs)];
@@ -407,7 +339,8 @@ fn make_plan() {
   for (var i = 0u; i < 9u; i += 3u) { plan_out[i + 1u] = 1u; plan_out[i + 2u] = 1u; }
 }
 
-// An upper bound of the keys of a run at the samples of the tile with the corner `corner`; 0 if it covers none.
+// An upper bound of the keys of a run at the samples of the tile with the corner `corner`; 0 if it covers
+// none.
 fn nearest_in_tile(run: Run, corner: vec2f) -> f32 {
   var key = 0.0;
   for (var i = 0u; i < run.count; i++) {
@@ -442,7 +375,8 @@ fn nearest_in_tile(run: Run, corner: vec2f) -> f32 {
       if (g != NO_GROUP) {
         let anchor = bitcast<vec4f>(projected[frame.vertices + 2u * g]);
         let plane = bitcast<vec4f>(projected[frame.vertices + 2u * g + 1u]);
-        let top = anchor.z + dot(plane.xy, 0.5 * (low + high) - anchor.xy) + 1.001 * dot(abs(plane.xy), 0.5 * (high - low));
+        let top = anchor.z + dot(plane.xy, 0.5 * (low + high) - anchor.xy) +
+          1.001 * dot(abs(plane.xy), 0.5 * (high - low));
         nearest = clamp(top, plane.z, plane.w);
       }
     }
@@ -485,75 +419,7 @@ fn emit(@builtin(global_invocation_id) id: vec3u) {
   pairs_out[i] = vec2u(pack_depth(key) | (tile << 24u), low | ((tile >> 8u) << 24u));
 }
 
-// ------------------------------------------------------------------------------------------------ stable radix sort
-//
-// By eight bits: a histogram of each block of pairs, prefix sums of the table (digit, block), and a scatter.
-
-fn digit_of(pair: vec2u) -> u32 { return (select(pair.x, pair.y, digit.word == 1u) >> digit.shift) & 255u; }
-
-var<workgroup> histogram: array<atomic<u32>, 256>;
-@compute @workgroup_size(256)
-fn count_digits(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: u32) {
-  let n = plan[9];
-  atomicStore(&histogram[t], 0u);
-  workgroupBarrier();
-  for (var c = 0u; c < 8u; c++) {
-    let i = wg.x * BLOCK + c * 256u + t;
-    if (i < n) { atomicAdd(&histogram[digit_of(pairs[i])], 1u); }
-  }
-  workgroupBarrier();
-  scanned[t * blocks(n) + wg.x] = atomicLoad(&histogram[t]);
-}
-
-// The rank of a pair among those with its digit is the count of bits below its own in a mask of 256 bits.
-var<workgroup> masks: array<atomic<u32>, 2048>;
-var<workgroup> starts: array<u32, 256>;
-@compute @workgroup_size(256)
-fn scatter(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: u32) {
-  let n = plan[9];
-  starts[t] = scanned[t * blocks(n) + wg.x];
-  for (var c = 0u; c < 8u; c++) {
-    for (var k = 0u; k < 8u; k++) { atomicStore(&masks[k * 256u + t], 0u); }
-    workgroupBarrier();
-    let i = wg.x * BLOCK + c * 256u + t;
-    var pair = vec2u(0u);
-    var d = 0u;
-    if (i < n) {
-      pair = pairs[i];
-      d = digit_of(pair);
-      atomicOr(&masks[8u * d + t / 32u], 1u << (t % 32u));
-    }
-    workgroupBarrier();
-    if (i < n) {
-      var rank = countOneBits(atomicLoad(&masks[8u * d + t / 32u]) & ((1u << (t % 32u)) - 1u));
-      for (var k = 0u; k < t / 32u; k++) { rank += countOneBits(atomicLoad(&masks[8u * d + k])); }
-      pairs_out[starts[d] + rank] = pair;
-    }
-    workgroupBarrier();
-    var count = 0u;
-    for (var k = 0u; k < 8u; k++) { count += countOneBits(atomicLoad(&masks[8u * t + k])); }
-    starts[t] += count;
-    workgroupBarrier();
-  }
-}
-
-// ------------------------------------------------------------------------------------------------ tile lists
-
-fn tile_of(pair: vec2u) -> u32 { return (pair.x >> 24u) | ((pair.y >> 24u) << 8u); }
-
-// Work item of each tile: (unused, first pair, end, 0). The items of empty tiles stay 0.
-@compute @workgroup_size(256)
-fn find_lists(@builtin(global_invocation_id) id: vec3u) {
-  let n = plan[9];
-  let i = id.x;
-  if (i >= n) { return; }
-  let tile = tile_of(pairs[i]);
-  if (tile == NO_TILE) { return; }
-  if (i == 0u || tile_of(pairs[max(i, 1u) - 1u]) != tile) { work_out[4u * (tile + 1u) + 1u] = i; }
-  if (i + 1u == n || tile_of(pairs[min(i + 1u, n - 1u)]) != tile) { work_out[4u * (tile + 1u) + 2u] = i + 1u; }
-}
-
-// ------------------------------------------------------------------------------------------------ pixels
+// -------------------------------------------------------------------------------- pixels
 
 // Averages the samples of each pixel: (sum of weight times RGB, transmittance).
 @compute @workgroup_size(8, 8)
@@ -563,7 +429,9 @@ fn resolve(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= size.x || id.y >= size.y) { return; }
   var sum = vec4f(0.0);
   for (var j = 0u; j < s; j++) {
-    for (var i = 0u; i < s; i++) { sum += bitcast<vec4f>(samples_in[(id.y * s + j) * frame.width + id.x * s + i]); }
+    for (var i = 0u; i < s; i++) {
+      sum += bitcast<vec4f>(samples_in[(id.y * s + j) * frame.width + id.x * s + i]);
+    }
   }
   pixels[id.y * size.x + id.x] = sum * (1.0 / f32(s * s));
 }

@@ -1,17 +1,18 @@
 // The part of raster.wgsl for gradients: the same image, and a tape of its fragments.
 //
-// All fragments of a sample are recorded that the derivatives need: transparent ones, too, and behind opaque ones as
-// many as if these transmitted some light. The tape is filled in two walks. The first marks the samples of each
-// triangle of each pair. Prefix sums of the marks give every fragment its place on the tape, so that the fragments of
-// one triangle in one tile follow each other. The second walk writes them there, linked from back to front. Both
-// walks are one pipeline: they see the same fragments in the same order.
+// All fragments of a sample are recorded that the derivatives need: transparent ones, too, and behind opaque
+// ones as many as if these transmitted some light. The tape is filled in two walks. The first marks the
+// samples of each triangle of each pair. Prefix sums of the marks give every fragment its place on the tape,
+// so that the fragments of one triangle in one tile follow each other. The second walk writes them there,
+// linked from back to front. Both walks are one pipeline: they see the same fragments in the same order.
 //
-// `counters` holds, behind the counters, by pair: the marks, 16 words; the first fragment of each of its triangles, 8
-// words; its first sum | the triangles with marks, one bit each << 24.
+// `counters` holds, behind the counters, by pair: the marks, 16 words; the first fragment of each of its
+// triangles, 8 words; its first sum | the triangles with marks, one bit each << 24.
 //
 // Behind the states, `samples` holds for each pixel the gradient of its RGB and of the background's share.
 
-@group(0) @binding(3) var<storage, read_write> tape: array<vec4u>;  // by fragment: the one in front, opacity, RGB . gradient, transmittance
+// by fragment: the one in front, opacity, RGB . gradient, transmittance
+@group(0) @binding(3) var<storage, read_write> tape: array<vec4u>;
 @group(0) @binding(9) var<uniform> walk: vec4u;                     // x: 0 marks, 1 writes the tape
 
 const COUNTERS = 16u;
@@ -49,10 +50,12 @@ fn is_open() -> bool { return capped >= frame.min_transmittance; }
 fn first_of(source: u32) -> u32 { return COUNTERS + 16u * frame.capacity + source; }
 fn sums_of(pair: u32) -> u32 { return COUNTERS + 24u * frame.capacity + pair; }
 fn marks_of(source: u32) -> vec2u {
-  return vec2u(atomicLoad(&counters[COUNTERS + 2u * source]), atomicLoad(&counters[COUNTERS + 2u * source + 1u]));
+  return vec2u(atomicLoad(&counters[COUNTERS + 2u * source]),
+    atomicLoad(&counters[COUNTERS + 2u * source + 1u]));
 }
 
-// Marks the fragment, or writes it to the tape. `visible`: the transmittance, or 0 behind the last visible one.
+// Marks the fragment, or writes it to the tape. `visible`: the transmittance, or 0 behind the last visible
+// one.
 fn record(source: u32, value: vec4f, visible: f32) {
   let bit = 1u << (lane % 32u);
   if (walk.x == 0u) {
@@ -67,7 +70,8 @@ fn record(source: u32, value: vec4f, visible: f32) {
     rank = countOneBits(marks.x) + countOneBits(marks.y & (bit - 1u));
   }
   let place = atomicLoad(&counters[first_of(source)]) + rank;
-  tape[place] = vec4u(last, bitcast<u32>(value.w), bitcast<u32>(dot(value.xyz, gradient)), bitcast<u32>(visible));
+  tape[place] = vec4u(last, bitcast<u32>(value.w), bitcast<u32>(dot(value.xyz, gradient)),
+    bitcast<u32>(visible));
   last = place;
 }
 
@@ -114,6 +118,7 @@ fn suspend(index: u32, state_index: u32, again: bool, needed: bool) {
   samples[index] = bitcast<vec4u>(vec4f(rgb, through));
   if (walk.x == 1u) { samples[index].x = last; }
   if (needed) {
-    samples[state_index] = vec4u(bitcast<u32>(floor_q), floor_face, bitcast<u32>(capped), select(0u, 1u, again));
+    samples[state_index] = vec4u(bitcast<u32>(floor_q), floor_face, bitcast<u32>(capped),
+      select(0u, 1u, again));
   }
 }

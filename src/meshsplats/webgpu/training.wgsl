@@ -1,4 +1,5 @@
-// Loss, its gradient, and Adam: what fine-tuning does between the forward and the backward pass, and behind it.
+// Loss, its gradient, and Adam: what fine-tuning does between the forward and the backward pass, and behind
+// it.
 
 struct Step {
   width: u32, height: u32,               // of the image, in pixels
@@ -14,20 +15,28 @@ struct Step {
   one_minus_beta1: f32, one_minus_beta2: f32,
 };
 @group(0) @binding(1) var<uniform> step_of: Step;
-@group(0) @binding(2) var<storage, read_write> samples: array<vec4f>;      // RGB and transmittance; states; gradients by pixel
+// RGB and transmittance; states; gradients by pixel
+@group(0) @binding(2) var<storage, read_write> samples: array<vec4f>;
 @group(0) @binding(3) var<storage, read_write> image: array<vec4f>;        // RGB over the background
-@group(0) @binding(4) var<storage, read> target_image: array<vec4f>;       // RGB; 1 where a pixel counts, else 0
-@group(0) @binding(5) var<storage, read_write> derivatives: array<vec4f>;  // three by pixel: of SSIM, for each channel
-@group(0) @binding(6) var<storage, read_write> image_gradient: array<vec4f>;  // of RGB; of the background's share
-@group(0) @binding(7) var<storage, read_write> losses: array<vec4f>;       // by workgroup: sums of |d|, d^2 and SSIM
-@group(0) @binding(8) var<storage, read_write> results: array<atomic<u32>>;  // the three sums; at 4: unfinished, 5: not finite
+@group(0) @binding(4) var<storage, read> target_image: array<vec4f>;  // RGB; 1 where a pixel counts, else 0
+// three by pixel: of SSIM, for each channel
+@group(0) @binding(5) var<storage, read_write> derivatives: array<vec4f>;
+// of RGB; of the background's share
+@group(0) @binding(6) var<storage, read_write> image_gradient: array<vec4f>;
+// by workgroup: sums of |d|, d^2 and SSIM
+@group(0) @binding(7) var<storage, read_write> losses: array<vec4f>;
+// the three sums; at 4: unfinished, 5: not finite
+@group(0) @binding(8) var<storage, read_write> results: array<atomic<u32>>;
 @group(0) @binding(9) var<storage, read> counters: array<u32>;
-@group(0) @binding(10) var<storage, read> gradients: array<vec4f>;         // two by vertex: position in camera axes; RGB and opacity
+// two by vertex: position in camera axes; RGB and opacity
+@group(0) @binding(10) var<storage, read> gradients: array<vec4f>;
 @group(0) @binding(11) var<storage, read_write> vertices: array<f32>;
 @group(0) @binding(12) var<storage, read_write> values: array<vec4f>;      // RGB and opacity
-@group(0) @binding(13) var<storage, read_write> position_moments: array<vec4f>;  // two by vertex: mean, square
+// two by vertex: mean, square
+@group(0) @binding(13) var<storage, read_write> position_moments: array<vec4f>;
 @group(0) @binding(14) var<storage, read_write> color_moments: array<vec4f>;
-@group(0) @binding(15) var<storage, read> traits: array<vec2f>;            // unit of the position; 1 where an opacity of 0 stays
+// unit of the position; 1 where an opacity of 0 stays
+@group(0) @binding(15) var<storage, read> traits: array<vec2f>;
 
 const SIDE = 16u;              // pixels along each side of a workgroup's tile
 const RADIUS = 5u;
@@ -38,7 +47,7 @@ const WEIGHT = array<f32, 6>(0.26601171, 0.21300554, 0.10936069, 0.036000773, 0.
 
 fn is_finite(x: f32) -> bool { return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u; }
 
-// ------------------------------------------------------------------------------------------------ windows
+// -------------------------------------------------------------------------------- windows
 
 // Averages the samples of a window.
 @compute @workgroup_size(8, 8)
@@ -68,14 +77,14 @@ fn judge() {
   if (counters[2] != step_of.tiles || counters[15] != 0u) { atomicStore(&results[4], 1u); }
 }
 
-// ------------------------------------------------------------------------------------------------ loss
+// -------------------------------------------------------------------------------- loss
 //
-// L1, L2 and SSIM with Gaussian windows of 11 x 11 pixels and sigma 1.5. Values outside the image, and of pixels that
-// do not count, are 0. With m = (x + y) / 2, d = x - y and G the windowed mean, SSIM is
+// L1, L2 and SSIM with Gaussian windows of 11 x 11 pixels and sigma 1.5. Values outside the image, and of
+// pixels that do not count, are 0. With m = (x + y) / 2, d = x - y and G the windowed mean, SSIM is
 //     (1 - p^2 / B1) (1 - v / B2),  p = G d,         B1 = 2 (G m)^2 + p^2 / 2 + C1,
 //                                   v = G d^2 - p^2, B2 = 2 (G m^2 - (G m)^2) + v / 2 + C2,
-// where rounding is relative to 1 - SSIM. A constant subtracted from m does not change B2: 1/2 keeps more of bright
-// regions. The window is separable.
+// where rounding is relative to 1 - SSIM. A constant subtracted from m does not change B2: 1/2 keeps more of
+// bright regions. The window is separable.
 
 var<workgroup> wide_m: array<f32, 676>;      // WIDE x WIDE
 var<workgroup> wide_d: array<f32, 676>;
@@ -94,10 +103,12 @@ fn weight_of(k: u32) -> f32 {
   return weights[select(RADIUS - k, k - RADIUS, k > RADIUS)];
 }
 
-// Rates the pixels of a tile, and finds the derivatives of SSIM through p and G m (together), G d^2 and G m^2.
+// Rates the pixels of a tile, and finds the derivatives of SSIM through p and G m (together), G d^2 and G
+// m^2.
 var<workgroup> rated: array<vec4f, 256>;
 @compute @workgroup_size(256)
-fn rate(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) size: vec3u, @builtin(local_invocation_index) t: u32) {
+fn rate(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) size: vec3u,
+  @builtin(local_invocation_index) t: u32) {
   let corner = vec2i(wg.xy * SIDE) - i32(RADIUS);
   let here = vec2i(wg.xy * SIDE) + vec2i(i32(t % SIDE), i32(t / SIDE));
   var sum = vec4f(0.0);
@@ -202,11 +213,12 @@ fn find_image_gradient(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocati
     workgroupBarrier();
   }
   if (here.x < i32(step_of.width) && here.y < i32(step_of.height)) {
-    image_gradient[u32(here.y) * step_of.width + u32(here.x)] = vec4f(gradient, dot(gradient, step_of.background));
+    image_gradient[u32(here.y) * step_of.width + u32(here.x)] =
+      vec4f(gradient, dot(gradient, step_of.background));
   }
 }
 
-// ------------------------------------------------------------------------------------------------ Adam
+// -------------------------------------------------------------------------------- Adam
 
 @compute @workgroup_size(256)
 fn check_gradients(@builtin(global_invocation_id) id: vec3u) {
@@ -224,18 +236,22 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
   if (all(g == vec4f(0.0))) { return; }
   let value = values[i];
   let mean = fma(g - color_moments[2u * i], vec4f(step_of.one_minus_beta1), color_moments[2u * i]);
-  let square = fma(g * g - color_moments[2u * i + 1u], vec4f(step_of.one_minus_beta2), color_moments[2u * i + 1u]);
+  let square = fma(g * g - color_moments[2u * i + 1u], vec4f(step_of.one_minus_beta2),
+    color_moments[2u * i + 1u]);
   color_moments[2u * i] = mean;
   color_moments[2u * i + 1u] = square;
-  var moved = clamp(value - step_of.color_step * (mean / (sqrt(square) + step_of.color_epsilon)), vec4f(0.0), vec4f(1.0));
+  var moved = clamp(value - step_of.color_step * (mean / (sqrt(square) + step_of.color_epsilon)), vec4f(0.0),
+    vec4f(1.0));
   if (traits[i].y == 1.0 && value.w == 0.0) { moved.w = 0.0; }
   values[i] = moved;
   if (step_of.position_step == 0.0) { return; }
   let c = gradients[2u * i].xyz;
   let p = c.x * frame.right.xyz + c.y * frame.down.xyz + c.z * frame.forward.xyz;
-  let p_mean = fma(p - position_moments[2u * i].xyz, vec3f(step_of.one_minus_beta1), position_moments[2u * i].xyz);
+  let p_mean = fma(p - position_moments[2u * i].xyz, vec3f(step_of.one_minus_beta1),
+    position_moments[2u * i].xyz);
   let p_square = fma(
-    p * p - position_moments[2u * i + 1u].xyz, vec3f(step_of.one_minus_beta2), position_moments[2u * i + 1u].xyz);
+    p * p - position_moments[2u * i + 1u].xyz, vec3f(step_of.one_minus_beta2),
+      position_moments[2u * i + 1u].xyz);
   position_moments[2u * i] = vec4f(p_mean, 0.0);
   position_moments[2u * i + 1u] = vec4f(p_square, 0.0);
   let change = step_of.position_step * traits[i].x * (p_mean / (sqrt(p_square) + step_of.position_epsilon));

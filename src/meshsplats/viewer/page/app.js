@@ -1,26 +1,27 @@
 // The page: settings, the loop that draws while something moves and refines the image when it is still.
 
 import { View, add, dot } from "./camera.js";
-import { connect, connectDivider } from "./controls.js";
+import { connect, connectDivider, connectPanel, fillCameras } from "./controls.js";
 import { CropBox } from "./crop.js";
 import { ExactRenderer } from "./exact.js";
 import { decodeMesh, decodeSplats, unpack } from "./scene.js";
 import { SortedRenderer } from "./sorted.js";
+import { element, number, report } from "./status.js";
 
 const QUIET = 180; // milliseconds without a change, after which the image is still
 const DRAFTS = [1 / 4, 1 / 3, 1 / 2, 1]; // sizes of the image while it moves
-const SLOW = 50, QUICK = 16, HOPELESS = 150; // milliseconds of a frame: a smaller draft, a larger one, the other renderer
+// milliseconds of a frame: a smaller draft, a larger one, the other renderer
+const SLOW = 50, QUICK = 16, HOPELESS = 150;
 const PICK = 8; // CSS pixels around a double click
 const MOST_PIXELS = 3.9e6; // of the canvas: the exact renderer draws an image in one piece
 const FLIGHT = 450; // milliseconds from one camera to the next
 
-const element = id => document.getElementById(id);
-const number = value => Math.round(value).toLocaleString("en");
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 const PHONE = 600; // CSS pixels of the shorter side of a screen, below which a device with touch is a phone
 
 class App {
-  // levels: the meshes that are unpacked, "coarse" and "fine"; unpackFine() gives the fine one, once, where it is not.
+  // levels: the meshes that are unpacked, "coarse" and "fine"; unpackFine() gives the fine one, once, where
+  // it is not.
   constructor(settings, levels, splats, unpackFine) {
     Object.assign(this, { settings, levels, splats, unpackFine });
     this.stage = element("stage");
@@ -40,12 +41,15 @@ class App {
   }
 
   // The level of the image at rest, and its mesh.
-  get resting() { return this.options.detail === "fine" && this.levels.fine ? "fine" : this.levels.coarse ? "coarse" : "fine"; }
+  get resting() {
+    if (this.options.detail === "fine" && this.levels.fine) return "fine";
+    return this.levels.coarse ? "coarse" : "fine";
+  }
 
   get mesh() { return this.levels[this.resting]; }
 
-  // WebGL draws from the first moment on, the coarse level if there is one; WebGPU takes over when its shaders are
-  // compiled.
+  // WebGL draws from the first moment on, the coarse level if there is one; WebGPU takes over when its
+  // shaders are compiled.
   async start(kernels) {
     const problems = [];
     try {
@@ -59,7 +63,8 @@ class App {
     await this.#refine();
     this.preparing = true;
     try {
-      const lost = reason => this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
+      const lost = reason =>
+        this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
       const exact = await ExactRenderer.create(this.canvases.exact, kernels, lost);
       for (const level of Object.keys(this.levels)) this.#give(exact, level);
       this.exact = exact;
@@ -67,11 +72,13 @@ class App {
       problems.push(error.message);
     }
     this.preparing = false;
-    if (!this.exact && !this.sorted) throw new Error(`This browser cannot draw the scene: ${problems.join("; ")}.`);
+    if (!this.exact && !this.sorted)
+      throw new Error(`This browser cannot draw the scene: ${problems.join("; ")}.`);
     if (this.exact) {
       this.changed();
     } else {
-      this.#fall(`The image is not exact here: ${problems.join("; ")}. WebGL draws triangles sorted by their centres.` +
+      this.#fall(`The image is not exact here: ${problems.join("; ")}.` +
+        " WebGL draws triangles sorted by their centres." +
         " Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
     }
     if (!this.sorted) {
@@ -91,7 +98,8 @@ class App {
     const unpackFine = this.unpackFine;
     this.unpackFine = null;
     this.preparing = true;
-    if (this.sorted) await new Promise(resolve => { this.shown = resolve; }); // a picture first: unpacking blocks the page
+    // a picture first: unpacking blocks the page
+    if (this.sorted) await new Promise(resolve => { this.shown = resolve; });
     try {
       this.levels.fine = await unpackFine();
       this.crop.again();
@@ -108,8 +116,9 @@ class App {
     exact.kept = this.kept;
     const left = exact.add(level, this.levels[level]);
     if (left) {
-      this.say(`WebGPU takes buffers of ${Math.round(exact.most / 2 ** 20)} MiB here: the exact image lacks the` +
-        ` ${(100 * left).toFixed(left < 0.1 ? 1 : 0)} % of the triangles that show least.`);
+      this.say(`WebGPU takes buffers of ${Math.round(exact.most / 2 ** 20)} MiB here:` +
+        ` the exact image lacks the ${(100 * left).toFixed(left < 0.1 ? 1 : 0)} % of the triangles` +
+        " that show least.");
     }
   }
 
@@ -197,15 +206,11 @@ class App {
 
   #connect() {
     const { settings, options } = this, list = element("cameras");
-    settings.cameras.forEach((camera, i) => {
-      const option = document.createElement("option");
-      option.value = String(i);
-      option.textContent = camera.name || `camera ${i + 1}`;
-      list.append(option);
-    });
+    fillCameras(list, settings.cameras);
     element("previous").disabled = element("next").disabled = settings.cameras.length < 2;
     list.addEventListener("change", () => this.jump(Number(list.value)));
-    for (const name of ["previous", "next", "home"]) element(name).addEventListener("click", () => this.command(name));
+    for (const name of ["previous", "next", "home"])
+      element(name).addEventListener("click", () => this.command(name));
     element("fly").addEventListener("change", event => { this.flying = event.target.checked; });
     element("spin").addEventListener("change", event => {
       this.spinning = event.target.checked;
@@ -252,7 +257,8 @@ class App {
     });
     const detail = element("detail");
     element("detailLine").hidden = !settings.triangles.coarse;
-    for (const option of detail.options) option.textContent = `${number(settings.triangles[option.value] ?? 0)} triangles`;
+    for (const option of detail.options)
+      option.textContent = `${number(settings.triangles[option.value] ?? 0)} triangles`;
     detail.value = options.detail;
     detail.addEventListener("change", () => {
       options.detail = detail.value;
@@ -265,20 +271,10 @@ class App {
       this.changed();
     });
     element("crop").addEventListener("toggle", () => this.changed());
-    const panel = element("panel"), toggle = element("toggle");
-    const open = shown => {
-      panel.classList.toggle("closed", !shown);
-      toggle.setAttribute("aria-expanded", String(shown));
-    };
-    toggle.addEventListener("click", () => open(panel.classList.contains("closed")));
-    document.addEventListener("keydown", event => {
-      if (event.key !== "Escape" || panel.classList.contains("closed")) return;
-      open(false);
-      toggle.focus();
-    });
-    open(!matchMedia("(max-width: 640px)").matches);
+    connectPanel(element("panel"), element("toggle"));
     element("dismiss").addEventListener("click", () => { element("message").hidden = true; });
-    this.canvases.sorted.addEventListener("webglcontextlost", () => this.say("The graphics device was lost: load the page again."));
+    this.canvases.sorted.addEventListener("webglcontextlost",
+      () => this.say("The graphics device was lost: load the page again."));
     connect(this.stage, this, settings.radius * 1e-3);
     new ResizeObserver(() => this.changed()).observe(this.stage);
     this.#measure();
@@ -331,7 +327,8 @@ class App {
   #measure() {
     const { clientWidth, clientHeight } = this.stage;
     const ratio = Math.min(devicePixelRatio || 1, 2, Math.sqrt(MOST_PIXELS / (clientWidth * clientHeight)));
-    const width = Math.max(1, Math.round(clientWidth * ratio)), height = Math.max(1, Math.round(clientHeight * ratio));
+    const width = Math.max(1, Math.round(clientWidth * ratio)),
+      height = Math.max(1, Math.round(clientHeight * ratio));
     for (const canvas of Object.values(this.canvases)) {
       if (canvas.width !== width) canvas.width = width;
       if (canvas.height !== height) canvas.height = height;
@@ -352,21 +349,26 @@ class App {
       return;
     }
     if (!quiet || this.finished) return;
-    const { options } = this, exact = this.#exactly();
+    const { options } = this, exact = this.exactly;
     const passes = exact && options.content !== "splats" ? options.samples ** 2 : 1, pass = this.passes++;
     if (exact) await this.#drawExact(this.resting, 1, pass, options.samples);
     if (pass === 0) await this.#drawSorted(this.resting, 1, true, exact);
     if (this.dirty) return;
     this.finished = this.passes >= passes;
-    this.#report(!this.finished ? "refining" : this.preparing ? "preparing" : "still", exact, passes, 1, this.resting);
+    report(this, !this.finished ? "refining" : this.preparing ? "preparing" : "still", exact, passes, 1,
+      this.resting);
     this.shown?.();
   }
 
-  #exactly() { return Boolean(this.exact?.levels[this.resting]) && this.options.renderer === "exact" && this.options.style === "blended"; }
+  // Whether the image at rest is the exact one.
+  get exactly() {
+    return Boolean(this.exact?.levels[this.resting]) && this.options.renderer === "exact" &&
+      this.options.style === "blended";
+  }
 
   // A quick image while something changes: small enough to be fluid, by WebGL where WebGPU is too slow.
   async #draft(now) {
-    const exact = this.#exactly() && (this.drafts.exact >= 0 || !this.sorted);
+    const exact = this.exactly && (this.drafts.exact >= 0 || !this.sorted);
     const kind = exact ? "exact" : "sorted", scale = DRAFTS[Math.max(0, this.drafts[kind])];
     const level = this.levels.coarse && !(exact && this.swift) ? "coarse" : this.resting;
     if (!exact) await this.#drawSorted(level, scale, false, false);
@@ -387,7 +389,7 @@ class App {
     else if (took > SLOW && took < 1000) this.drafts[kind] = Math.max(0, this.drafts[kind] - 1);
     else if (took && took < QUICK) this.drafts[kind] = Math.min(DRAFTS.length - 1, this.drafts[kind] + 1);
     this.took = took;
-    this.#report("moving", exact, 1, scale, level);
+    report(this, "moving", exact, 1, scale, level);
   }
 
   async #drawSorted(level, scale, still, exact) {
@@ -397,7 +399,8 @@ class App {
     if (meshToo && split < 1) parts.push({ what: "mesh", from: split, to: 1 });
     const { style, background, gain } = options, stop = () => this.dirty;
     if (parts.length && this.sorted) {
-      const drawn = await this.sorted.draw({ view: this.view, level, parts, style, still, scale, background, gain, stop });
+      const drawn = await this.sorted.draw(
+        { view: this.view, level, parts, style, still, scale, background, gain, stop });
       if (!drawn) return;
     }
     this.canvases.exact.style.visibility = exact && split < 1 ? "visible" : "hidden";
@@ -411,55 +414,14 @@ class App {
     const w = Math.max(1, Math.round(width * scale)), h = Math.max(1, Math.round(height * scale));
     const begun = performance.now();
     const dx = (pass % n + 0.5) / n - 0.5, dy = (Math.floor(pass / n) + 0.5) / n - 0.5;
-    await this.exact.draw(level, this.view.pinhole(w, h, dx, dy), { first: pass === 0, background, gain, filterScale: scale });
+    await this.exact.draw(level, this.view.pinhole(w, h, dx, dy),
+      { first: pass === 0, background, gain, filterScale: scale });
     this.exactTook = performance.now() - begun;
   }
 
   #outline() {
-    const svg = element("box"), shown = element("crop").open || this.crop.active;
-    svg.toggleAttribute("hidden", !shown);
-    if (!shown) return;
     const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight);
-    svg.firstElementChild.setAttribute("d", this.crop.outline(pinhole));
-  }
-
-  // ---- Status and statistics
-
-  #report(state, exact, passes, scale, level) {
-    const { options } = this, only = options.content === "splats";
-    const kind = only ? "splats" : exact ? "exact" : "sorted";
-    const samples = exact && !only ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
-    const size = scale < 1 ? `, 1/${Math.round(1 / scale)} size` : state === "moving" ? ", moving" : samples;
-    const wording = { refining: `, ${this.passes} of ${passes} samples`, preparing: ", preparing the exact image" };
-    element("status").textContent = kind + (wording[state] ?? size);
-    element("samples").disabled = !this.#exactly();
-    document.body.dataset.renderer = kind;
-    document.body.dataset.level = level;
-    document.body.dataset.firstPicture ??= String(Math.round(performance.now())); // milliseconds after the request
-    document.body.dataset.state = state;
-    if (state === "moving" && !element("statistics").open) return;
-    const { width, height } = this.canvases.sorted, { mesh, splats, view, settings } = this;
-    const shown = this.kept, triangles = number(mesh.faces.length / 3);
-    const point = values => values.map(value => Number(value.toPrecision(4))).join(" ");
-    const rows = {
-      triangles: shown ? `${number(shown[this.resting].triangles.length)} of ${triangles}` : triangles,
-      vertices: number(mesh.vertices.length / 3),
-      ...(splats ? { splats: shown ? `${number(shown.splats.length)} of ${number(splats.count)}` : number(splats.count) } : {}),
-      image: `${width} × ${height}`,
-      "exact frame": this.exactTook === undefined ? "–" : `${number(this.exactTook)} ms`,
-      "graphics": (exact ? this.exact?.name : this.sorted?.name) ?? "",
-      "first picture": `${number(Number(document.body.dataset.firstPicture))} ms`,
-      position: point(view.position),
-      direction: point(view.forward),
-      ...settings.statistics,
-    };
-    const list = element("statistics").querySelector("dl");
-    list.replaceChildren(...Object.entries(rows).flatMap(([term, text]) => {
-      const dt = document.createElement("dt"), dd = document.createElement("dd");
-      dt.textContent = term;
-      dd.textContent = text;
-      return [dt, dd];
-    }));
+    this.crop.show(element("box"), element("crop").open, pinhole);
   }
 }
 
@@ -474,7 +436,8 @@ async function main() {
     return found;
   };
   const unpackFine = async () => decodeMesh(await unpack(take("mesh")));
-  const levels = text("coarse") ? { coarse: decodeMesh(await unpack(take("coarse"))) } : { fine: await unpackFine() };
+  const levels = text("coarse") ? { coarse: decodeMesh(await unpack(take("coarse"))) }
+    : { fine: await unpackFine() };
   const splats = text("splats") ? decodeSplats(await unpack(take("splats"))) : null;
   await new App(settings, levels, splats, levels.fine ? null : unpackFine).start(JSON.parse(text("kernels")));
 }

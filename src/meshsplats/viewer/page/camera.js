@@ -2,18 +2,20 @@
 
 export const add = (a, b, t = 1) => [a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2]];
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
+  a[0] * b[1] - a[1] * b[0]];
 export const unit = a => { const l = Math.hypot(...a) || 1; return [a[0] / l, a[1] / l, a[2] / l]; };
 
 // `v` turned by `angle` around the unit vector `axis`.
 export function turned(v, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle), w = cross(axis, v), d = dot(axis, v) * (1 - c);
-  return [c * v[0] + s * w[0] + d * axis[0], c * v[1] + s * w[1] + d * axis[1], c * v[2] + s * w[2] + d * axis[2]];
+  return [c * v[0] + s * w[0] + d * axis[0], c * v[1] + s * w[1] + d * axis[1],
+    c * v[2] + s * w[2] + d * axis[2]];
 }
 
 export class View {
-  // camera: {matrix: 12 numbers, the rows of world to camera; fx, fy, cx, cy, width, height, near}; up: unit vector;
-  // distance: of the pivot before the camera.
+  // camera: {matrix: 12 numbers, the rows of world to camera; fx, fy, cx, cy, width, height, near}; up: unit
+  // vector; distance: of the pivot before the camera.
   constructor(camera, up, distance) {
     this.up = up;
     const m = camera.matrix;
@@ -52,8 +54,8 @@ export class View {
     for (const name of ["right", "down", "forward"]) this[name] = unit(turned(this[name], axis, angle));
   }
 
-  // Turns by angles: to the left, around the up direction; then downwards, around the camera's right, not over the
-  // poles.
+  // Turns by angles: to the left, around the up direction; then downwards, around the camera's right, not
+  // over the poles.
   #rotate(yaw, pitch) {
     const tilt = Math.asin(Math.max(-1, Math.min(1, -dot(this.forward, this.up))));
     const least = -1.55 - tilt, most = 1.55 - tilt;
@@ -86,7 +88,9 @@ export class View {
   }
 
   // Along right, down, forward in scene units.
-  move(x, y, z) { this.position = add(add(add(this.position, this.right, x), this.down, y), this.forward, z); }
+  move(x, y, z) {
+    this.position = add(add(add(this.position, this.right, x), this.down, y), this.forward, z);
+  }
 
   // The pinhole of an image of w x h pixels: the lens' whole image fits in it. dx, dy: offset of the samples
   // from the pixels' centres.

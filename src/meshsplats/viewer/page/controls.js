@@ -10,7 +10,8 @@ export function connect(stage, pilot, least) {
   stage.addEventListener("pointerdown", event => {
     if (event.target.closest("#divider")) return;
     stage.setPointerCapture(event.pointerId);
-    touches.set(event.pointerId, { x: event.clientX, y: event.clientY, pans: event.button > 0 || event.shiftKey });
+    touches.set(event.pointerId, { x: event.clientX, y: event.clientY,
+      pans: event.button > 0 || event.shiftKey });
     stage.classList.add("dragging");
     stage.focus({ preventScroll: true });
   });
@@ -18,7 +19,8 @@ export function connect(stage, pilot, least) {
     touches.delete(event.pointerId);
     if (!touches.size) stage.classList.remove("dragging");
   };
-  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) stage.addEventListener(name, leave);
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture"])
+    stage.addEventListener(name, leave);
   stage.addEventListener("pointermove", event => {
     const touch = touches.get(event.pointerId);
     if (!touch) return;
@@ -115,10 +117,35 @@ export function connectDivider(divider, stage, moved) {
   });
   divider.addEventListener("keydown", event => {
     const now = Number(divider.getAttribute("aria-valuenow")) / 100;
-    const steps = { ArrowLeft: now - 0.02, ArrowRight: now + 0.02, PageDown: now - 0.1, PageUp: now + 0.1, Home: 0, End: 1 };
+    const steps = { ArrowLeft: now - 0.02, ArrowRight: now + 0.02, PageDown: now - 0.1, PageUp: now + 0.1,
+      Home: 0, End: 1 };
     if (!(event.key in steps)) return;
     set(steps[event.key]);
     event.preventDefault();
     event.stopPropagation();
+  });
+}
+
+// The panel of the settings: `toggle` opens and closes it, Escape closes it. It begins open on wide screens.
+export function connectPanel(panel, toggle) {
+  const open = shown => {
+    panel.classList.toggle("closed", !shown);
+    toggle.setAttribute("aria-expanded", String(shown));
+  };
+  toggle.addEventListener("click", () => open(panel.classList.contains("closed")));
+  document.addEventListener("keydown", event => {
+    if (event.key !== "Escape" || panel.classList.contains("closed")) return;
+    open(false);
+    toggle.focus();
+  });
+  open(!matchMedia("(max-width: 640px)").matches);
+}
+
+export function fillCameras(list, cameras) {
+  cameras.forEach((camera, i) => {
+    const option = document.createElement("option");
+    option.value = String(i);
+    option.textContent = camera.name || `camera ${i + 1}`;
+    list.append(option);
   });
 }

@@ -5,8 +5,8 @@ import { project } from "./camera.js";
 const STEPS = 200;
 
 export class CropBox {
-  // extent: [[x, y, z], [x, y, z]], where the sliders end. levels: meshes by name, to which others may be added later,
-  // followed by `again`. changed(kept) as in SortedRenderer.crop.
+  // extent: [[x, y, z], [x, y, z]], where the sliders end. levels: meshes by name, to which others may be
+  // added later, followed by `again`. changed(kept) as in SortedRenderer.crop.
   constructor(extent, levels, splats, changed) {
     Object.assign(this, { extent, levels, splats, changed });
     this.marks = [[0, 0, 0], [STEPS, STEPS, STEPS]];
@@ -18,7 +18,8 @@ export class CropBox {
       grid.append(name);
       for (const end of [0, 1]) {
         const input = document.createElement("input");
-        Object.assign(input, { type: "range", min: 0, max: STEPS, step: 1, value: end * STEPS, id: `crop-${axis}${end}` });
+        Object.assign(input, { type: "range", min: 0, max: STEPS, step: 1, value: end * STEPS,
+          id: `crop-${axis}${end}` });
         input.setAttribute("aria-label", `${axis}, ${end ? "upper" : "lower"} end of the crop box`);
         input.addEventListener("input", () => this.#moved(k, end, Number(input.value)));
         this.inputs.push(input);
@@ -58,7 +59,8 @@ export class CropBox {
 
   #tell() {
     const numbers = this.corners.flat().map(value => Number(value.toPrecision(4)));
-    this.inputs.forEach((input, i) => input.setAttribute("aria-valuetext", String(numbers[(i % 2) * 3 + (i >> 1)])));
+    this.inputs.forEach((input, i) => input.setAttribute(
+      "aria-valuetext", String(numbers[(i % 2) * 3 + (i >> 1)])));
     document.getElementById("cropText").textContent = this.active ? `--crop ${numbers.join(" ")}` : "";
   }
 
@@ -79,9 +81,16 @@ export class CropBox {
     const high = to.map((value, k) => this.marks[1][k] === STEPS ? Infinity : value);
     for (let i = 0; i < points.length / 3; i++) {
       const x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
-      if (x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1] && z >= low[2] && z <= high[2]) kept.push(i);
+      if (x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1] && z >= low[2] && z <= high[2])
+        kept.push(i);
     }
     return Uint32Array.from(kept);
+  }
+
+  // Shows the box in the image of `pinhole`, by a path in `svg`, while it is `open` or in use.
+  show(svg, open, pinhole) {
+    svg.toggleAttribute("hidden", !(open || this.active));
+    if (open || this.active) svg.firstElementChild.setAttribute("d", this.outline(pinhole));
   }
 
   // The edges of the box in an image, in pixels.

@@ -1,17 +1,15 @@
-// WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in the
-// page as Python wrote them; docs/webgpu.md says what a host has to do.
+// WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in
+// the page as Python wrote them; docs/webgpu.md says what a host has to do.
 
+import { TILE, findGroups, findRuns, fitting, frameUniform } from "./arrays.js";
 import { counting } from "./scene.js";
-import { sortFarToNear } from "./sorted.js";
 
-const TILE = 8, RUN = 8;
-const NONE = 0xffffffff;
 const ROWS = 16; // strips of an image begin at multiples of it
-const DISPATCH = 65535; // workgroups along an axis, on every device
 
 // Sums frames and shows their mean over the background.
 const PRESENT = `
-struct Show { background: vec3f, gain: f32, size: vec2u, canvas: vec2f, weight: f32, linear: u32, first: u32, top: u32, rows: u32 };
+struct Show { background: vec3f, gain: f32, size: vec2u, canvas: vec2f, weight: f32, linear: u32, first: u32,
+  top: u32, rows: u32 };
 @group(0) @binding(0) var<uniform> show: Show;
 @group(0) @binding(1) var<storage, read> samples: array<vec4f>;
 @group(0) @binding(2) var<storage, read_write> sums: array<vec4f>;
@@ -63,7 +61,8 @@ export class ExactRenderer {
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter) throw new Error("WebGPU finds no graphics device");
     const { maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
-    const device = await adapter.requestDevice({ requiredLimits: { maxStorageBufferBindingSize, maxBufferSize } });
+    const device = await adapter.requestDevice(
+      { requiredLimits: { maxStorageBufferBindingSize, maxBufferSize } });
     const self = new ExactRenderer();
     const { vendor, architecture, description } = adapter.info ?? {};
     Object.assign(self, { canvas, kernels, device, levels: {}, buffers: {}, groupsOfBindings: new Map() });
@@ -93,11 +92,14 @@ export class ExactRenderer {
     const { device, kernels } = this, modules = {};
     for (const [name, code] of Object.entries({ ...kernels.sources, present: PRESENT })) {
       modules[name] = device.createShaderModule({ code });
-      const wrong = (await modules[name].getCompilationInfo()).messages.find(message => message.type === "error");
-      if (wrong) throw new Error(`a shader does not compile: ${name}, line ${wrong.lineNum}: ${wrong.message}`);
+      const wrong = (await modules[name].getCompilationInfo()).messages.find(
+        message => message.type === "error");
+      if (wrong)
+        throw new Error(`a shader does not compile: ${name}, line ${wrong.lineNum}: ${wrong.message}`);
     }
     const steps = [...kernels.lists, ...kernels.raster].filter(step => step.kernel);
-    const entries = new Map(steps.map(({ kernel }) => [kernel, kernel === "raster" ? "raster" : kernel === "raster_again" ? "again" : "lists"]));
+    const entries = new Map(steps.map(({ kernel }) =>
+      [kernel, kernel === "raster" ? "raster" : kernel === "raster_again" ? "again" : "lists"]));
     entries.set("collect", "present");
     this.pipelines = {};
     await Promise.all([...entries].map(async ([kernel, module]) => {
@@ -112,8 +114,8 @@ export class ExactRenderer {
 
   // ---- The mesh
 
-  // Adds a mesh under the name `level`: the part of it that fits the device. Returns the share of triangles left out.
-  // Throws if not even parts fit.
+  // Adds a mesh under the name `level`: the part of it that fits the device. Returns the share of triangles
+  // left out. Throws if not even parts fit.
   add(level, mesh) {
     const part = fitting(mesh, this.most, this.kernels.limits.runs, this.kernels.groups);
     this.levels[level] = { mesh, part };
@@ -174,7 +176,8 @@ export class ExactRenderer {
   #allocate(name, bytes) {
     const size = Math.max(64, Math.ceil(bytes / 16) * 16), old = this.buffers[name];
     if (old && old.size >= size) return;
-    if (size > this.most) throw new Error(`${name} needs ${Math.ceil(size / 2 ** 20)} MiB, more than WebGPU allows here`);
+    if (size > this.most)
+      throw new Error(`${name} needs ${Math.ceil(size / 2 ** 20)} MiB, more than WebGPU allows here`);
     old?.destroy();
     const { UNIFORM, STORAGE, COPY_DST, COPY_SRC, INDIRECT } = GPUBufferUsage;
     const uniform = ["frame", "digits", "show"].includes(name);
@@ -191,8 +194,8 @@ export class ExactRenderer {
 
   // ---- Frames
 
-  // Draws one sample in each pixel of a level and shows the mean of it and of the frames since the last one with
-  // `first`. filterScale: size of the image in that of the canvas, for the low-pass filter of the mesh.
+  // Draws one sample in each pixel of a level and shows the mean of it and of the frames since the last one
+  // with `first`. filterScale: size of the image in that of the canvas, for the low-pass filter of the mesh.
   async draw(level, pinhole, { first, background, gain, filterScale }) {
     const { width, height } = pinhole, { mesh, counts } = this.levels[level];
     if (16 * width * height > this.most) throw new Error("the image is too large");
@@ -203,7 +206,8 @@ export class ExactRenderer {
     const waiting = [[0, height]];
     while (waiting.length) {
       const [top, rows] = waiting.pop();
-      if (!this.#fits(width, rows) || (counts.faces && !await this.#drawStrip(level, pinhole, top, rows, filterScale))) {
+      if (!this.#fits(width, rows) || (counts.faces &&
+        !await this.#drawStrip(level, pinhole, top, rows, filterScale))) {
         if (rows <= ROWS) throw new Error("the tile lists need more memory than WebGPU allows here");
         const upper = ROWS * Math.ceil(rows / 2 / ROWS);
         waiting.push([top + upper, rows - upper], [top, upper]);
@@ -216,17 +220,20 @@ export class ExactRenderer {
 
   #fits(width, rows) {
     const { tiles, window } = this.kernels.limits;
-    return Math.ceil(width / TILE) * Math.ceil(rows / TILE) <= tiles && width * rows <= Math.min(window, this.most / 32);
+    return Math.ceil(width / TILE) * Math.ceil(rows / TILE) <= tiles &&
+      width * rows <= Math.min(window, this.most / 32);
   }
 
   // Draws some rows of the image to `samples`; false if they have too many pairs of a run and a tile.
   async #drawStrip(level, pinhole, top, rows, filterScale) {
     const strip = { ...pinhole, cy: pinhole.cy - top, height: rows };
     this.#prepare(level, strip, filterScale);
-    // Loop iterations of one walk through a tile list, one limit after the other until all tiles are finished. Software
-    // drivers cut loops after 65,535 iterations; walks are counted high, so the first is safe, and the second mostly.
+    // Loop iterations of one walk through a tile list, one limit after the other until all tiles are
+    // finished. Software drivers cut loops after 65,535 iterations; walks are counted high, so the first is
+    // safe, and the second mostly.
     const { budgets, pairs, rounds } = this.kernels.limits;
-    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1, at = budgets.indexOf(this.budget);
+    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1,
+      at = budgets.indexOf(this.budget);
     for (let round = 0; ; round++) {
       const counters = await this.#run(level, steps);
       if (this.problem) throw new Error(this.problem);
@@ -264,12 +271,14 @@ export class ExactRenderer {
     this.#allocate("again", 16 * (this.tiles + 1));
     this.#allocate("samples", 32 * width * height);
     const filter = mesh.filter * filterScale * filterScale;
-    this.device.queue.writeBuffer(this.buffers.frame, 0, frameUniform(pinhole, counts, this.capacity, offsets, filter, this.budget));
+    this.device.queue.writeBuffer(this.buffers.frame, 0,
+      frameUniform(pinhole, counts, this.capacity, offsets, filter, this.budget));
   }
 
   // Runs steps and returns the counters.
   async #run(level, steps) {
-    const counts = { ...this.levels[level].counts, tiles: this.tiles }, encoder = this.device.createCommandEncoder();
+    const counts = { ...this.levels[level].counts, tiles: this.tiles },
+      encoder = this.device.createCommandEncoder();
     let pass = null;
     for (const step of steps) {
       if (step.clear) {
@@ -306,7 +315,8 @@ export class ExactRenderer {
       const part = index === undefined ? {} : { offset: 256 * Number(index), size: 16 };
       return { binding: Number(binding), resource: { buffer, ...part } };
     });
-    const made = this.device.createBindGroup({ layout: this.pipelines[step.kernel].getBindGroupLayout(0), entries });
+    const made = this.device.createBindGroup(
+      { layout: this.pipelines[step.kernel].getBindGroupLayout(0), entries });
     all.set(step, made);
     return made;
   }
@@ -323,7 +333,9 @@ export class ExactRenderer {
     floats.set([canvas.width, canvas.height, 1 / this.frames], 6);
     words.set([Number(linear), Number(first), top, rows], 9);
     device.queue.writeBuffer(this.buffers.show, 0, floats);
-    if (empty) device.queue.writeBuffer(this.buffers.samples, 0, new Float32Array(4 * width * rows).map((_, i) => Number(i % 4 === 3)));
+    if (empty)
+      device.queue.writeBuffer(this.buffers.samples, 0,
+        new Float32Array(4 * width * rows).map((_, i) => Number(i % 4 === 3)));
     const encoder = device.createCommandEncoder(), collect = encoder.beginComputePass();
     collect.setPipeline(this.pipelines.collect);
     collect.setBindGroup(0, this.#shown(this.pipelines.collect, [[0, "show"], [1, "samples"], [2, "total"]]));
@@ -335,7 +347,8 @@ export class ExactRenderer {
   #paint() {
     const { device } = this, encoder = device.createCommandEncoder();
     const view = this.context.getCurrentTexture().createView();
-    const paint = encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] });
+    const paint = encoder.beginRenderPass({ colorAttachments: [
+      { view, loadOp: "clear", storeOp: "store" }] });
     paint.setPipeline(this.painter);
     paint.setBindGroup(0, this.#shown(this.painter, [[0, "show"], [3, "total"]]));
     paint.draw(3);
@@ -347,113 +360,4 @@ export class ExactRenderer {
     const entries = names.map(([binding, name]) => ({ binding, resource: { buffer: this.buffers[name] } }));
     return this.device.createBindGroup({ layout: pipeline.getBindGroupLayout(0), entries });
   }
-}
-
-// The part of a mesh whose buffers fit into `most` bytes each, null if all of it does: the fans of the largest area times
-// opacity. runs: most runs. kept: 1 for each triangle in it, count: how many; vertices, colors: its own; vertexOf: the
-// new index of each old vertex.
-export function fitting(mesh, most, runs, groups) {
-  const { vertices, colors, faces, fans } = mesh, V = vertices.length / 3, F = faces.length / 3, n = fans.length - 1;
-  // A triangle takes three indices, a share of a run and, with depth groups, two words and two projected vertices.
-  const all = findRuns(faces, mesh.splat).length, words = 3 + Math.max(all / F, n / F) + (groups ? 2 : 0);
-  const room = Math.floor(most / 16) * (groups ? 1 / 3 : 1);
-  const mostVertices = Math.min(room, 256 * DISPATCH);
-  const mostFaces = Math.min(most / 4 / words, groups ? Math.min(room, 64 * DISPATCH) : Infinity, F * Math.min(1, (runs - 1) / all));
-  const mostFans = mesh.filter > 0 ? Math.min(64 * DISPATCH, most / 4 - 1) : Infinity;
-  if (V <= mostVertices && F <= mostFaces && n <= mostFans) return null;
-  const importance = new Float32Array(n), point = k => vertices.subarray(3 * k, 3 * k + 3);
-  for (let fan = 0; fan < n; fan++) {
-    for (let f = fans[fan]; f < fans[fan + 1]; f++) {
-      const [a, b, c] = [0, 1, 2].map(k => faces[3 * f + k]), [p, q, r] = [a, b, c].map(point);
-      const u = [0, 1, 2].map(k => q[k] - p[k]), v = [0, 1, 2].map(k => r[k] - p[k]);
-      const area = Math.hypot(u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]);
-      importance[fan] += area * (colors[4 * a + 3] + colors[4 * b + 3] + colors[4 * c + 3]);
-    }
-  }
-  const order = sortFarToNear(importance, counting(n), new Uint32Array(n));
-  const kept = new Uint8Array(F), used = new Uint8Array(V);
-  let count = 0, corners = 0;
-  for (let i = 0; i < Math.min(n, mostFans); i++) {
-    const from = fans[order[i]], to = fans[order[i] + 1];
-    if (count + to - from > mostFaces || corners + 3 * (to - from) > mostVertices && corners + fresh(faces, used, from, to) > mostVertices) break;
-    for (let k = 3 * from; k < 3 * to; k++) {
-      corners += 1 - used[faces[k]];
-      used[faces[k]] = 1;
-    }
-    kept.fill(1, from, to);
-    count += to - from;
-  }
-  if (!count) throw new Error("not even a part of the scene fits this graphics device");
-  const part = { kept, count, vertexOf: new Uint32Array(V), vertices: new Float32Array(3 * corners), colors: new Float32Array(4 * corners) };
-  for (let v = 0, at = 0; v < V; v++) {
-    if (!used[v]) continue;
-    part.vertices.set(point(v), 3 * at);
-    part.colors.set(colors.subarray(4 * v, 4 * v + 4), 4 * at);
-    part.vertexOf[v] = at++;
-  }
-  return part;
-}
-
-// Vertices of some triangles that are not used yet.
-function fresh(faces, used, from, to) {
-  return new Set(faces.subarray(3 * from, 3 * to).filter(v => !used[v])).size;
-}
-
-// The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last four unused. filter: variance in square
-// samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
-export function frameUniform(
-  { width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter, budget,
-) {
-  const floats = new Float32Array(64), words = new Uint32Array(floats.buffer);
-  const split = (values, high, low) => {
-    floats.set(values, high);
-    floats.set(values.map(value => value - Math.fround(value)), low);
-  };
-  rows.forEach((row, k) => split(row.slice(0, 3), 4 * k, 44 + 4 * k));
-  split(center, 12, 16);
-  split([fx, fy, cx, cy], 20, 56);
-  floats.set([near, 1e-6, -1, filter], 24);
-  words.set([width, height, Math.ceil(width / TILE), Math.ceil(height / TILE)], 28);
-  words.set([counts.vertices, counts.faces, counts.runs, counts.fans], 32);
-  words.set([counts.groups, capacity, 0, budget, ...offsets, 1], 36);
-  return floats;
-}
-
-// Runs of up to 8 consecutive triangles: of one splat, or, without splats, such that each has a vertex of the one
-// before. First face, and from bit 29 on the count less 1.
-export function findRuns(faces, splat) {
-  const F = faces.length / 3, runs = [];
-  const joined = f => {
-    if (splat) return splat[f] === splat[f - 1];
-    for (let i = 3 * f; i < 3 * f + 3; i++) for (let j = 3 * f - 3; j < 3 * f; j++) if (faces[i] === faces[j]) return true;
-    return false;
-  };
-  for (let f = 0, count = 0; f < F; f += count) {
-    for (count = 1; count < RUN && f + count < F && joined(f + count);) count++;
-    runs.push((f | ((count - 1) << 29)) >>> 0);
-  }
-  return Uint32Array.from(runs);
-}
-
-// ofFace: the depth group of each face, without gaps, NONE for none; largest: the face of each with the largest area.
-export function findGroups(vertices, faces, group) {
-  const F = faces.length / 3, ofFace = new Uint32Array(F).fill(NONE), names = new Map(), largest = [], areas = [];
-  for (let f = 0; group && f < F; f++) {
-    if (group[f] < 0) continue;
-    const p = [0, 1, 2].map(k => vertices.subarray(3 * faces[3 * f + k], 3 * faces[3 * f + k] + 3));
-    const u = [0, 1, 2].map(c => p[1][c] - p[0][c]), v = [0, 1, 2].map(c => p[2][c] - p[0][c]);
-    const area = (u[1] * v[2] - u[2] * v[1]) ** 2 + (u[2] * v[0] - u[0] * v[2]) ** 2 + (u[0] * v[1] - u[1] * v[0]) ** 2;
-    if (!names.has(group[f])) {
-      names.set(group[f], largest.length);
-      largest.push(f);
-      areas.push(area);
-    }
-    const g = names.get(group[f]);
-    ofFace[f] = g;
-    if (area > areas[g]) {
-      areas[g] = area;
-      largest[g] = f;
-    }
-  }
-  return { ofFace, largest: Uint32Array.from(largest) };
 }

@@ -72,7 +72,8 @@ export function decodeMesh({ header, row, rows }) {
 // Strays, as the two halves of their bits, into points (3 floats each).
 function decodeFar({ header, row, rows }, points) {
   if (header.far < 0) return;
-  const halves = rows(header.far_places, 6), bits = new Uint32Array(points.buffer, points.byteOffset, points.length);
+  const halves = rows(header.far_places, 6);
+  const bits = new Uint32Array(points.buffer, points.byteOffset, points.length);
   row(header.far).forEach((point, i) => {
     for (let k = 0; k < 3; k++) bits[3 * point + k] = halves[k][i] * 65536 + halves[3 + k][i];
   });
@@ -117,7 +118,8 @@ function decodeFans(mesh, source) {
     known.forEach((offset, k) => own.forEach((fan, i) => store(first[fan] + pattern.basis[k],
       anchor[0][i] + offset[0][i], anchor[1][i] + offset[1][i], anchor[2][i] + offset[2][i])));
     others(m, [0, ...pattern.basis]).forEach((vertex, r) => {
-      const rest = rows(pattern.rest[r], 3), weights = pattern.weights.slice(r * known.length, (r + 1) * known.length);
+      const rest = rows(pattern.rest[r], 3);
+      const weights = pattern.weights.slice(r * known.length, (r + 1) * known.length);
       const value = (axis, i) => {
         let predicted = 0;
         for (let k = 0; k < weights.length; k++) predicted = predicted + weights[k] * known[k][axis][i];
@@ -136,7 +138,8 @@ function decodeFans(mesh, source) {
       }
     }
     const alpha = pattern.alpha.map(row), basis = pattern.alpha_basis, K = basis.length;
-    basis.forEach((vertex, k) => own.forEach((fan, i) => { colors[4 * (first[fan] + vertex) + 3] = alpha[k][i]; }));
+    basis.forEach((vertex, k) => own.forEach(
+      (fan, i) => { colors[4 * (first[fan] + vertex) + 3] = alpha[k][i]; }));
     others(m, basis).forEach((vertex, r) => {
       const rest = row(pattern.alpha_rest[r]);
       for (let i = 0; i < n; i++) {

@@ -2,6 +2,7 @@
 // overlap in depth are not split, but quick, and it runs where WebGPU is missing.
 
 import { fanMiddles, middlesOf } from "./crop.js";
+import { depthsOf, sortFarToNear } from "./order.js";
 import { counting } from "./scene.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
@@ -50,7 +51,8 @@ void main() {
   // EWA: the local affine approximation, where the direction is limited as in 3D Gaussian Splatting.
   vec2 limit = 1.3 * vec2(max(lens.z, size.x - lens.z), max(lens.w, size.y - lens.w)) / lens.xy;
   vec2 slope = clamp(c.xy / c.z, -limit, limit);
-  vec3 jx = vec3(lens.x / c.z, 0, -lens.x * slope.x / c.z), jy = vec3(0, lens.y / c.z, -lens.y * slope.y / c.z);
+  vec3 jx = vec3(lens.x / c.z, 0, -lens.x * slope.x / c.z),
+    jy = vec3(0, lens.y / c.z, -lens.y * slope.y / c.z);
   mat3 turn = mat3(row0.xyz, row1.xyz, row2.xyz);
   vec3 x = turn * jx, y = turn * jy;
   float a = dot(x, covariance * x), b = dot(x, covariance * y), d = dot(y, covariance * y);
@@ -64,7 +66,8 @@ void main() {
   float large = middle + spread, small = max(middle - spread, 1e-9);
   vec2 axis = abs(b) < 1e-9 ? (a >= d ? vec2(1, 0) : vec2(0, 1)) : normalize(vec2(b, large - a));
   offset = sqrt(2. * log(255. * rgba.a)) * vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID >> 1) * 2 - 1);
-  vec2 pixel = lens.xy * c.xy / c.z + lens.zw + axis * sqrt(large) * offset.x + vec2(-axis.y, axis.x) * sqrt(small) * offset.y;
+  vec2 pixel = lens.xy * c.xy / c.z + lens.zw + axis * sqrt(large) * offset.x +
+    vec2(-axis.y, axis.x) * sqrt(small) * offset.y;
   gl_Position = vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0, 1);
 }`;
 const SPLAT_FRAGMENT = HEAD + `
@@ -82,7 +85,9 @@ const PRESENT_FRAGMENT = HEAD + `
 uniform sampler2D image; uniform vec3 background; uniform float gain; uniform bool linear;
 in vec2 uv; out vec4 result;
 vec3 decode(vec3 c) { return mix(c / 12.92, pow((max(c, 0.) + .055) / 1.055, vec3(2.4)), step(.04045, c)); }
-vec3 encode(vec3 c) { return mix(c * 12.92, 1.055 * pow(max(c, 0.), vec3(1. / 2.4)) - .055, step(.0031308, c)); }
+vec3 encode(vec3 c) {
+  return mix(c * 12.92, 1.055 * pow(max(c, 0.), vec3(1. / 2.4)) - .055, step(.0031308, c));
+}
 void main() {
   vec4 c = texture(image, uv);
   vec3 rgb = c.rgb;
@@ -93,32 +98,6 @@ void main() {
   rgb += (1. - c.a) * (linear ? decode(background) : background);
   result = vec4(linear ? encode(rgb) : rgb, 1);
 }`;
-
-// Fills `order` with `items`, indices of `depths`, the farthest first. Depths are positive floats: their bits are in
-// the same order.
-export function sortFarToNear(depths, items, order) {
-  const n = items.length, bits = new Uint32Array(depths.buffer, depths.byteOffset, depths.length);
-  let low = 0xffffffff, high = 0;
-  for (let i = 0; i < n; i++) {
-    const b = bits[items[i]];
-    if (b < low) low = b;
-    if (b > high) high = b;
-  }
-  const BUCKETS = 1 << 18, shift = Math.max(0, 32 - Math.clz32(Math.max(0, high - low)) - 18);
-  const ends = new Uint32Array(BUCKETS + 1);
-  for (let i = 0; i < n; i++) ends[BUCKETS - ((bits[items[i]] - low) >>> shift)]++;
-  for (let i = 1; i <= BUCKETS; i++) ends[i] += ends[i - 1];
-  for (let i = n - 1; i >= 0; i--) order[--ends[BUCKETS - ((bits[items[i]] - low) >>> shift)]] = items[i];
-  return order;
-}
-
-// Depths of points (3 a point), at least `near`.
-function depthsOf(points, row, near, depths) {
-  const [a, b, c, d] = row;
-  for (let i = 0; i < depths.length; i++) {
-    depths[i] = Math.max(a * points[3 * i] + b * points[3 * i + 1] + c * points[3 * i + 2] + d, near);
-  }
-}
 
 export class SortedRenderer {
   // levels: meshes by name; others may be added later. Throws where there is no WebGL2.
@@ -135,13 +114,16 @@ export class SortedRenderer {
 
   #needMesh(level) {
     if (this.triangles[level]) return this.triangles[level];
-    const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
+    const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3,
+      V = mesh.vertices.length / 3;
     this.programs.mesh ??= program(gl, MESH_VERTEX, MESH_FRAGMENT);
     const bytes = new Uint8Array(4 * V);
     for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
-    const middles = fanMiddles(mesh), centers = fans.length - 1 === F ? middles : middlesOf(mesh, counting(F + 1));
+    const middles = fanMiddles(mesh), centers = fans.length - 1 === F ? middles
+      : middlesOf(mesh, counting(F + 1));
     this.triangles[level] = {
-      ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans, order: new Uint32Array(F),
+      ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans,
+        order: new Uint32Array(F),
       depths: new Float32Array(F), fanDepths: new Float32Array(fans.length - 1),
       fanOrder: new Uint32Array(fans.length - 1), count: 0,
     };
@@ -151,7 +133,8 @@ export class SortedRenderer {
 
   #needSplats() {
     if (this.cloud) return this.cloud;
-    const { gl, splats } = this, n = splats.count, four = new Float32Array(4 * n), shapes = new Float32Array(8 * n);
+    const { gl, splats } = this, n = splats.count, four = new Float32Array(4 * n),
+      shapes = new Float32Array(8 * n);
     this.programs.splats = program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     for (let i = 0; i < n; i++) {
       four.set(splats.means.subarray(3 * i, 3 * i + 3), 4 * i);
@@ -181,15 +164,17 @@ export class SortedRenderer {
     }
   }
 
-  // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of the canvas
-  // transparent. scale: size of the image in that of the canvas; still: triangles are sorted one by one, not fan by fan,
-  // and the device may take its time, unless stop() says that the image is not wanted any more: then the canvas stays as it is, and the result is false.
+  // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of
+  // the canvas transparent. scale: size of the image in that of the canvas; still: triangles are sorted one
+  // by one, not fan by fan, and the device may take its time, unless stop() says that the image is not wanted
+  // any more: then the canvas stays as it is, and the result is false.
   async draw({ view, level, parts, style, still, scale, background, gain, stop }) {
     const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
     const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h), images = [];
     gl.disable(gl.SCISSOR_TEST);
     for (const { what } of parts) {
-      images.push(what === "mesh" ? await this.#drawMesh(level, pinhole, style, still, stop) : this.#drawSplats(pinhole, scale));
+      images.push(what === "mesh" ? await this.#drawMesh(level, pinhole, style, still, stop)
+        : this.#drawSplats(pinhole, scale));
       if (!images.at(-1)) return false;
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -215,7 +200,8 @@ export class SortedRenderer {
   }
 
   async #drawMesh(level, pinhole, style, still, stop) {
-    const { gl } = this, all = this.#needMesh(level), opaque = style === "opaque", wires = style === "wireframe";
+    const { gl } = this, all = this.#needMesh(level), opaque = style === "opaque",
+      wires = style === "wireframe";
     if (!opaque) this.#sortMesh(all, pinhole, still);
     const list = opaque ? all.items : all.order.subarray(0, all.count);
     const frame = this.#frame(pinhole.width, pinhole.height, 4, opaque), corners = wires ? 6 : 3;
@@ -232,7 +218,8 @@ export class SortedRenderer {
       }
       gl.uniform1f(this.programs.mesh.at("solid"), SOLID[style]);
       gl.bindVertexArray(all.array);
-      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires), gl.STREAM_DRAW);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires),
+        gl.STREAM_DRAW);
       gl.drawElements(wires ? gl.LINES : gl.TRIANGLES, corners * some.length, gl.UNSIGNED_INT, 0);
       gl.bindVertexArray(null);
     }
@@ -243,7 +230,8 @@ export class SortedRenderer {
   async #idle() {
     const { gl } = this, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise(done => setTimeout(done, 2));
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED)
+      await new Promise(done => setTimeout(done, 2));
     gl.deleteSync(fence);
   }
 
@@ -309,7 +297,8 @@ export class SortedRenderer {
     frame.image = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, frame.image);
     gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
+    for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
+      gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     frame.plain = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame.plain);
@@ -343,7 +332,8 @@ function resolve(gl, frame) {
   if (frame.target !== frame.plain) {
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame.target);
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, frame.plain);
-    gl.blitFramebuffer(0, 0, frame.width, frame.height, 0, 0, frame.width, frame.height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.blitFramebuffer(0, 0, frame.width, frame.height, 0, 0, frame.width, frame.height, gl.COLOR_BUFFER_BIT,
+      gl.NEAREST);
   }
   return frame.image;
 }
@@ -390,7 +380,8 @@ function cornersOf(faces, some, edges) {
 function indexedArray(gl, { id }, positions, colors) {
   const array = gl.createVertexArray();
   gl.bindVertexArray(array);
-  const attributes = [["position", positions, 3, gl.FLOAT, false], ["color", colors, 4, gl.UNSIGNED_BYTE, true]];
+  const attributes = [["position", positions, 3, gl.FLOAT, false],
+    ["color", colors, 4, gl.UNSIGNED_BYTE, true]];
   for (const [name, values, width, type, normalised] of attributes) {
     const at = gl.getAttribLocation(id, name);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -424,7 +415,8 @@ function texture(gl, format, layout, type, values) {
   gl.bindTexture(gl.TEXTURE_2D, id);
   gl.texStorage2D(gl.TEXTURE_2D, 1, format, WIDTH, rows);
   gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, layout, type, padded);
-  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+    gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
   return id;
 }
 

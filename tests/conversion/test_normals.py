@@ -10,9 +10,9 @@ from _blender_scenes import ball_splats, sheets
 
 from meshsplats import convert
 from meshsplats.blender.linear import linear_colors
-from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.colors import srgb_to_linear
+from meshsplats.conversion.normals import shading_normals, typical_spacing
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.gaussians import GaussianCloud
 

@@ -8,8 +8,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from meshsplats.cli.messages import UsageError, one_line
-
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -35,21 +33,21 @@ def load(path: Path) -> dict[str, Any]:
 
     Raises:
         OSError: it cannot be read.
-        UsageError: it is larger than ``MAX_BYTES``, or no TOML.
+        ValueError: it is larger than ``MAX_BYTES``, or no TOML.
     """
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
-        raise UsageError(f"{path}: larger than {MAX_BYTES >> 10} KiB: not a configuration")
+        raise ValueError(f"{path}: larger than {MAX_BYTES >> 10} KiB: not a configuration")
     if max(map(len, data.splitlines()), default=0) > MAX_LINE:
-        raise UsageError(f"{path}: a line is longer than {MAX_LINE:,} bytes: not a configuration")
+        raise ValueError(f"{path}: a line is longer than {MAX_LINE:,} bytes: not a configuration")
     try:
         return tomllib.loads(data.decode("utf-8"))
     except RecursionError:
-        raise UsageError(f"{path}: not a TOML file: nested too deeply") from None
+        raise ValueError(f"{path}: not a TOML file: nested too deeply") from None
     except ValueError as error:
-        message = one_line(error)
-        raise UsageError(f"{path}: not a TOML file: {message[:200]}") from None
+        message = " ".join(str(error).split())
+        raise ValueError(f"{path}: not a TOML file: {message[:200]}") from None
 
 
 def _lines(table: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[str]:

@@ -12,11 +12,16 @@ from pathlib import Path
 
 from meshsplats._files.atomic import refuse_existing
 from meshsplats._files.locks import lock_of, locked
-from meshsplats.cli.common import check_mesh_suffix, check_outputs, file_of
-from meshsplats.cli.messages import UsageError, shown_path
-from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside, recorded_options
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import FileFormatError, OverwritingError
 from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.outputs import (
+    CONFIGURATION,
+    PREVIEW,
+    beside,
+    check_outputs,
+    file_of,
+    recorded_options,
+)
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named, splat_file, subject_name
@@ -32,11 +37,8 @@ class Job:
     preview: Path | None
     configs: tuple[Path, ...]
     """One for each output, or none."""
-
-    @property
-    def shown(self) -> str:
-        """The input as the user named it."""
-        return shown_path(self.source)
+    shown: str
+    """The input as the user named it; - for standard input."""
 
     @contextmanager
     def claimed(self, force: bool) -> Iterator[None]:
@@ -69,7 +71,7 @@ class Job:
 
         Raises:
             OSError: an output exists already, or cannot be written.
-            UsageError: an output is the input.
+            OverwritingError: an output is the input.
         """
         preview = [self.preview] if self.preview else []
         every = [*self.outputs, *self.configs, *preview]
@@ -175,13 +177,19 @@ def is_batch(paths: Sequence[Path]) -> bool:
 
 
 def jobs(
-    inputs: Sequence[Path], output: Path, formats: Sequence[str], *, preview: bool, sidecars: bool
+    inputs: Sequence[Path],
+    output: Path,
+    formats: Sequence[str],
+    *,
+    preview: bool,
+    sidecars: bool,
+    shown: Callable[[Path], str] = str,
 ) -> list[Job]:
     """A job for each of ``inputs``. ``formats``: suffixes without a dot, for a folder ``output``; none:
-    ``output`` is the one file.
+    ``output`` is the one file. ``shown``: an input as the user named it.
 
     Files in a folder are named like their inputs, ``a.glb`` for ``a.ply``; but ``a.ply.glb`` and
-    ``a.sog.glb`` for ``a.ply`` and ``a.sog``. UsageError if two outputs have one name all the same.
+    ``a.sog.glb`` for ``a.ply`` and ``a.sog``. OverwritingError if two outputs have one name all the same.
     """
     made: dict[Path, Path] = {}
     result = []
@@ -190,13 +198,13 @@ def jobs(
         outputs = tuple(output / f"{name}.{kind}" for kind in dict.fromkeys(formats)) or (output,)
         for path in outputs:
             if path in made:
-                raise UsageError(
+                raise OverwritingError(
                     f"{made[path]} and {source} would both become {path}: convert them into different folders"
                 )
             made[path] = source
         image = beside(outputs[0], PREVIEW) if sidecars and preview else None
         configs = tuple(beside(path, CONFIGURATION) for path in outputs) if sidecars else ()
-        result.append(Job(source, outputs, image, configs))
+        result.append(Job(source, outputs, image, configs, shown(source)))
     return result
 
 
@@ -238,20 +246,6 @@ def _is_result(path: Path) -> bool:
         return not path.is_dir() and identify(path) == "mesh"
     except (FileFormatError, OSError):
         return False
-
-
-def check_folder(output: Path) -> None:
-    """UsageError if ``output`` names a mesh file, where a folder for several is wanted."""
-    if output.suffix.lower() in MESH_SUFFIXES and not output.is_dir():
-        raise UsageError(f"several inputs or formats need a folder: -o {output.with_suffix('')}, say")
-
-
-def check_file(output: Path) -> None:
-    """UsageError if no mesh can be written as ``output``."""
-    try:
-        check_mesh_suffix(output)
-    except UsageError as error:
-        raise UsageError(f"{error}; for a folder, name the formats: --formats glb") from None
 
 
 def _is_splats(folder: Path) -> bool:

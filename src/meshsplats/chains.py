@@ -1,0 +1,164 @@
+"""A chain of levels of detail in a folder, made level by level: interrupted, it can go on."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from meshsplats._files.atomic import replace_folder, write_text
+from meshsplats.evaluation.viewers import choose_alpha
+from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.levels import (
+    SAMPLES,
+    Level,
+    level_targets,
+    likeness,
+    make_level,
+    merged,
+    merges_further,
+    plan_levels,
+    views_to_score,
+)
+from meshsplats.mesh import SplatMesh
+
+TABLE = "levels.json"
+OnLevel = Callable[[int, Level], AbstractContextManager[Callable[[Progress], None] | None]]
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """The meshes of a chain and their files."""
+
+    levels: int = 4
+    factor: Literal[2, 4] = 4
+    """Splats of each level per splat of the next."""
+    width: int = 800
+    """Side in pixels of images that just hold the subject, of the finest level."""
+    max_splats: int | None = None
+    """Of the finest level; None: all."""
+    format: str = "glb"
+    """Suffix of the files, without a dot."""
+    alpha: Literal["auto", "blend", "mask", "opaque"] = "auto"
+    """As for ``save_mesh``; 'auto': measured for each level (``choose_alpha``), for a .glb."""
+    up: Sequence[float] | np.ndarray | None = None
+    sh_degree: int | None = None
+    """Of the images of the splats; None: all that are stored."""
+    threads: int | None = None
+
+    def plan(self, splats: int) -> list[Level]:
+        """The levels of so many ``splats`` (``plan_levels``)."""
+        most = splats if self.max_splats is None else min(self.max_splats, splats)
+        return plan_levels(most, self.levels, factor=self.factor, width=self.width)
+
+
+def partial_folder(folder: Path) -> Path:
+    """Where the chain ``folder`` lies until it is complete."""
+    return folder.with_name(f"{folder.name}.partial")
+
+
+def make_chain(
+    cloud: GaussianCloud,
+    folder: Path,
+    options: ChainOptions | None = None,
+    config: FinetuneConfig | None = None,
+    *,
+    source: str = "",
+    place: Callable[[SplatMesh], SplatMesh] = lambda mesh: mesh,
+    on_level: OnLevel = lambda number, level: nullcontext(),
+) -> dict[str, Any]:
+    """Makes the chain of ``cloud`` in ``partial_folder(folder)`` and renames that to ``folder``, in place of
+    an older one. Levels that are finished there are kept. Returns the table of ``levels.json``.
+
+    Args:
+        cloud: the splats.
+        folder: where the chain appears when all its levels are done.
+        options: of the meshes and files.
+        config: of the fine-tuning of each level; None: converted only.
+        source: the name of ``cloud`` in the table.
+        place: makes of a mesh the one that is written.
+        on_level: entered for each level that is made; what it gives is shown the progress.
+
+    Raises Interrupted after Ctrl-C in a level, whose predecessors stay, and what ``plan_levels`` raises.
+    """
+    chosen, unfinished = options or ChainOptions(), partial_folder(folder)
+    chain = chosen.plan(len(cloud))
+    unfinished.mkdir(exist_ok=True)
+    rows, records = [], []
+    splats, waiting = cloud, list[Level]()  # splats that are merged further, and for which levels
+    for number, level in enumerate(chain):
+        records.append(unfinished / f"level_{number}.json")
+        waiting.append(level)
+        if not records[-1].is_file():
+            path = unfinished / f"level_{number}.{chosen.format}"
+            with on_level(number, level) as show:
+                row, splats = _made(cloud, splats, waiting, path, chosen, config, place, show)
+            waiting = []
+            write_text(records[-1], json.dumps(row, indent=1, allow_nan=False) + "\n")
+        rows.append(json.loads(records[-1].read_text(encoding="utf-8")))
+    table = {
+        "source": source,
+        "splats": len(cloud),
+        "factor": chosen.factor,
+        "look": "area",
+        "samples": SAMPLES,
+        "levels": rows,
+    }
+    for record in records:
+        record.unlink()
+    write_text(unfinished / TABLE, json.dumps(table, indent=1, allow_nan=False) + "\n")
+    replace_folder(unfinished, folder)
+    return table
+
+
+def _made(
+    cloud: GaussianCloud,
+    splats: GaussianCloud,
+    waiting: Sequence[Level],
+    path: Path,
+    chosen: ChainOptions,
+    config: FinetuneConfig | None,
+    place: Callable[[SplatMesh], SplatMesh],
+    show: Callable[[Progress], None] | None,
+) -> tuple[dict[str, Any], GaussianCloud]:
+    """Writes the mesh of the last level ``waiting`` to ``path``; its row of the table, and the splats that
+    the next levels are made of. ``splats``: those of this one and the levels before it that wait."""
+    start, level, threads = time.perf_counter(), waiting[-1], chosen.threads
+    drawn = {"up": chosen.up, "sh_degree": chosen.sh_degree, "threads": threads}
+    targets = level_targets(cloud, level, config, **drawn)
+    cameras = [view.camera for view in targets.test]
+    own = splats
+    for each in waiting if config is None else ():
+        if each is level or merges_further(each):
+            seen = level_targets(cloud, each, config, **drawn).test
+            own = merged(splats, each, [view.camera for view in seen], threads)
+            splats = own if merges_further(each) else splats
+    run = RunOptions(threads=threads, spent=time.perf_counter() - start)
+    mesh = make_level(own, level, targets, config, run=run, on_progress=show, up=chosen.up)
+    choice = None
+    if chosen.alpha == "auto" and chosen.format == "glb":
+        choice = choose_alpha(mesh, cameras, threads=threads)
+    asked = {} if chosen.alpha == "auto" else {"alpha": chosen.alpha}
+    save_mesh(place(mesh), path, **(asked if choice is None else choice.options))
+    scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces), len(cloud))]
+    score = likeness(mesh, cloud, scored, sh_degree=chosen.sh_degree, threads=threads)
+    row = {
+        "file": path.name,
+        "splats": mesh.splat_count,
+        "triangles": len(mesh.faces),
+        "bytes": path.stat().st_size,
+        "screen_size": level.width,
+        "psnr": round(score, 3),
+        "views": len(scored),
+        "alpha": asdict(choice) if choice else asked or None,
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+    return row, splats

@@ -1,0 +1,70 @@
+"""Meshes as files for other programs: cut, with normals for light, in the alpha mode that suits viewers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from meshsplats.camera import Camera
+from meshsplats.conversion.normals import shading_normals
+from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
+from meshsplats.formats.cutting import CUTOFF, cut_mesh
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.mesh import SplatMesh
+
+GLB_ALPHA = ("mask", "hybrid")
+"""Values of ``alpha`` that only .glb files have."""
+
+
+@dataclass(frozen=True)
+class MeshFileOptions:
+    """How a mesh is saved, in one or several formats. What a format does not have does not count there."""
+
+    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid"] = "auto"
+    """'auto': for a .glb, measured (``choose_alpha``); 'opaque': cut to solid triangles before."""
+    cutoff: float | None = None
+    """Least opacity that is drawn, of 'mask' and 'opaque'; None: ``CUTOFF``."""
+    lit: bool = False
+    """.glb, .usd: a material that takes light."""
+    smooth: bool = False
+    """Normals of the surface that the splats form."""
+    color_type: Literal["uint16", "float32"] = "uint16"
+    """.glb."""
+    compression: Literal["none", "meshopt"] = "none"
+    """.glb."""
+
+    def prepared(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
+        """``mesh`` cut and with normals, where that is asked for. ``cameras``: where it is seen from."""
+        if self.alpha == "opaque":
+            mesh = cut_mesh(mesh, CUTOFF if self.cutoff is None else self.cutoff)
+        return replace(mesh, normals=shading_normals(mesh, cameras)) if self.smooth else mesh
+
+    def choice(
+        self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
+    ) -> AlphaChoice | None:
+        """The alpha mode of the .glb among ``paths``, where it is left to the measurement."""
+        measured = self.alpha == "auto" and len(mesh.faces) and any(map(_is_glb, paths))
+        return choose_alpha(mesh, cameras) if measured else None
+
+    def save(self, mesh: SplatMesh, paths: Sequence[Path], choice: AlphaChoice | None = None) -> None:
+        """Saves a ``prepared`` mesh with the alpha mode of the ``choice``."""
+        own = {
+            "alpha": self.alpha if self.alpha in GLB_ALPHA else None,  # or cut already
+            "cutoff": self.cutoff if self.alpha == "mask" else None,
+        }
+        for path in paths:
+            glb = _is_glb(path)
+            more: dict[str, Any] = {}
+            if glb:
+                more |= own if choice is None else choice.options
+                more |= {"color_type": self.color_type} if self.color_type != "uint16" else {}
+                more |= {"compression": self.compression} if self.compression != "none" else {}
+            if self.lit and (glb or path.suffix.lower().startswith(".usd")):
+                more["lit"] = True
+            save_mesh(mesh, path, **more)
+
+
+def _is_glb(path: Path) -> bool:
+    return path.suffix.lower() == ".glb"

@@ -1,0 +1,67 @@
+"""Outputs of a command or program: checked before the work; and the records beside them."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from meshsplats import _toml as toml
+from meshsplats._files.atomic import refuse_existing
+from meshsplats.errors import FileFormatError, OverwritingError
+from meshsplats.formats.splat_paths import splat_file
+
+CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
+"""Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
+
+
+def beside(output: Path, record: str) -> Path:
+    """Name of a record of the file ``output``: with the whole name of that, so that records of ``mesh.glb``
+    and ``mesh.png`` are different files."""
+    return output.with_name(f"{output.name}.{record}")
+
+
+def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:
+    """The options in the configuration file at ``path``; None if there is none, or of another command than
+    ``name``."""
+    try:
+        record = toml.load(path)
+        return dict(record["options"]) if name in (None, record["command"]) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def check_outputs(
+    paths: Sequence[Path], force: bool, folder: Path | None = None, *, inputs: Sequence[Path] = ()
+) -> None:
+    """Checks outputs before the work. ``folder`` holds all of them and is made later, but not the one above
+    it: a misspelt path must not make a tree of folders.
+
+    Raises:
+        OSError: an output exists already (unless ``force``) or cannot be written.
+        OverwritingError: an output is one of ``inputs``, with ``force``, too.
+    """
+    read = [file_of(source) for source in inputs if source.exists()]
+    for path in paths:
+        if path.exists() and any(path.samefile(source) for source in read):
+            raise OverwritingError(f"{path} is read by this command: give another name for the output")
+    refuse_existing(paths, force)
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "must be a folder, this is a file", str(folder))
+    exists = folder is not None and folder.exists()
+    places = {folder} if exists else {(folder or path).absolute().parent for path in paths}
+    for above in filter(None, places):
+        if not above.is_dir():
+            raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
+        if not os.access(above, os.W_OK):
+            raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
+
+
+def file_of(source: Path) -> Path:
+    """The file that is read where ``source`` is a folder."""
+    try:
+        return splat_file(source) if source.is_dir() else source
+    except FileFormatError:
+        return source

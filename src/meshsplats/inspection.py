@@ -1,0 +1,253 @@
+"""What a file or folder is and holds: splats, a mesh, a tileset, cameras, a data set of photographs."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats._json import read_json
+from meshsplats._origin import choose_origin
+from meshsplats.camera import Camera
+from meshsplats.cameras.camera_path import is_camera_path
+from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds, warn_of_strays_in
+from meshsplats.datasets.colmap import count_points
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.image_files import PhotoFile
+from meshsplats.datasets.layouts import Layout, find_layout
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.gaussians import format_of, load_gaussians, moving_splats
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_paths import splat_file
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.tiles import is_tileset
+
+SAMPLE = 4000
+"""Number of splats that are converted to estimate the size of the mesh."""
+
+
+def describe(path: Path, reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Findings about ``path``, ready for JSON, first its ``kind``. Lengths are in scene units.
+
+    ``reading``: arguments of ``load_gaussians``, for splats.
+
+    Raises FileFormatError for a file or folder that is none of these, and OSError.
+    """
+    if is_tileset(path):
+        return {"kind": "tileset", **_tileset(path)}
+    layout = _layout(path)
+    kind = "data set" if layout is not None else identify(path)
+    found: dict[str, Any] = {"kind": kind}
+    if path.is_file():
+        found["bytes"] = path.stat().st_size
+    if layout is not None:
+        found |= _photographs(path, layout)
+    elif kind == "splats":
+        cloud = load_gaussians(path, **(reading or {}))
+        warn_of_strays_in(cloud)
+        found |= {"format": format_of(path)} | _in_time(path) | _splats(cloud)
+        if cameras := cameras_beside(path, np.zeros(3)):
+            found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
+    elif kind == "mesh":
+        mesh = load_mesh(path)
+        warn_of_strays_in(mesh)
+        found |= _mesh(mesh)
+    else:
+        found |= _world_cameras(load_cameras(path))
+        if is_camera_path(read_json(path)):
+            found["frame"] = "nerfstudio's, that of the splats it exports"
+            if (path.parent / "dataparser_transforms.json").is_file():
+                found["frame"] += "; dataparser_transforms.json leads from that of the photographs to it"
+    return found
+
+
+def _layout(path: Path) -> Layout | None:
+    """That of a data set; None for anything else."""
+    if path.is_dir():
+        try:
+            splat_file(path)
+        except FileFormatError:
+            return find_layout(path)
+        return None
+    if path.suffix.lower() != ".json" or identify(path) != "cameras":
+        return None
+    content = read_json(path)
+    return find_layout(path) if isinstance(content, dict) and "frames" in content else None
+
+
+def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
+    dataset = load_dataset(path, missing="skip")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # those of the first time
+        own = not dataset.test or bool(load_dataset(path, test_every=0, missing="skip").test)
+    sources = [view.source for view in dataset.views]
+    photos = [source for source in sources if isinstance(source, PhotoFile)]
+    lenses = sorted({photo.lens.model for photo in photos})
+    found: dict[str, Any] = {
+        "layout": layout.name,
+        "read_from": str(layout.source),
+        "images": len({photo.path for photo in photos}),
+        "training_views": len(dataset.train),
+        "held_out_views": len(dataset.test),
+        "split": "the data set's own" if own else "every 8th by name",
+        "lenses": lenses,
+        "undistorted_when_read": not all(photo.lens.is_pinhole for photo in photos),
+        "with_alpha": sum(photo.has_alpha for photo in photos),
+        "with_masks": sum(photo.mask is not None for photo in photos),
+        "bytes_in_memory": dataset.memory,
+        **_cameras([view.camera for view in dataset.views], dataset.origin),
+    }
+    if layout.name == "COLMAP" and (points := count_points(layout.source)) is not None:
+        found["points"] = points
+    return found
+
+
+def _in_time(path: Path) -> dict[str, Any]:
+    """What is known of splats that move; nothing of others."""
+    motion = moving_splats(path)
+    return {} if motion is None else {"moves": motion[0], "times": _rounded(np.array(motion[1:]))}
+
+
+def _splats(cloud: GaussianCloud) -> dict[str, Any]:
+    from meshsplats.conversion import convert
+
+    sample = cloud.take(np.arange(0, len(cloud), -(-len(cloud) // SAMPLE)))
+    try:
+        tried = convert(sample)
+    except ValueError:  # nothing visible
+        tried = SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 4)))
+    share = len(cloud) / len(sample)
+    ordered = np.sort(cloud.scales, axis=1).astype(np.float64)
+    flatness = ordered[:, 0] / np.maximum(ordered[:, 1], 1e-30)
+    return {
+        "splats": len(cloud),
+        "sh_degree": cloud.sh_degree,
+        "kernel": cloud.kernel,
+        **({} if cloud.up is None else {"up": _rounded(cloud.up)}),
+        **_extent(cloud.means, scene_bounds(cloud), cloud.origin),
+        "opacity_5_50_95_percent": _quantiles(cloud.opacities),
+        "faint_splats": int((cloud.opacities < 1 / 255).sum()),
+        "scale_5_50_95_percent": _quantiles(ordered.mean(axis=1)),
+        "flatness_median": float(np.float32(np.median(flatness))),
+        "estimated_triangles": round(len(tried.faces) * share),
+        "estimated_vertices": round(len(tried.vertices) * share),
+    }
+
+
+def _mesh(mesh: SplatMesh) -> dict[str, Any]:
+    found: dict[str, Any] = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    if mesh.splat_count is not None:
+        found["splats"] = mesh.splat_count
+    if len(mesh.vertices):
+        found |= _extent(mesh.vertices, scene_bounds(mesh), mesh.origin)
+        found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
+    if mesh.binding is not None:
+        base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"
+        found["bound_to_base_of"] = base
+    return found | {
+        "up": _rounded(mesh.up),
+        "blending": mesh.blending,
+        "filter_px2": mesh.filter_px2,
+        "normals": mesh.normals is not None,
+        "depth_groups": mesh.depth_group is not None,
+        "attributes": list(mesh.attributes),
+    }
+
+
+def _tileset(path: Path) -> dict[str, Any]:
+    from meshsplats.tiles.tileset import Tileset
+
+    tileset = Tileset(path)
+    folder = path if path.is_dir() else path.parent
+    found = {"tiles": 0, "levels": 0, "triangles": 0, "largest_tile": 0}
+    for tile, level in tileset.tiles():
+        found["tiles"] += 1
+        found["levels"] = max(found["levels"], level)
+        found["largest_tile"] = max(found["largest_tile"], tile.triangles)
+        found["triangles"] += 0 if tile.children else tile.triangles
+    corners = tileset.root.corners()
+    return {
+        "bytes": sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
+        "splats": tileset.splats,
+        **found,
+        "geometric_error": float(f"{tileset.root.error:.6g}"),
+        "lower": _in_world(corners.min(axis=0), tileset.origin),
+        "upper": _in_world(corners.max(axis=0), tileset.origin),
+        **_origin(tileset.origin),
+        "up": _rounded(tileset.up),
+    }
+
+
+def _cameras(cameras: Sequence[Camera], origin: np.ndarray) -> dict[str, Any]:
+    centers = np.array([camera.center for camera in cameras])
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    return {
+        "cameras": len(cameras),
+        "image_sizes": [list(size) for size in sizes[:8]],
+        "fx": _range([camera.fx for camera in cameras]),
+        "near": _near_planes(cameras),
+        "lower": _in_world(centers.min(axis=0), origin),
+        "upper": _in_world(centers.max(axis=0), origin),
+        **_origin(origin),
+        "up_by_cameras": _rounded(guess_up(None, cameras)),
+    }
+
+
+def _world_cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Findings about cameras that are in the world."""
+    origin = choose_origin(np.array([camera.center for camera in cameras]))
+    return _cameras([camera.relative_to(origin) for camera in cameras], origin)
+
+
+def _near_planes(cameras: Sequence[Camera]) -> list[float] | str:
+    """Range of those that are named."""
+    named = [camera.near for camera in cameras if camera.near is not None]
+    return _range(named) if named else "follows the scene"
+
+
+def _extent(points: np.ndarray, bounds: Bounds, origin: np.ndarray) -> dict[str, Any]:
+    """In the coordinates of the file, which are those of the world."""
+    return {
+        "lower": _in_world(points.min(axis=0), origin),
+        "upper": _in_world(points.max(axis=0), origin),
+        "center": _in_world(bounds.center, origin),
+        **_origin(origin),
+        "radius_90_percent": float(f"{bounds.radius:.6g}"),
+    }
+
+
+class Place(float):
+    """A coordinate that is printed with all its digits."""
+
+
+def _in_world(local: np.ndarray, origin: np.ndarray) -> list[float]:
+    """``local`` (3,), six digits, plus the ``origin``."""
+    rounded = _rounded(local)
+    if not origin.any():
+        return rounded
+    return [Place(f"{x + at:.12g}") for x, at in zip(rounded, origin.tolist(), strict=True)]
+
+
+def _origin(origin: np.ndarray) -> dict[str, Any]:
+    """The finding about it; none for zeros."""
+    return {"origin": [Place(x) for x in origin.tolist()]} if origin.any() else {}
+
+
+def _quantiles(values: np.ndarray) -> list[float]:
+    return _rounded(np.quantile(values, (0.05, 0.5, 0.95)))
+
+
+def _range(values: Sequence[float]) -> list[float]:
+    return _rounded(np.array([min(values), max(values)]))
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    """Six digits, and 0 for rounding errors."""
+    largest = float(np.abs(values).max())
+    return [float(f"{v:.6g}") if abs(v) > 1e-12 * largest else 0.0 for v in values]

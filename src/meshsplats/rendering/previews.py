@@ -1,0 +1,49 @@
+"""Images that show at a glance what a file holds, made smaller where they would take long."""
+
+from __future__ import annotations
+
+import os
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.images.writing import save_image
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.api import render_splats
+from meshsplats.rendering.layers import affordable
+from meshsplats.rendering.looks import image_of
+from meshsplats.rendering.samples import FEWEST, needed_samples
+
+TRIANGLES = 1_000_000
+"""Triangles of a mesh above which its preview is half as wide, with the fewest samples. Of 2 to 17 million
+triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."""
+FRAGMENTS = 1e9
+"""Fragments above which a preview is made smaller, or not at all: some 10 s of one processor. Of real scenes,
+previews have 1e7 to 4e8."""
+
+
+def preview_camera(scene: SplatMesh | GaussianCloud) -> Camera:
+    """In front of ``scene`` and a little to the side, which shows more of its shape."""
+    return orbit(scene, 1, azimuth=30, width=800, height=800)[0]
+
+
+def save_preview(
+    scene: SplatMesh | GaussianCloud, path: str | os.PathLike[str], camera: Camera | None = None
+) -> bool:
+    """Saves an image of ``scene`` from ``camera``, by default ``preview_camera``. Returns False, and saves
+    nothing, if it would have more than ``FRAGMENTS`` at an eighth of the size, too."""
+    camera = preview_camera(scene) if camera is None else camera
+    samples = 1
+    if isinstance(scene, SplatMesh):
+        if len(scene.faces) <= TRIANGLES:
+            samples = needed_samples(scene, [camera])
+        else:
+            camera, samples = camera.scaled(0.5), 1 if scene.filter_px2 else FEWEST
+    small = affordable(scene, camera, samples, FRAGMENTS)
+    if small is None:
+        return False
+    if isinstance(scene, SplatMesh):
+        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples)[0])
+    else:
+        save_image(path, render_splats(scene, small).color)
+    return True

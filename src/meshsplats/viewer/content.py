@@ -1,0 +1,135 @@
+"""What a page shows: splats that are merged if they are many, their mesh, a coarse level for weak devices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.conversion import convert
+from meshsplats.conversion.budget import usual_triangles_each
+from meshsplats.conversion.merging import simplify_in_blocks
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render, render_splats
+from meshsplats.rendering.layers import SMALLEST, affordable
+from meshsplats.viewer.page import Page
+
+SIDE = 400
+"""Largest side of the image by which the errors of merging and quantisation are measured."""
+MEASURED_FRAGMENTS = 1e9
+"""Largest number of its fragments: of a scene that has more, the image is smaller."""
+TRIANGLES = 4_000_000
+"""Usual limit: more take seconds to sort and draw, and pages of more than 40 MB."""
+COARSE_TRIANGLES = 300_000
+"""Triangles of the coarse level, which any phone draws; meshes with more get one."""
+MOST_TRIANGLES = 20_000_000
+"""Triangles of a page at most: browsers hold no more."""
+
+
+class TooManyTrianglesError(ValueError):
+    """A page cannot hold the mesh."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a page shows."""
+
+    mesh: SplatMesh
+    splats: GaussianCloud | None
+    """Shown beside it."""
+    coarse: SplatMesh | None = None
+    kept: int = 0
+    """Splats of the mesh, where it was made of splats."""
+    merged_from: int | None = None
+    """How many there were, if they were merged."""
+    merging_psnr: float = 0.0
+    """dB between images of all splats and of those that are left, in one view."""
+
+
+def content_of_splats(
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera] = (),
+    *,
+    max_triangles: int | None = None,
+    shown: bool = True,
+) -> Content:
+    """The content of a page of splats, merged until their mesh has at most ``max_triangles``.
+
+    ``cameras``: where they are seen from. ``shown``: whether the splats are in the page, too.
+
+    Raises TooManyTrianglesError above ``MOST_TRIANGLES``.
+    """
+    each = usual_triangles_each()
+    count = len(cloud) if max_triangles is None else max(1, max_triangles // each)
+    _check_size(each * min(count, len(cloud)))
+    cloud = _degree_0(cloud)
+    kept = simplify_in_blocks(cloud, count)
+    mesh = convert(kept)
+    content = Content(mesh, kept if shown else None, _coarse(mesh, kept), len(kept))
+    if kept is cloud:
+        return content
+    images = (render_splats(each, _camera(cloud, cameras)).color for each in (kept, cloud))
+    return replace(content, merged_from=len(cloud), merging_psnr=psnr(*images))
+
+
+def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Content:
+    """The content of a page of a mesh, with ``splats`` to compare it with. Raises TooManyTrianglesError above
+    ``MOST_TRIANGLES``."""
+    _check_size(len(mesh.faces))
+    splats = None if splats is None else _degree_0(splats)
+    return Content(mesh, splats, None if splats is None else _coarse(mesh, splats))
+
+
+def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Sizes of ``page``, and the errors that merging and quantisation make."""
+    mesh, packed = content.mesh, page.mesh
+    camera = _camera(mesh, cameras)
+    camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
+    images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
+    merged: dict[str, Any] = {}
+    if content.merged_from is not None:
+        merged = {"merged_from": content.merged_from, "merging_psnr": round(content.merging_psnr, 2)}
+    return {
+        "triangles": len(mesh.faces),
+        "coarse_triangles": 0 if content.coarse is None else len(content.coarse.faces),
+        "splats": 0 if content.splats is None else len(content.splats),
+        **merged,
+        "viewpoints": len(cameras),
+        "bytes": len(page.html.encode("utf-8")),
+        "bytes_a_triangle": round(packed.bytes_a_triangle, 2),
+        "position_error": packed.position_error,
+        "position_error_radii": packed.relative_error,
+        "color_error_levels": packed.color_error,
+        "alpha_error_levels": packed.alpha_error,
+        "image_error_levels": 255 * float(np.abs(images[0] - images[1]).max()),
+    }
+
+
+def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
+    """``cloud`` without the colours that a page does not show: up to three quarters of its memory."""
+    return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
+
+
+def _coarse(mesh: SplatMesh, splats: GaussianCloud) -> SplatMesh | None:
+    """The coarse level of a mesh with many triangles, made of its splats."""
+    if len(mesh.faces) <= COARSE_TRIANGLES:
+        return None
+    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each()), up=mesh.up)
+
+
+def _check_size(triangles: int) -> None:
+    if triangles > MOST_TRIANGLES:
+        raise TooManyTrianglesError(
+            f"a page holds at most {MOST_TRIANGLES:,} triangles, and these would be {triangles:,}"
+        )
+
+
+def _camera(scene: SplatMesh | GaussianCloud, cameras: Sequence[Camera]) -> Camera:
+    """The view of the measurements."""
+    return cameras[0].within(SIDE) if cameras else orbit(scene, 1, azimuth=30, width=SIDE, height=SIDE)[0]

@@ -1,0 +1,46 @@
+// The line of the state of the image, and statistics.
+
+export const element = id => document.getElementById(id);
+export const number = value => Math.round(value).toLocaleString("en");
+
+// state: of the image; exact: whether the exact renderer drew it, in so many passes; scale: of the canvas.
+export function report(app, state, exact, passes, scale, level) {
+  const { options } = app, only = options.content === "splats";
+  const kind = only ? "splats" : exact ? "exact" : "sorted";
+  const samples = exact && !only ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
+  const size = scale < 1 ? `, 1/${Math.round(1 / scale)} size` : state === "moving" ? ", moving" : samples;
+  const wording = {
+    refining: `, ${app.passes} of ${passes} samples`, preparing: ", preparing the exact image",
+  };
+  element("status").textContent = kind + (wording[state] ?? size);
+  element("samples").disabled = !app.exactly;
+  document.body.dataset.renderer = kind;
+  document.body.dataset.level = level;
+  // milliseconds after the request
+  document.body.dataset.firstPicture ??= String(Math.round(performance.now()));
+  document.body.dataset.state = state;
+  if (state === "moving" && !element("statistics").open) return;
+  const { width, height } = app.canvases.sorted, { mesh, splats, view, settings } = app;
+  const shown = app.kept, triangles = number(mesh.faces.length / 3);
+  const point = values => values.map(value => Number(value.toPrecision(4))).join(" ");
+  const rows = {
+    triangles: shown ? `${number(shown[app.resting].triangles.length)} of ${triangles}` : triangles,
+    vertices: number(mesh.vertices.length / 3),
+    ...(splats ? { splats: shown ? `${number(shown.splats.length)} of ${number(splats.count)}`
+      : number(splats.count) } : {}),
+    image: `${width} × ${height}`,
+    "exact frame": app.exactTook === undefined ? "–" : `${number(app.exactTook)} ms`,
+    "graphics": (exact ? app.exact?.name : app.sorted?.name) ?? "",
+    "first picture": `${number(Number(document.body.dataset.firstPicture))} ms`,
+    position: point(view.position),
+    direction: point(view.forward),
+    ...settings.statistics,
+  };
+  const list = element("statistics").querySelector("dl");
+  list.replaceChildren(...Object.entries(rows).flatMap(([term, text]) => {
+    const dt = document.createElement("dt"), dd = document.createElement("dd");
+    dt.textContent = term;
+    dd.textContent = text;
+    return [dt, dd];
+  }));
+}

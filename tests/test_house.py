@@ -1,0 +1,120 @@
+"""Limits that keep the source readable: lengths of files and lines, parameters, a thin command line."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import meshsplats
+
+SOURCE = Path(meshsplats.__file__).parent
+ROOT = Path(__file__).parents[1]
+LONGEST_FILE = 450
+LONGEST_LINE = 110
+MOST_PARAMETERS = 8
+MOST_LINES_OF_THE_COMMAND_LINE = 6100
+KINDS = {".py", ".h", ".cpp", ".js", ".wgsl", ".html", ".css"}
+
+LONGER = {
+    "csrc/gradient.h": "the backward pass in one piece, so that the compiler inlines it",
+    "csrc/fan_filter.h": "the filter and its adjoint share the moments of a fan",
+    "csrc/splats.h": "projection, order and blending of splats in one piece, as in gradient.h",
+    "cli/common.py": "options of all commands",
+    "cli/convert.py": "the largest command",
+    "cli/training.py": "options, progress and result of three commands",
+    "finetuning/cells.py": "being divided",
+    "finetuning/run.py": "being divided",
+    "finetuning/state.py": "being divided",
+    "rendering/reference.py": "the specification, read from top to bottom",
+    "webgpu/frames.py": "being divided",
+    "webgpu/gradients.py": "being divided",
+}
+"""Files that are longer, and why."""
+WIDER = {
+    "cameras/trajectories.py: dome": "public",
+    "cameras/trajectories.py: orbit": "public",
+    "datasets/splat_targets.py: splat_dataset": "public",
+    "evaluation/benchmarks.py: _scene_report": "being divided",
+    "evaluation/benchmarks.py: run_benchmark": "public",
+    "evaluation/comparison.py: compare": "public",
+    "evaluation/comparison.py: compare_views": "public",
+    "evaluation/report.py: _scores": "being divided",
+    "evaluation/report.py: evaluate": "public",
+    "rendering/api.py: render": "public",
+    "rendering/autograd.py: rasterize": "public",
+    "rendering/backward.py: __init__": "being divided",
+    "rendering/reference.py: render": "as in the library",
+    "rendering/reference_autograd.py: rasterize": "as in the library",
+    "webgpu/training.py: __init__": "being divided",
+}
+"""Functions of more parameters, and why."""
+
+
+def sources() -> dict[str, str]:
+    return {
+        path.relative_to(SOURCE).as_posix(): path.read_text("utf-8")
+        for path in sorted(SOURCE.rglob("*"))
+        if path.suffix in KINDS
+    }
+
+
+def too_many_parameters(text: str) -> list[str]:
+    """Names of the functions."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            given = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+            if sum(each.arg not in ("self", "cls") for each in given) > MOST_PARAMETERS:
+                found.append(node.name)
+    return found
+
+
+def test_files_are_short_or_named_with_a_reason():
+    longer = {name for name, text in sources().items() if len(text.splitlines()) > LONGEST_FILE}
+    assert longer == set(LONGER), "name what is longer, and take out what is not"
+
+
+def test_lines_are_short():
+    """Formatters see to Python and C++; nothing else does to WGSL and JavaScript. Remarks to tools may stand
+    beyond the limit."""
+    remark = re.compile(r"  # (noqa|type: ignore).*")
+    wide = [
+        f"{name}:{number}"
+        for name, text in sources().items()
+        if not name.endswith((".html", ".css"))
+        for number, line in enumerate(text.splitlines(), 1)
+        if len(remark.sub("", line)) > LONGEST_LINE
+    ]
+    assert wide == []
+
+
+def test_functions_take_few_parameters_or_are_named_with_a_reason():
+    wider = {
+        f"{name}: {function}"
+        for name, text in sources().items()
+        if name.endswith(".py")
+        for function in too_many_parameters(text)
+    }
+    assert wider == set(WIDER), "name what takes more, and take out what does not"
+
+
+def test_parameters_are_counted_without_self():
+    names = [f"p{i}" for i in range(MOST_PARAMETERS)]
+    few = f"class A:\n    def f(self, {', '.join(names)}): ..."
+    assert too_many_parameters(few) == []
+    assert too_many_parameters(few.replace("p0", "p0, *, more")) == ["f"]
+
+
+def test_the_command_line_is_thin():
+    lines = sum(len(path.read_text("utf-8").splitlines()) for path in (SOURCE / "cli").rglob("*.py"))
+    assert lines <= MOST_LINES_OF_THE_COMMAND_LINE
+
+
+def test_only_the_command_itself_imports_the_command_line():
+    """Benchmarks, tools and Blender's extension use the library; but a page lists the options of the command."""
+    users = [*ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("tools/**/*.py"), *ROOT.glob("examples/**/*.py")]
+    users += ROOT.glob("blender_extension/**/*.py")
+    assert len(users) > 20
+    found = [path.name for path in users if "meshsplats.cli" in path.read_text("utf-8")]
+    assert found == ["options_page.py"]

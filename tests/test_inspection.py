@@ -1,0 +1,48 @@
+"""Findings about files and the installation, without the command line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from _splats import few_splats
+
+from meshsplats import convert
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.inspection import describe
+from meshsplats.installation import examine
+
+
+def test_findings_about_splats_follow_the_arguments_of_the_reader(tmp_path):
+    cloud = few_splats()
+    save_gaussians(cloud, tmp_path / "scene.ply")
+    found = describe(tmp_path / "scene.ply")
+    assert (found["kind"], found["splats"]) == ("splats", len(cloud))
+    upside_down = describe(tmp_path / "scene.ply", {"axes": "y-up"})
+    assert upside_down["lower"][1] == pytest.approx(-found["upper"][1], rel=1e-5)
+    json.dumps(found, allow_nan=False)
+
+
+def test_findings_about_a_mesh(tmp_path):
+    mesh = convert(few_splats())
+    save_mesh(mesh, tmp_path / "mesh.npz")
+    found = describe(tmp_path / "mesh.npz")
+    assert (found["kind"], found["triangles"]) == ("mesh", len(mesh.faces))
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    (tmp_path / "text.ply").write_text("hello")
+    with pytest.raises(FileFormatError, match=r"text\.ply"):
+        describe(tmp_path / "text.ply")
+
+
+def test_missing_libraries_are_named_as_pip_takes_them(monkeypatch):
+    monkeypatch.setattr("meshsplats.installation._version", lambda name: None if name == "wgpu" else "1.0")
+    found = examine()
+    assert found["core"]["works"]
+    missing = found["to_install"]
+    assert "gpu" in missing
+    assert {name[:4] for names in missing.values() for name in names} == {"wgpu"}
+    json.dumps(found)

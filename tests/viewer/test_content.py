@@ -1,0 +1,36 @@
+"""What a page shows, without a browser."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshsplats.conversion import convert
+from meshsplats.demo_scene import make_scene
+from meshsplats.viewer import content
+from meshsplats.viewer.content import TooManyTrianglesError, content_of_mesh, content_of_splats
+
+
+def test_splats_within_the_limit_are_not_merged():
+    cloud = make_scene(200)
+    found = content_of_splats(cloud, max_triangles=1600)
+    assert (len(found.mesh.faces), found.kept, found.merged_from) == (1600, 200, None)
+    found = content_of_splats(cloud, max_triangles=800, shown=False)
+    assert (len(found.mesh.faces), found.kept, found.merged_from, found.splats) == (800, 100, 200, None)
+    assert 10 < found.merging_psnr < 45
+
+
+def test_only_the_colours_that_a_page_shows_are_kept():
+    cloud = make_scene(200)
+    assert cloud.sh_degree > 0
+    found = content_of_mesh(convert(cloud), cloud)
+    assert found.splats is not None
+    np.testing.assert_array_equal(found.splats.sh, cloud.sh[:, :1])
+
+
+def test_a_page_has_a_limit_for_meshes_and_splats(monkeypatch):
+    monkeypatch.setattr(content, "MOST_TRIANGLES", 1000)
+    cloud = make_scene(200)
+    for call in (lambda: content_of_splats(cloud), lambda: content_of_mesh(convert(cloud))):
+        with pytest.raises(TooManyTrianglesError, match="at most 1,000 triangles, and these would be 1,600"):
+            call()
