@@ -25,7 +25,7 @@ from test_rendering_variants import VIEWS, assert_image, in_another_process, sca
 from meshsplats import Camera, SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapedRendering, TapeOptions
 
 MODES = ("flat", "crossed", "3d")
 STARS = {"detail": "cameras", "sides": 60, "cameras": [camera()]}
@@ -233,7 +233,7 @@ def test_what_stays_as_it_is():
 def test_an_invisible_splat_has_a_shape():
     """Its gradient is that of its contribution, at the position that its filter gives it."""
     mesh, view = diamond((20, 18), (2.0, 2.0), alpha=0.0), plain_camera()
-    image = TapedRendering(mesh.triangles._replace(filter_px2=8.0), view, samples=8)
+    image = TapedRendering(mesh.triangles._replace(filter_px2=8.0), view, TapeOptions(samples=8))
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     nothing, all_pixels = np.zeros_like(image.color), np.ones_like(image.alpha)
     image.backward(nothing, all_pixels, None, vertices=points, colors=colors)

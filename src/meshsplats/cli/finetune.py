@@ -68,7 +68,7 @@ from meshsplats.finetuning.pace import (
     of_brief_run,
     worthwhile_steps,
 )
-from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores, scored_count
+from meshsplats.finetuning.reports import SCORED_VIEWS, held_out_scores, scored_count
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
