@@ -26,6 +26,7 @@ from meshsplats import Camera, SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
+from meshsplats.rendering.reference_samples import to_camera
 
 MODES = ("flat", "crossed", "3d")
 STARS = {"detail": "cameras", "sides": 60, "cameras": [camera()]}
@@ -326,7 +327,7 @@ def test_gradients_by_finite_differences():
     from meshsplats.rendering import reference_autograd
 
     mesh, view = fans(6, 3, "crossed", sizes=(0.05, 0.5)), camera()
-    points = torch.from_numpy(reference._to_camera(mesh.vertices, view)).requires_grad_()
+    points = torch.from_numpy(to_camera(mesh.vertices, view)).requires_grad_()
     opacity = torch.from_numpy(mesh.colors[:, 3].astype(np.float64)).requires_grad_()
 
     def places(points, opacity):
