@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,11 +17,14 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config, starting_mesh
+from meshsplats.finetuning.clock import Clock
+from meshsplats.finetuning.config import learning_rates
 from meshsplats.finetuning.hybrid import COLOR_SLOPE, ColorLimits, softness, with_soft_splats
 from meshsplats.finetuning.opaque import expected_error, visible_samples
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.cutting import Cutting
 from meshsplats.finetuning.phases.hybrid import Hybrid
+from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.state import Gradients, State
 from meshsplats.finetuning.step import make_step
 from meshsplats.formats.cutting import cut_mesh
@@ -321,6 +325,22 @@ def test_a_run_with_blended_triangles_limits_the_colors_of_opaque_ones(foggy):
     assert beyond(opaque) > 5 * beyond(hybrid)
 
 
+def test_limits_of_colors_follow_the_triangles_that_are_left(foggy):
+    dataset, mesh, _ = foggy
+    views = len(dataset.train)
+    config = make_config(steps=8, opacity="cutoff", soft_share=0.2, prune_epochs=2 / views)
+    start = with_soft_splats(cut_mesh(mesh), mesh, dataset.train, 0.2)
+    moment, state = Moment(Clock(config, views), dataset.train, None), State.begin_hybrid(start, config, 1)
+    phase, limits = Hybrid(config), []
+    for moment.clock.step in range(1, 5):
+        phase, state = phase.after_step(state, moment)
+        limits.append(phase.limits)
+        state.colors[state.mesh.faces[~solid_faces(state.result())][:9], 3] = 0
+    assert len(state.mesh.faces) < len(start.faces)
+    changed = [one is not two for one, two in pairwise(limits)]
+    assert changed == [True, False, True]  # pruned after every second step
+
+
 def square(x: float, depth: float, opacity: float) -> SplatMesh:
     """Red, of side 1."""
     corners = [(x + dx, dy, depth) for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
@@ -328,12 +348,17 @@ def square(x: float, depth: float, opacity: float) -> SplatMesh:
 
 
 def test_the_phases_of_a_run(scene):
-    _, mesh = scene
+    dataset, mesh = scene
+    view = dataset.train[0]
     config = make_config(opacity="cutoff", soft_share=0.1, soft_phase=0.25)
     cutting, hybrid = Cutting(config, mesh), Hybrid(config)
     assert [cutting.share(f) for f in (0, 0.375, 0.75, 0.9)] == pytest.approx([0, 0.5, 1, 1])
     assert [hybrid.share(f) for f in (0.75, 0.875, 1)] == pytest.approx([0, 0.5, 1])
     assert hybrid.share(0.74) < 0
+    # Learning rates begin again with the second phase.
+    for phase, step, fraction, own in ((cutting, 300, 0.375, 300), (hybrid, 700, 0.875, 100)):
+        plan = phase.plan(view, step, fraction)
+        assert (plan.color_rate, plan.position_rate) == pytest.approx(learning_rates(config, own, 0.5))
     assert Cutting(make_config(opacity="cutoff"), mesh).share(0.9) == 0.9
 
 

@@ -109,10 +109,11 @@ def loss_name(loss: Loss | None) -> str:
 def own_loss(loss: Loss, image: np.ndarray, target: Target) -> tuple[float, np.ndarray]:
     """The value of a loss that is not the default one, and its gradient, float32.
 
-    The loss gets copies, which it may change. TypeError or ValueError if it returns something else.
+    The loss may change the image and the target, which is a copy. TypeError or ValueError if it returns
+    something else.
     """
     mask = None if target.mask is None else target.mask.copy()
-    found: object = loss(image.copy(), target._replace(color=target.color.copy(), mask=mask))
+    found: object = loss(image, target._replace(color=target.color.copy(), mask=mask))
     name = loss_name(loss)
     if not (isinstance(found, (tuple, list)) and len(found) == 2):
         raise TypeError(f"the loss {name} must return its value and its gradient, got {described(found)}")
