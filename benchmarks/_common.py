@@ -135,11 +135,12 @@ def take_steps(
 ) -> tuple[ms.SplatMesh, int]:
     """The mesh after steps of fine-tuning, and their number, until ``fraction``, which takes the number of
     steps so far, is 1: for clocks that ``finetune`` does not have."""
+    from meshsplats.finetuning.phases.blended import Blended
     from meshsplats.finetuning.step import kept_faces, make_step
 
     step, interval = 0, config.prune_interval(len(views))
     while (done := fraction(step)) < 1:
-        make_step(state, views, step, done)
+        make_step(state, views, step, done, Blended(config))
         step += 1
         if interval and step % interval == 0 and fraction(step) < 1:
             state = state.prune(kept_faces(state))

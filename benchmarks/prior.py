@@ -20,8 +20,9 @@ from _common import PHOTOGRAPHED, Report, Stopwatch, arguments, take_steps
 import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
 from meshsplats.finetuning.config import FinetuneConfig, learning_rates
+from meshsplats.finetuning.loss import DefaultLoss
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import loss_of, target_of, view_of_step
+from meshsplats.finetuning.step import target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.prior import bind, prior_config
 
@@ -116,7 +117,7 @@ def opaque_colors(
         )
         adam.param_groups[0]["lr"] = learning_rates(config, step, step / steps)[0]
         adam.zero_grad()
-        gradient = loss_of(drawn.color.detach().numpy(), target, config, threads)[1]
+        gradient = DefaultLoss.of(config, threads)(drawn.color.detach().numpy(), target)[1]
         drawn.color.backward(torch.from_numpy(gradient))
         adam.step()
         with torch.no_grad():

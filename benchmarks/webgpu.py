@@ -22,22 +22,21 @@ import numpy as np
 from _common import FANS, Report, Stopwatch, arguments, random_fans
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
-from meshsplats.rendering.backward import TapedRendering
-from meshsplats.rendering.gpu_backward import GpuRendering
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.gpu import GpuRendering, gpu_engine
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.frames import DrawSettings
-from meshsplats.webgpu.gradients import gradient_renderer
-from meshsplats.webgpu.renderer import draw
 
 
 def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> tuple[str, ...]:
     settings = DrawSettings(filter_px2=mesh.filter_px2)
-    drawn = draw(mesh, view, settings)  # compiles
+    drawn = gpu_engine().renderer_of(mesh).draw(view, settings)  # compiles
     walls, processors, cores = [], [], []
     for _ in range(repeat):
         watch = Stopwatch()
-        drawn = draw(mesh, view, settings)
+        drawn = gpu_engine().renderer_of(mesh).draw(view, settings)
         walls.append(1000 * watch.wall)
         processors.append(1000 * watch.processor)
         watch = Stopwatch()
@@ -67,21 +66,21 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> tuple[str, ..
     rng = np.random.default_rng(0)
     gradient = rng.normal(size=(view.height, view.width, 3)).astype(np.float32)
     found, times = [], []
-    for kind in (GpuRendering, GpuRendering, TapedRendering):  # the first compiles
+    for engine in (gpu_engine(), gpu_engine(), CpuEngine()):  # the first compiles
         vertices, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
         watch = Stopwatch()
-        rendering = kind(mesh.triangles, view, min_transmittance=1e-3)
+        rendering = engine.tape(mesh.triangles, view, TapeOptions(min_transmittance=1e-3))
         times.append(watch.processor)
         rendering.backward(gradient, None, None, vertices=vertices, colors=colors)
         times.append(watch.processor - times[-1])
         if isinstance(rendering, GpuRendering):
-            forward = rendering.forward
+            tape = rendering.tape
         found.append((vertices, colors[:, :3], colors[:, 3]))
     errors = [
         np.linalg.norm(gpu.astype(float) - core) / np.linalg.norm(core.astype(float))
         for gpu, core in zip(found[1], found[2], strict=True)
     ]
-    renderer = gradient_renderer(mesh.triangles)
+    renderer = gpu_engine().gradients_of(mesh.triangles)
     steps = [*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps(), *kernels.gradient_steps(0)]
     skipped = ("fans",) * (not mesh.filter_px2) + ("groups",) * (mesh.depth_group is None)
     same = all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))
@@ -91,9 +90,9 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> tuple[str, ..
         f"{view.width} x {view.height}",
         *(f"{error:.1e}" for error in errors),
         "yes" if same else "NO",
-        f"{len(forward.windows)}",
-        f"{sum(window.fragments for window in forward.windows):,}",
-        f"{sum(window.sums for window in forward.windows):,}",
+        f"{len(tape.windows)}",
+        f"{sum(window.fragments for window in tape.windows):,}",
+        f"{sum(window.sums for window in tape.windows):,}",
         f"{sum('kernel' in step and step.get('if') not in skipped for step in steps)}",
         f"{renderer.frames.bytes / 1e6:.0f}",
         *(f"{1000 * seconds:.0f}" for seconds in (times[2], times[3], times[4] + times[5])),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from meshsplats import Camera, GaussianCloud, SplatMesh
-from meshsplats.rendering import api, reference
+from meshsplats.rendering import api, reference, reference_splats
 
 TOLERANCE = 2e-5
 """Largest difference between the core (float32 in a pixel) and the reference (float64), of values near 1."""
@@ -154,7 +154,7 @@ def assert_splats_are_exact(
     cloud: GaussianCloud, view: Camera, *, tolerance=TOLERANCE, **options
 ) -> api.Rendering:
     image = api.render_splats(cloud, view, **options)
-    truth = reference.render_splats(cloud, view, **options)
+    truth = reference_splats.render_splats(cloud, view, **options)
     assert_close(image, truth, tolerance=tolerance)
     samples = view.width * view.height * options.get("samples", 1) ** 2
     assert abs(image.fragments - truth.fragments) <= max(1, FLIPS * samples)

@@ -23,12 +23,6 @@ LONGER = {
     "cli/common.py": "options of all commands",
     "cli/convert.py": "the largest command",
     "cli/training.py": "options, progress and result of three commands",
-    "finetuning/cells.py": "being divided",
-    "finetuning/run.py": "being divided",
-    "finetuning/state.py": "being divided",
-    "rendering/reference.py": "the specification, read from top to bottom",
-    "webgpu/frames.py": "being divided",
-    "webgpu/gradients.py": "being divided",
 }
 """Files that are longer, and why."""
 WIDER = {
@@ -43,10 +37,8 @@ WIDER = {
     "evaluation/report.py: evaluate": "public",
     "rendering/api.py: render": "public",
     "rendering/autograd.py: rasterize": "public",
-    "rendering/backward.py: __init__": "being divided",
     "rendering/reference.py: render": "as in the library",
     "rendering/reference_autograd.py: rasterize": "as in the library",
-    "webgpu/training.py: __init__": "being divided",
 }
 """Functions of more parameters, and why."""
 
@@ -112,7 +104,7 @@ def test_the_command_line_is_thin():
 
 
 def test_only_the_command_itself_imports_the_command_line():
-    """Benchmarks, tools and Blender's extension use the library; but a page lists the options of the command."""
+    """Benchmarks, tools and Blender's extension use the library. One page lists the command's options."""
     users = [*ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("tools/**/*.py"), *ROOT.glob("examples/**/*.py")]
     users += ROOT.glob("blender_extension/**/*.py")
     assert len(users) > 20

@@ -46,12 +46,12 @@ def test_lower_degrees_are_the_beginning(degree):
 
 
 def test_same_as_the_renderer():
-    from meshsplats.rendering import reference
+    from meshsplats.rendering import reference_splats
 
     v = sphere(50)
-    names = [name for name in dir(reference) if "harmonic" in name or name.endswith("sh_basis")]
+    names = [name for name in dir(reference_splats) if "harmonic" in name or name.endswith("sh_basis")]
     assert names, "the reference renderer has no basis of its own any more"
-    np.testing.assert_allclose(getattr(reference, names[0])(v, 3), sh_basis(v, 3), atol=1e-12)
+    np.testing.assert_allclose(getattr(reference_splats, names[0])(v, 3), sh_basis(v, 3), atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [-1, 4, 1.5])

@@ -13,7 +13,7 @@ import numpy as np
 if TYPE_CHECKING:
     from meshsplats.camera import Camera
     from meshsplats.mesh import SplatMesh
-    from meshsplats.rendering.api import Device
+    from meshsplats.rendering.engine import Device
 
 
 def examine() -> dict[str, Any]:
@@ -86,13 +86,13 @@ def _triangle() -> tuple[SplatMesh, Camera]:
 
 def _has_gradient() -> bool:
     """Whether the GPU has the gradients of the core, of the mean over the image."""
-    from meshsplats.rendering.gpu_backward import taped_rendering
+    from meshsplats.rendering.devices import engine
 
     mesh, camera = _triangle()
     ones, found = np.ones((3, 3, 3), np.float32), []
     devices: tuple[Device, ...] = ("cpu", "gpu")
     for device in devices:
-        rendering = taped_rendering(device, mesh.triangles, camera)
+        rendering = engine(device).tape(mesh.triangles, camera)
         found.append((np.zeros((3, 3), np.float32), np.zeros((3, 4), np.float32)))
         rendering.backward(ones, None, None, vertices=found[-1][0], colors=found[-1][1])
     return all(bool(np.allclose(a, b, rtol=1e-4, atol=1e-4)) for a, b in zip(*found, strict=True))

@@ -25,6 +25,7 @@ from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
 from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
     TRAINING_MIN_TRANSMITTANCE,
@@ -135,7 +136,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     view = View(dataset.train[0].camera, ViewImage(image, None, mask), background)
     found = []
     monkeypatch.setattr(State, "step", lambda state, gradients, *rest, **more: found.extend(gradients))
-    loss = make_step(state, [view], 0, 0.0)
+    loss = make_step(state, [view], 0, 0.0, Blended(state.config))
 
     leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
@@ -340,7 +341,7 @@ def test_a_step_changes_only_what_its_view_shows(scene):
     _, dataset, mesh = scene
     near = dataset.train[view_of_step(make_config(), 0, len(dataset.train))]
     state = State.begin(mesh, len(dataset.train), make_config(), None)
-    make_step(state, dataset.train, 0, 0.0)
+    make_step(state, dataset.train, 0, 0.0, Blended(state.config))
     moved = (state.result().colors != mesh.colors).any(axis=1)
     assert 0.05 < moved.mean() < 1
     assert near.camera.sees(mesh.vertices[moved]).mean() > 0.8
@@ -352,7 +353,7 @@ def test_positions_move_by_the_size_of_their_splats(scene):
     """Adam's first step is the rate, in units of the splat's size."""
     _, dataset, mesh = scene
     state = State.begin(mesh, len(dataset.train), make_config(position_rate=0.05), None)
-    make_step(state, dataset.train, 0, 0.0)
+    make_step(state, dataset.train, 0, 0.0, Blended(state.config))
     step = np.abs(state.result().vertices - mesh.vertices)
     moved = step.max(axis=1) > 0
     share = step[moved].max(axis=1) / state.sizes[moved]
@@ -365,7 +366,7 @@ def test_black_fans_on_black_take_on_colors(scene):
     colors = mesh.colors * np.array([0, 0, 0, 1], np.float32)
     view = replace(dataset.train[0], source=ViewImage(dataset.train[0].image), background=(0.0, 0.0, 0.0))
     state = State.begin(replace(mesh, colors=colors), 1, make_config(steps=10), None)
-    make_step(state, [view], 0, 0.0)
+    make_step(state, [view], 0, 0.0, Blended(state.config))
     assert (state.colors[:, :3] > 0).any()
 
 
@@ -415,7 +416,7 @@ def test_faint_triangles_are_dropped_with_their_vertices_and_moments(scene):
     config = make_config(prune_opacity=0.3, prune_epochs=1)
     state = State.begin(mesh, len(dataset.train), config, None)
     for step in range(3):
-        make_step(state, dataset.train, step, 0.0)
+        make_step(state, dataset.train, step, 0.0, Blended(config))
     keep = kept_faces(state)
     assert 0 < keep.sum() < len(keep)
     expected = state.result().prune(0.3)

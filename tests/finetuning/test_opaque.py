@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,21 +17,14 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config, starting_mesh
-from meshsplats.finetuning import step as training_step
-from meshsplats.finetuning.hybrid import (
-    COLOR_SLOPE,
-    ColorLimits,
-    opaque_fraction,
-    soft_fraction,
-    softness,
-    with_soft_splats,
-)
-from meshsplats.finetuning.opaque import (
-    expected_error,
-    expected_share,
-    ramp_of,
-    visible_samples,
-)
+from meshsplats.finetuning.clock import Clock
+from meshsplats.finetuning.config import learning_rates
+from meshsplats.finetuning.hybrid import COLOR_SLOPE, ColorLimits, softness, with_soft_splats
+from meshsplats.finetuning.opaque import expected_error, visible_samples
+from meshsplats.finetuning.phases.blended import Blended
+from meshsplats.finetuning.phases.cutting import Cutting
+from meshsplats.finetuning.phases.hybrid import Hybrid
+from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.state import Gradients, State
 from meshsplats.finetuning.step import make_step
 from meshsplats.formats.cutting import cut_mesh
@@ -89,17 +83,21 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, soft_share, opaq
             assert getattr(again, name).tobytes() == getattr(whole, name).tobytes()
 
 
-def test_the_schedule_goes_from_blended_to_cut():
+def test_the_schedule_goes_from_blended_to_cut(scene):
+    dataset, mesh = scene
+    view = dataset.train[0]
     config = make_config(opacity="cutoff", cutoff=0.3, anneal_share=0.5, expected_share=0.4)
-    begin, half, end = (ramp_of(config, f) for f in (0.0, 0.25, 0.5))
+    plans = [Cutting(config, mesh).plan(view, 0, f) for f in (0, 0.25, 0.5, 1)]
+    begin, half, end = (plan.ramp for plan in plans[:3])
     assert (begin.height, begin.slope, begin.cutoff) == (0.3, 1, 0.3)
     assert half.height == pytest.approx(0.4)
     assert begin.leak > half.leak > end.leak == 0
     assert (end.height, end.width) == (0.5, 1)
     assert end.slope > 1e5
-    assert [expected_share(config, f) for f in (0, 0.25, 0.5, 1)] == pytest.approx([0, 0.2, 0.4, 0.4])
-    assert ramp_of(make_config(), 0.7) is None
-    assert expected_share(make_config(), 0.7) == 0
+    assert [plan.expected for plan in plans] == pytest.approx([0, 0.2, 0.4, 0.4])
+    assert [plan.edges for plan in plans] == [None, 0.3, 0.3, 0.3]
+    blended = Blended(make_config()).plan(view, 0, 0.7)
+    assert (blended.ramp, blended.expected, blended.edges) == (None, 0, None)
 
 
 def test_masked_pixels_do_not_count():
@@ -253,7 +251,7 @@ def test_opaque_triangles_of_a_hybrid_mesh_move_only_with_their_edges(foggy):
     assert 0 < solid.sum() < len(solid)
     for step in (6, 7):  # means over pixels, and then values at their centres, which have no edges
         state = State.begin_hybrid(start, config, 1)
-        make_step(state, dataset.train, step, step / 8)
+        make_step(state, dataset.train, step, step / 8, Hybrid(config))
         end = state.result()
         assert np.array_equal(end.vertices[solid], start.vertices[solid]) == (step == 7)
         assert (end.colors[solid, 3] == 1).all()
@@ -263,22 +261,12 @@ def test_opaque_triangles_of_a_hybrid_mesh_move_only_with_their_edges(foggy):
         assert np.array_equal(solid_faces(end), solid_faces(start))
 
 
-def test_the_initial_fraction_with_one_sample_does_not_begin_again_with_blended_triangles(foggy, monkeypatch):
-    dataset, mesh, _ = foggy
-    photographs = [replace(view, source=view.load()) for view in dataset.train]
-    start = with_soft_splats(cut_mesh(mesh), mesh, photographs, 0.2)
+def test_the_initial_fraction_with_one_sample_does_not_begin_again_with_blended_triangles(foggy):
+    dataset, _, _ = foggy
+    photograph = replace(dataset.train[0], source=dataset.train[0].load())
     config = make_config(steps=8, opacity="cutoff", soft_share=0.2, one_sample_share=0.5)
-    state, drawn = State.begin_hybrid(start, config, 1), []
-
-    def noted(*args, **more):
-        drawn.append(more["samples"])
-        return real(*args, **more)
-
-    real = training_step.taped_rendering
-    monkeypatch.setattr(training_step, "taped_rendering", noted)
-    for step in range(6, 8):
-        make_step(state, photographs, step, step / 8)
-    assert drawn == [2, 1]  # every other step is at the pixel centres
+    plans = [Hybrid(config).plan(photograph, step, step / 8) for step in (6, 7)]
+    assert [plan.samples for plan in plans] == [2, 1]  # every other step is at the pixel centres
 
 
 def test_colors_of_small_opaque_triangles_change_slowly_in_the_image():
@@ -337,20 +325,41 @@ def test_a_run_with_blended_triangles_limits_the_colors_of_opaque_ones(foggy):
     assert beyond(opaque) > 5 * beyond(hybrid)
 
 
+def test_limits_of_colors_follow_the_triangles_that_are_left(foggy):
+    dataset, mesh, _ = foggy
+    views = len(dataset.train)
+    config = make_config(steps=8, opacity="cutoff", soft_share=0.2, prune_epochs=2 / views)
+    start = with_soft_splats(cut_mesh(mesh), mesh, dataset.train, 0.2)
+    moment, state = Moment(Clock(config, views), dataset.train, None), State.begin_hybrid(start, config, 1)
+    phase, limits = Hybrid(config), []
+    for moment.clock.step in range(1, 5):
+        phase, state = phase.after_step(state, moment)
+        limits.append(phase.limits)
+        state.colors[state.mesh.faces[~solid_faces(state.result())][:9], 3] = 0
+    assert len(state.mesh.faces) < len(start.faces)
+    changed = [one is not two for one, two in pairwise(limits)]
+    assert changed == [True, False, True]  # pruned after every second step
+
+
 def square(x: float, depth: float, opacity: float) -> SplatMesh:
     """Red, of side 1."""
     corners = [(x + dx, dy, depth) for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
     return SplatMesh(corners, [(0, 1, 2), (0, 2, 3)], [(1, 0, 0, opacity)] * 4)
 
 
-def test_the_phases_of_a_run():
+def test_the_phases_of_a_run(scene):
+    dataset, mesh = scene
+    view = dataset.train[0]
     config = make_config(opacity="cutoff", soft_share=0.1, soft_phase=0.25)
-    assert [opaque_fraction(config, f) for f in (0, 0.375, 0.75, 0.9)] == pytest.approx([0, 0.5, 1, 1])
-    assert [soft_fraction(config, f) for f in (0.75, 0.875, 1)] == pytest.approx([0, 0.5, 1])
-    assert soft_fraction(config, 0.74) < 0
-    for other in (make_config(), make_config(opacity="cutoff")):
-        assert opaque_fraction(other, 0.9) == 0.9
-        assert soft_fraction(other, 1.0) < 0
+    cutting, hybrid = Cutting(config, mesh), Hybrid(config)
+    assert [cutting.share(f) for f in (0, 0.375, 0.75, 0.9)] == pytest.approx([0, 0.5, 1, 1])
+    assert [hybrid.share(f) for f in (0.75, 0.875, 1)] == pytest.approx([0, 0.5, 1])
+    assert hybrid.share(0.74) < 0
+    # Learning rates begin again with the second phase.
+    for phase, step, fraction, own in ((cutting, 300, 0.375, 300), (hybrid, 700, 0.875, 100)):
+        plan = phase.plan(view, step, fraction)
+        assert (plan.color_rate, plan.position_rate) == pytest.approx(learning_rates(config, own, 0.5))
+    assert Cutting(make_config(opacity="cutoff"), mesh).share(0.9) == 0.9
 
 
 def test_only_fans_that_beat_opaque_triangles_stay_blended():
@@ -399,5 +408,5 @@ def test_opaque_triangles_move_to_where_their_edges_belong(monkeypatch):
     moved = finetune(start, Dataset(views, ()), config)
     assert distance(moved) < 0.3
     # Nothing else draws it there.
-    monkeypatch.setattr(training_step, "follows_edges", lambda *_: False)
+    monkeypatch.setattr(Cutting, "_follows_edges", lambda *_: False)
     assert distance(finetune(start, Dataset(views, ()), config)) > 1

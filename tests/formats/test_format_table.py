@@ -18,7 +18,6 @@ from _splat_files import random_splats
 
 import meshsplats as ms
 from meshsplats.cli import main
-from meshsplats.jobs import sources
 from meshsplats.errors import FileFormatError
 from meshsplats.formats import _zipped, splat_formats
 from meshsplats.formats.content import Content
@@ -28,6 +27,7 @@ from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import FORMATS, SplatFormat, listed, splat_suffixes, zipped_suffixes
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.splats._cloud_builder import SplatReader
+from meshsplats.jobs import sources
 
 ROOT = Path(__file__).resolve().parents[2]
 POINTS = np.random.default_rng(5).normal(size=(300, 3))

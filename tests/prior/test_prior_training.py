@@ -17,6 +17,7 @@ from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import RunOptions, make_config
 from meshsplats.finetuning.bound import BoundPositions, project_to_simplex, weight_units
 from meshsplats.finetuning.checkpoint import load_checkpoint, mesh_arrays, stored_mesh
+from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.prior import MeshPrior, bind, train_prior
@@ -123,7 +124,7 @@ def test_training_opens_no_gaps(task):
     config = make_config(steps=30, position_rate=0.02)
     state = State.begin(prior.mesh, len(data.train), config, 1)
     for step in range(30):
-        make_step(state, data.train, step, step / 30)
+        make_step(state, data.train, step, step / 30, Blended(config))
     mesh = state.result()
     moved = np.abs(mesh.binding.weights - prior.mesh.binding.weights).max(axis=1)
     assert moved.max() > 0.02
@@ -154,7 +155,7 @@ def test_the_constraint_holds_after_every_step(task, layers, spacing):
     state = State.begin(prior.mesh, len(data.train), config, 1)
     moved = 0.0
     for step in range(40):
-        make_step(state, data.train, step, step / 40)
+        make_step(state, data.train, step, step / 40, Blended(config))
         mesh = state.result()
         check_constraint(mesh.binding)
         np.testing.assert_allclose(mesh.vertices, mesh.binding.positions(), atol=1e-6)

@@ -25,7 +25,8 @@ from test_rendering_variants import VIEWS, assert_image, in_another_process, sca
 from meshsplats import Camera, SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapedRendering, TapeOptions
+from meshsplats.rendering.reference_samples import to_camera
 
 MODES = ("flat", "crossed", "3d")
 STARS = {"detail": "cameras", "sides": 60, "cameras": [camera()]}
@@ -233,7 +234,7 @@ def test_what_stays_as_it_is():
 def test_an_invisible_splat_has_a_shape():
     """Its gradient is that of its contribution, at the position that its filter gives it."""
     mesh, view = diamond((20, 18), (2.0, 2.0), alpha=0.0), plain_camera()
-    image = TapedRendering(mesh.triangles._replace(filter_px2=8.0), view, samples=8)
+    image = TapedRendering(mesh.triangles._replace(filter_px2=8.0), view, TapeOptions(samples=8))
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     nothing, all_pixels = np.zeros_like(image.color), np.ones_like(image.alpha)
     image.backward(nothing, all_pixels, None, vertices=points, colors=colors)
@@ -326,7 +327,7 @@ def test_gradients_by_finite_differences():
     from meshsplats.rendering import reference_autograd
 
     mesh, view = fans(6, 3, "crossed", sizes=(0.05, 0.5)), camera()
-    points = torch.from_numpy(reference._to_camera(mesh.vertices, view)).requires_grad_()
+    points = torch.from_numpy(to_camera(mesh.vertices, view)).requires_grad_()
     opacity = torch.from_numpy(mesh.colors[:, 3].astype(np.float64)).requires_grad_()
 
     def places(points, opacity):

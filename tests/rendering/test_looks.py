@@ -11,7 +11,7 @@ import meshsplats as ms
 from meshsplats import GaussianCloud, SplatMesh, draw_splats, needed_samples
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.demo_scene import make_scene
-from meshsplats.rendering import reference
+from meshsplats.rendering import reference_splats
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_a_look_that_does_not_exist(cloud):
 def test_the_low_pass_of_2dgs_follows_the_dilation(cloud, dilation):
     flat = replace(cloud.take(np.arange(0, 1500, 60)), kernel="2dgs")
     camera = camera_of(cloud, 24)
-    want = reference.render_splats(flat, camera, dilation=dilation)
+    want = reference_splats.render_splats(flat, camera, dilation=dilation)
     found = ms.render_splats(flat, camera, dilation=dilation)
     np.testing.assert_allclose(found.color, want.color, atol=2e-4)
 

@@ -10,14 +10,16 @@ from _rendering import FLIPS, camera, fan, layers, soup
 
 from meshsplats import SplatMesh
 from meshsplats.rendering import render
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, TapeOptions
 
 VIEW = camera(48, 40)
 
 
-def drawn(mesh: SplatMesh, ramp: OpacityRamp | None, **options) -> TapedRendering:
-    options.setdefault("min_transmittance", 0.0)
-    return TapedRendering(mesh.triangles, VIEW, ramp=ramp, **options)
+def drawn(
+    mesh: SplatMesh, ramp: OpacityRamp | None, samples: int = 1, background=(1, 1, 1), **options
+) -> TapedRendering:
+    exact = TapeOptions(background, samples, 0.0, ramp=ramp)
+    return TapedRendering(mesh.triangles, VIEW, exact, **options)
 
 
 def gradients(rendering: TapedRendering, grad_color, expected=None):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from meshsplats.camera import Camera
 from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.rendering.reference import render_splats, sh_basis, splat_colors
+from meshsplats.rendering.reference_splats import render_splats, sh_basis, splat_colors
 
 BLACK = (0, 0, 0)
 seeds = st.integers(0, 10_000)

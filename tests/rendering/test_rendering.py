@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, convert, load_cameras, load_gaussians
 from meshsplats.rendering import api, reference, render
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapedRendering, TapeOptions
 
 BLACK = (0, 0, 0)
 seeds = st.integers(0, 10_000)
@@ -410,7 +410,7 @@ def test_the_near_plane_is_measured_from_the_pose():
     pose = view.world_to_camera.copy()
     far = pose.copy()
     far[2, 3] += 1e4  # from there, the near plane would lie behind the mesh
-    image = TapedRendering(mesh.triangles, replace(view, world_to_camera=far), world_to_camera=pose)
+    image = TapedRendering(mesh.triangles, replace(view, world_to_camera=far), TapeOptions(pose=pose))
     assert np.array_equal(image.color, render(mesh, view).color)
     assert image.alpha.any()
 
@@ -423,9 +423,9 @@ def test_a_taped_rendering_of_a_mesh_has_its_groups_and_its_filter():
         (replace(soup(3), depth_group=groups), soup(3)),
         (replace(fan(5, 8, 0.6), face_splat=np.zeros(8, np.int32), filter_px2=9.0), fan(5, 8, 0.6)),
     ):
-        image = TapedRendering(whole.triangles, view, background=(0, 0, 1)).color
+        image = TapedRendering(whole.triangles, view, TapeOptions((0, 0, 1))).color
         assert np.array_equal(image, render(whole, view, background=(0, 0, 1)).color)
         assert not np.array_equal(image, render(without, view, background=(0, 0, 1)).color)
     black = np.zeros_like(whole.colors)
-    image = TapedRendering(whole.triangles._replace(colors=black), view, background=(0, 0, 1)).color
+    image = TapedRendering(whole.triangles._replace(colors=black), view, TapeOptions((0, 0, 1))).color
     assert np.array_equal(image, render(replace(whole, colors=black), view, background=(0, 0, 1)).color)

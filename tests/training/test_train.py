@@ -20,15 +20,15 @@ from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
-from meshsplats.finetuning import step as training_step
 from meshsplats.finetuning.checkpoint import OtherRunError
-from meshsplats.finetuning.run import run_start
+from meshsplats.finetuning.phases.phase import Moment
+from meshsplats.finetuning.run import TrainingLoop, run_start
 from meshsplats.finetuning.state import Gradients, State
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
-from meshsplats.training import starting_fans, train, train_config
+from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training.as_splats import splats_of_fans
 from meshsplats.training.growth import (
     HALF,
@@ -42,7 +42,7 @@ from meshsplats.training.growth import (
     split_in_halves,
 )
 from meshsplats.training.initial import fans_of
-from meshsplats.training.run import SO_FAR, GrowingLoop, check_training_memory
+from meshsplats.training.run import SO_FAR, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
 
 LAYERS = ("color", "alpha")
@@ -350,8 +350,9 @@ def test_shapes_decay_in_each_step_as_the_learning_rate_falls(ball, start):
     options = {"position_rate": 0.0, "rate_steps": 0, "shape_decay": 0.4, "final_share": 0.25}
     config = train_config(steps=4, **SMALL | {"growth_events": 0}, **options)
     run = RunOptions(report_every=0)
-    loop = GrowingLoop(run_start(bent, ball, config, run, None), ball, config, run, None, None)
-    mesh = loop.run()
+    begun = run_start(bent, ball, config, run, None)
+    phase = growing.Growing(config, bent, begun.dataset.train, 0.0, 0)
+    mesh = TrainingLoop(begun, begun.clock(run), phase, run).run()
     ellipses = bent.vertices.reshape(-1, 7, 3).copy()
     round_fans(ellipses, 1.0)
     left = np.prod([1 - 0.4 * 0.25 ** (step / 4) for step in range(1, 5)])
@@ -378,12 +379,12 @@ def test_fans_of_a_training_are_nearly_ellipses(trained, ball):
 def test_photographs_have_one_sample_a_pixel_at_first(ball, start, monkeypatch):
     drawn = []
 
-    def noted(*args, **more):
-        drawn.append(more["samples"])
-        return real(*args, **more)
+    def noted(state, camera, options):
+        drawn.append(options.samples)
+        return real(state, camera, options)
 
-    real = training_step.taped_rendering
-    monkeypatch.setattr(training_step, "taped_rendering", noted)
+    real = State.tape
+    monkeypatch.setattr(State, "tape", noted)
     finetune(start, ball, make_config(steps=4, one_sample_share=0.5), run=RunOptions(report_every=0))
     finetune(
         start, ball, make_config(steps=2, one_sample_share=0.5, samples=3), run=RunOptions(report_every=0)
@@ -489,6 +490,7 @@ def test_halves_lie_side_by_side_along_the_longest_axis():
 
 def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
     """And before files of an earlier run are deleted."""
+    from meshsplats.rendering import gpu
     from meshsplats.training import run
 
     def fail(*_):
@@ -498,7 +500,7 @@ def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
         raise MissingDependencyError("no GPU was found")
 
     monkeypatch.setattr(run, "starting_fans", fail)
-    monkeypatch.setattr(run, "open_device", no_gpu)
+    monkeypatch.setattr(gpu, "open_device", no_gpu)
     with pytest.raises(MissingDependencyError, match="no GPU"):
         train(ball, train_config(steps=1), run=RunOptions(tmp_path / "run", device="gpu"))
     assert not (tmp_path / "run").exists()
@@ -507,13 +509,13 @@ def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
 def test_no_growth_event_happens_twice(ball, start, monkeypatch):
     """In a run by minutes, the share that is over may fall."""
     config, options = train_config(steps=60, **SMALL), RunOptions()
-    loop = GrowingLoop(run_start(start, ball, config, options, None), ball, config, options, None, None)
-    passed = []
-    for step in (9, 11, 9, 11, 21):
-        loop.step = step
-        loop._adapt()
-        passed.append(loop.events)
-    assert passed == [0, 1, 1, 1, 2]
+    begun = run_start(start, ball, config, options, None)
+    views, clock, state = begun.dataset.train, begun.clock(options), begun.state
+    phase, grown = growing.Growing(config, start, views, 0.0, 0), []
+    monkeypatch.setattr(growing, "grow", lambda state, *_: grown.append(clock.step) or state)
+    for clock.step in (9, 11, 9, 11, 21):
+        _, state = phase.after_step(state, Moment(clock, views, None))
+    assert grown == [11, 21]
 
 
 def test_the_estimate_of_memory_holds_reduced_images_and_silhouettes(ball, room):

@@ -17,12 +17,16 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DeviceError, DivergenceError, FileFormatError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
-from meshsplats.finetuning.state import State
+from meshsplats.finetuning.loss import DefaultLoss, LossRates
+from meshsplats.finetuning.phases.blended import Blended
+from meshsplats.finetuning.state import Rates, State, StepImage
 from meshsplats.finetuning.step import make_step, view_of_step
 from meshsplats.prior import bind
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.gpu import gpu_engine
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
+from meshsplats.webgpu.frames import WINDOW_SAMPLES
 
 GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4
@@ -47,7 +51,8 @@ def steps(scene, device, count: int = 5, **options) -> tuple[list[float], State]
     dataset, mesh = scene
     config = make_config(steps=count, **options)
     state = State.begin(mesh, len(dataset.train), config, None, device=device)
-    losses = [make_step(state, dataset.train, i, i / count) for i in range(count)]
+    phase = Blended(config)
+    losses = [make_step(state, dataset.train, i, i / count, phase) for i in range(count)]
     assert None not in losses
     return [loss for loss in losses if loss is not None], state
 
@@ -78,6 +83,20 @@ def test_steps_are_those_of_the_cpu(scene, options):
         assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
         difference = np.sort(np.abs(getattr(state, name) - after), axis=None)[:-DECIDED_BY_ROUNDING]
         assert np.linalg.norm(difference) <= CHANGES * change
+
+
+@pytest.mark.parametrize("options", [{}, {"exposure": True}], ids=["default", "exposure"])
+def test_the_default_loss_as_a_function_has_the_steps_of_the_gpus_own(scene, options):
+    need_gpu()
+    dataset, mesh = scene
+    config = make_config(steps=5, **options)
+    default = DefaultLoss.of(config)
+    own, known = (
+        finetune(mesh, dataset, config, run=replace(GPU, report_every=0), loss=loss)
+        for loss in (lambda image, target: default(image, target), None)
+    )
+    change = np.linalg.norm(known.vertices - mesh.vertices)
+    assert np.linalg.norm(own.vertices - known.vertices) <= CHANGES * change
 
 
 def test_black_fans_on_black_take_on_the_colors_of_the_cpu(scene):
@@ -115,16 +134,18 @@ def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene):
     need_gpu()
     dataset, _ = scene
     camera = dataset.train[0].camera
-    assert steps(scene, "gpu")[1].trains_on_gpu(camera)
-    assert not steps(scene, "cpu", 0)[1].trains_on_gpu(camera)
-    for options in ({"blending": "linear"}, {"exposure": True}):
-        assert not steps(scene, "gpu", 0, **options)[1].trains_on_gpu(camera)
-    assert not steps(scene, "gpu", 0)[1].trains_on_gpu(replace(camera, width=2000, height=2000))
+    state = steps(scene, "gpu")[1]
+    assert state.whole_steps(camera, ())
+    assert steps(scene, "cpu", 0)[1].whole_steps(camera, ()) is None
+    for options in ({"blending": "linear"}, {"exposure": True}, {"opacity_decay": 0.01}):
+        assert steps(scene, "gpu", 0, **options)[1].whole_steps(camera, ()) is None
+    assert state.whole_steps(replace(camera, width=2000, height=2000), ()) is None
+    assert state.whole_steps(camera, ("loss",)) is None
 
 
 def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
     need_gpu()
-    from meshsplats.finetuning import state as module
+    from meshsplats.rendering import gpu as module
 
     dataset, mesh = scene
     expected, known = steps(scene, "gpu")
@@ -133,7 +154,7 @@ def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
     losses = []
     for i in range(5):
         monkeypatch.setattr(module, "MAX_PIXELS", 0 if i in (1, 3) else 1 << 20)
-        losses.append(make_step(state, dataset.train, i, i / 5))
+        losses.append(make_step(state, dataset.train, i, i / 5, Blended(config)))
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - mesh.vertices)
     assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
@@ -144,8 +165,8 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
     expected, known = steps(scene, "gpu")
     monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 10_000)  # as if there were more fragments
     losses, state = steps(scene, "gpu")
-    assert state._trainer is not None
-    assert state.limit.samples < 1 << 22
+    assert state.whole_steps(scene[0].train[0].camera, ())
+    assert state.arrays()["window_samples"] < 1 << 22
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - known.mesh.vertices)
     assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
@@ -154,8 +175,9 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
 def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):
     need_gpu()
     dataset, mesh = scene
-    state = State.begin(mesh, len(dataset.train), make_config(steps=5), None, device="gpu")
-    make_step(state, dataset.train, 0, 0.0)
+    config = make_config(steps=5)
+    state = State.begin(mesh, len(dataset.train), config, None, device="gpu")
+    make_step(state, dataset.train, 0, 0.0, Blended(config))
     before = {name: array.copy() for name, array in state.arrays().items()}
     image = dataset.train[0].load()
     color = image.color.astype(np.float32)
@@ -164,10 +186,12 @@ def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):
     broken = replace(image, color=color, alpha=alpha)
     views = [replace(view, source=broken) for view in dataset.train]
     with pytest.raises(DivergenceError, match="the loss is not finite"):
-        make_step(state, views, 1, 0.2)
+        make_step(state, views, 1, 0.2, Blended(config))
     target, camera = dataset.train[0].image, dataset.train[0].camera
-    loss = (0.0, 0.0, 3e38)  # the sums are finite, the gradients are not
-    sums = state.step_on_gpu(camera, DrawSettings(), target, None, (0, 0, 0), loss, (0.02, 0.02))
+    loss = LossRates(0.0, 0.0, 3e38, 0.0)  # the sums are finite, the gradients are not
+    steps, image = state.whole_steps(camera, ()), StepImage(camera, TapeOptions((0, 0, 0)), target, None)
+    assert steps is not None
+    sums = state.whole_step(steps, image, loss, Rates(0.02, 0.02))
     assert np.isfinite(sums[:3]).all()
     assert not sums.finite
     after = state.arrays()
@@ -213,8 +237,8 @@ def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch
 
     def fits(number: int) -> bool:
         state = State.begin(mesh, len(views), config, None, device="gpu")
-        make_step(state, [views[view_of_step(config, number, len(views))]], 0, 0.0)
-        return state.limit.samples == WINDOW_SAMPLES
+        make_step(state, [views[view_of_step(config, number, len(views))]], 0, 0.0, Blended(config))
+        return state.arrays()["window_samples"] == WINDOW_SAMPLES
 
     assert (fits(2), fits(3)) == (False, True)
     check_resumed(dataset, mesh, config, tmp_path)
@@ -254,7 +278,7 @@ def check_resumed(dataset, mesh, config, tmp_path):
     run = RunOptions(folder, device="gpu", report_every=0, preview_every=0, checkpoint_seconds=1e-9)
     with pytest.raises(Stop):
         finetune(mesh, dataset, config, run=run, on_progress=after)
-    gradients._last = None
+    gpu_engine().forget()
     tuned = finetune(mesh, dataset, config, run=replace(run, resume=True))
     assert tuned.vertices.tobytes() == whole.vertices.tobytes()
     assert tuned.colors.tobytes() == whole.colors.tobytes()
@@ -281,7 +305,7 @@ def test_what_needs_the_cpu_is_an_error_before_anything_is_written(scene, tmp_pa
     run = RunOptions(tmp_path / "run", device="gpu")
     with pytest.raises(ValueError, match="opacity 'cutoff' needs device 'cpu'"):
         finetune(mesh, dataset, make_config(steps=1, opacity="cutoff"), run=run)
-    with pytest.raises(ValueError, match="device must be 'cpu' or 'gpu', got 'cuda'"):
+    with pytest.raises(ValueError, match="device must be one of cpu, gpu, got 'cuda'"):
         RunOptions(device="cuda")  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
@@ -317,9 +341,9 @@ def test_moments_that_start_again_are_those_after_the_last_step(scene):
     )
     rows = np.arange(0, len(mesh.vertices), 3)
     for state in (one, two):
-        make_step(state, dataset.train, 0, 0.0)
+        make_step(state, dataset.train, 0, 0.0, Blended(state.config))
         state.restart(rows)
-        make_step(state, dataset.train, 1, 0.2)
+        make_step(state, dataset.train, 1, 0.2, Blended(state.config))
     for name in ("vertices", "colors"):
         change = np.linalg.norm(getattr(two, name) - getattr(mesh, name))
         assert np.linalg.norm(getattr(one, name) - getattr(two, name)) <= CHANGES * change

@@ -12,8 +12,10 @@ from test_webgpu_render import crossing_planes, nearly_coplanar, random_fans
 
 from meshsplats import Camera, SplatMesh, render
 from meshsplats.errors import DeviceError
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering
-from meshsplats.rendering.gpu_backward import GpuRendering, taped_rendering
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapeOptions
+from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.engine import Engine, Taped, visible_pixels
+from meshsplats.rendering.gpu import CANNOT, gpu_engine
 from meshsplats.webgpu import gradients, kernels
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.frames import DrawSettings
@@ -70,8 +72,11 @@ SCENES = [
 ]
 
 
-def of_mesh(kind, mesh: SplatMesh, view: Camera, *, filter_px2: float = 0.0, **options):
-    return kind(mesh.triangles._replace(filter_px2=filter_px2), view, **options)
+GPU, CPU = gpu_engine(), CpuEngine()
+
+
+def of_mesh(engine: Engine, mesh: SplatMesh, view: Camera, *, filter_px2: float = 0.0, **options) -> Taped:
+    return engine.tape(mesh.triangles._replace(filter_px2=filter_px2), view, TapeOptions(**options))
 
 
 def random_gradient(view: Camera, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +99,7 @@ def error(found: np.ndarray, expected: np.ndarray) -> float:
 
 def assert_same_gradients(mesh: SplatMesh, view: Camera, **options) -> None:
     options["background"] = np.random.default_rng(1).random((view.height, view.width, 3)).astype(np.float32)
-    gpu, core = of_mesh(GpuRendering, mesh, view, **options), of_mesh(TapedRendering, mesh, view, **options)
+    gpu, core = of_mesh(GPU, mesh, view, **options), of_mesh(CPU, mesh, view, **options)
     assert np.abs(gpu.color - core.color).max() < 1e-4
     assert np.abs(gpu.alpha - core.alpha).max() < 1e-4
     gradient = random_gradient(view)
@@ -128,8 +133,8 @@ def test_through_the_low_pass_filter(radius, samples, near):
     mesh = replace(mesh, vertices=seen_by(view, mesh.vertices.astype(float)))
     assert_same_gradients(mesh, view, filter_px2=0.3, samples=samples)
     gradient = random_gradient(view)
-    without = descend(of_mesh(GpuRendering, mesh, view, samples=samples), gradient)
-    filtered = descend(of_mesh(GpuRendering, mesh, view, samples=samples, filter_px2=0.3), gradient)
+    without = descend(of_mesh(GPU, mesh, view, samples=samples), gradient)
+    filtered = descend(of_mesh(GPU, mesh, view, samples=samples, filter_px2=0.3), gradient)
     assert all(error(a, b) > 0.1 for a, b in zip(without, filtered, strict=True))  # it matters here
 
 
@@ -153,16 +158,16 @@ def large_fan(triangles: int) -> SplatMesh:
 def test_through_the_filter_of_the_largest_fan():
     mesh, view = large_fan(gradients.MAX_FAN), camera(60, 50)
     gradient = random_gradient(view)
-    found = descend(of_mesh(GpuRendering, mesh, view, filter_px2=0.3), gradient)
-    expected = descend(of_mesh(TapedRendering, mesh, view, filter_px2=0.3), gradient)
+    found = descend(of_mesh(GPU, mesh, view, filter_px2=0.3), gradient)
+    expected = descend(of_mesh(CPU, mesh, view, filter_px2=0.3), gradient)
     assert all(error(a, b) < 1e-3 for a, b in zip(found, expected, strict=True))  # slivers, by rounding
     with pytest.raises(DeviceError, match="up to 4,096 triangles; one has 4,097"):
-        of_mesh(GpuRendering, large_fan(gradients.MAX_FAN + 1), view, filter_px2=0.3)
+        of_mesh(GPU, large_fan(gradients.MAX_FAN + 1), view, filter_px2=0.3)
 
 
 def test_the_image_is_that_of_render():
     mesh, view, _ = scene("terminated early")
-    taped = of_mesh(GpuRendering, mesh, view, min_transmittance=1e-3)
+    taped = of_mesh(GPU, mesh, view, min_transmittance=1e-3)
     image = render(mesh, view, min_transmittance=1e-3, device="gpu")
     assert taped.color.tobytes() == image.color.tobytes()
     assert taped.alpha.tobytes() == image.alpha.tobytes()
@@ -173,18 +178,18 @@ def test_the_image_is_that_of_render():
 def test_the_same_bits_every_time(name):
     mesh, view, options = scene(name)
     gradient = random_gradient(view)
-    first = of_mesh(GpuRendering, mesh, view, **options)
+    first = of_mesh(GPU, mesh, view, **options)
     found = bits(descend(first, gradient))
     assert bits(descend(first, gradient)) == found
-    other = of_mesh(GpuRendering, replace(mesh, vertices=mesh.vertices + 0.1), view, **options)
+    other = of_mesh(GPU, replace(mesh, vertices=mesh.vertices + 0.1), view, **options)
     assert bits(descend(other, gradient)) != found
     assert bits(descend(first, gradient)) == found  # rendered again: the GPU holds one tape
-    of_mesh(GpuRendering, soup(9), view)
-    assert bits(descend(of_mesh(GpuRendering, mesh, view, **options), gradient)) == found
+    of_mesh(GPU, soup(9), view)
+    assert bits(descend(of_mesh(GPU, mesh, view, **options), gradient)) == found
 
 
 def renderer_of(mesh: SplatMesh) -> GradientRenderer:
-    return gradients.gradient_renderer(mesh.triangles)
+    return GPU.gradients_of(mesh.triangles)
 
 
 @pytest.mark.parametrize("queues", [(4, 4), (24, 8)])
@@ -194,9 +199,8 @@ def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     gradient = np.concatenate([random_gradient(view)[0], np.zeros((view.height, view.width, 1))], axis=2)
 
     def found(settings: DrawSettings) -> tuple[bytes, bytes]:
-        forward = renderer.forward(mesh.triangles, view, settings)
-        color = forward.images.color.tobytes()
-        return color, renderer.backward(forward, gradient.astype(np.float32))[0].tobytes()
+        images, tape = renderer.forward(mesh.triangles, view, settings)
+        return images.color.tobytes(), renderer.backward(tape, gradient.astype(np.float32))[0].tobytes()
 
     usual = found(DrawSettings())
     assert found(DrawSettings(queue=queues[0], long_queue=queues[1])) == usual
@@ -205,24 +209,24 @@ def test_the_length_of_the_queue_does_not_change_a_bit(queues):
 def test_in_windows_where_a_tape_does_not_fit(monkeypatch):
     mesh, view, _ = scene("across tiles")
     gradient = random_gradient(view)
-    whole = of_mesh(GpuRendering, mesh, view)
+    whole = of_mesh(GPU, mesh, view)
     expected = descend(whole, gradient)
     monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 16 * 4000)  # as if there were more fragments
     monkeypatch.setattr(renderer_of(mesh).device, "binding_limit", 64 << 20)
-    parts = of_mesh(GpuRendering, mesh, view)
-    assert len(parts.forward.windows) >= 4
+    parts = of_mesh(GPU, mesh, view)
+    assert len(parts.tape.windows) >= 4
     # The corner of each window is another origin for rounding.
     assert np.abs(parts.color - whole.color).max() < 1e-4
     found = descend(parts, gradient)
     assert all(error(a, b) < TOLERANCE for a, b in zip(found, expected, strict=True))
     assert bits(descend(parts, gradient)) == bits(found)
-    gradients._last = None
+    GPU.forget()
 
 
 def test_lists_grow():
     mesh, view, _ = scene("piercing")
     mesh = replace(mesh, faces=np.tile(mesh.faces, (40, 1)))
-    gradients._last = None
+    GPU.forget()
     renderer = renderer_of(mesh)
     renderer.frames.capacity = 300
     assert_same_gradients(mesh, view)
@@ -233,7 +237,7 @@ def test_no_triangles_and_none_in_view():
     view = camera()
     empty = SplatMesh(np.zeros((3, 3)), np.zeros((0, 3), int), np.zeros((3, 4)))
     for mesh in (empty, soup(1, z=-50)):
-        rendering = of_mesh(GpuRendering, mesh, view, background=(0.1, 0.2, 0.3))
+        rendering = of_mesh(GPU, mesh, view, background=(0.1, 0.2, 0.3))
         assert not rendering.alpha.any()
         assert np.allclose(rendering.color, (0.1, 0.2, 0.3))
         assert not any(part.any() for part in descend(rendering, random_gradient(view)))
@@ -242,7 +246,7 @@ def test_no_triangles_and_none_in_view():
 def test_splats_that_share_vertices_have_no_filter():
     mesh = replace(soup(3), face_splat=np.arange(60))
     with pytest.raises(ValueError, match="share a vertex"):
-        of_mesh(GpuRendering, mesh, camera(), filter_px2=0.3)
+        of_mesh(GPU, mesh, camera(), filter_px2=0.3)
 
 
 def test_a_walk_that_cannot_end_is_an_error():
@@ -258,8 +262,8 @@ def test_walks_that_exceed_their_budget_go_on_where_they_ended():
     gradient = np.ones((view.height, view.width, 4), np.float32)
 
     def found(settings: DrawSettings) -> tuple[int, bytes]:
-        forward = renderer.forward(mesh.triangles, view, settings)
-        return forward.images.work.walks, renderer.backward(forward, gradient)[0].tobytes()
+        images, tape = renderer.forward(mesh.triangles, view, settings)
+        return images.work.walks, renderer.backward(tape, gradient)[0].tobytes()
 
     usual, short = found(DrawSettings()), found(DrawSettings(budget=400))
     assert short[0] > usual[0]
@@ -276,18 +280,18 @@ def test_a_sample_with_too_many_fragments_is_an_error(monkeypatch):
     monkeypatch.setattr(open_device(), "_pipelines", {})
     monkeypatch.setattr(open_device(), "_modules", {})
     mesh, view, _ = scene("many layers")
-    rendering = of_mesh(GpuRendering, mesh, view)
+    rendering = of_mesh(GPU, mesh, view)
     with pytest.raises(DeviceError, match="too many fragments"):
         descend(rendering, random_gradient(view))
 
 
 def test_what_needs_the_cpu_is_an_error(monkeypatch):
     mesh, view, _ = scene("a fan")
-    with pytest.raises(ValueError, match="opacity ramps need device='cpu'"):
-        taped_rendering("gpu", mesh.triangles, view, ramp=OpacityRamp(0.5))
-    rendering = of_mesh(GpuRendering, mesh, view)
+    with pytest.raises(ValueError, match=CANNOT["cutoff"]):
+        of_mesh(GPU, mesh, view, ramp=OpacityRamp(0.5))
+    rendering = of_mesh(GPU, mesh, view)
     color, alpha = random_gradient(view)
-    with pytest.raises(ValueError, match="the expected error needs device='cpu'"):
+    with pytest.raises(ValueError, match=CANNOT["cutoff"]):
         rendering.backward(
             color,
             None,
@@ -297,9 +301,16 @@ def test_what_needs_the_cpu_is_an_error(monkeypatch):
             expected=ExpectedError(color, alpha),
         )
     monkeypatch.setattr(gradients, "MAX_VALENCE", 7)
-    gradients._last = None
+    GPU.forget()
     with pytest.raises(DeviceError, match="up to 7 triangles; one has 8"):
-        of_mesh(GpuRendering, mesh, view)
+        of_mesh(GPU, mesh, view)
+
+
+def test_visible_pixels_are_those_of_the_core():
+    mesh, view, _ = scene("piercing")
+    found, expected = (visible_pixels(engine, mesh.triangles, view) for engine in (GPU, CPU))
+    assert expected.sum() > 10
+    assert error(found, expected) < TOLERANCE
 
 
 def test_rasterize_with_further_attributes_background_and_poses():

@@ -12,8 +12,10 @@ from conftest import shared_data
 
 from meshsplats import Camera, SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.errors import DeviceError
+from meshsplats.rendering.gpu import gpu_engine
 from meshsplats.webgpu import frames, kernels, renderer
-from meshsplats.webgpu.frames import DrawSettings, find_groups, find_runs
+from meshsplats.webgpu.frames import DrawSettings
+from meshsplats.webgpu.layout import find_groups, find_runs
 from meshsplats.webgpu.renderer import MeshRenderer
 
 
@@ -74,7 +76,9 @@ def crossing_planes(seed: int = 0) -> tuple[SplatMesh, Camera]:
 
 
 def draw(mesh: SplatMesh, view: Camera, settings: DrawSettings) -> renderer.Images:
-    return renderer.draw(mesh, view, settings)
+    engine = gpu_engine()
+    with engine.errors():
+        return engine.renderer_of(mesh).draw(view, settings)
 
 
 def bits(images: renderer.Images) -> bytes:

@@ -19,7 +19,8 @@ from meshsplats.conversion.normals import views_around
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.cpu import CpuEngine
 
 STEPS = 72
 _VIEWS = 24
@@ -79,13 +80,8 @@ def linear_colors(
             seen = render(mesh, camera, background=(0, 0, 0), samples=samples, threads=threads)
             targets[id(camera)] = seen
         target = seen.color + (1 - seen.alpha)[:, :, None] * np.array(background, np.float32)
-        drawn = TapedRendering(
-            mesh.triangles._replace(colors=colors),
-            camera,
-            background=srgb_to_linear(np.array(background, np.float32)),
-            samples=samples,
-            threads=threads,
-        )
+        options = TapeOptions(srgb_to_linear(np.array(background, np.float32)), samples)
+        drawn = CpuEngine(threads).tape(mesh.triangles._replace(colors=colors), camera, options)
         error = (linear_to_srgb(drawn.color) - target) * encoding_slope(
             np.maximum(drawn.color, np.float32(_DARKEST))
         )

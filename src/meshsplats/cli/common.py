@@ -303,10 +303,9 @@ class DrawOptions:
 
     def check_device(self) -> None:
         """Raises MissingDependencyError or DeviceError if there is no such device."""
-        if self.device == "gpu":
-            from meshsplats.webgpu.device import open_device
+        from meshsplats.rendering.devices import engine
 
-            open_device()
+        engine(self.device).check()
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.messages import quoted
 from meshsplats.installation import examine
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

@@ -311,7 +311,7 @@ class TrainingCommand(Command):
         """Prints the result of a run of ``seconds``, after those of the ``earlier`` part. ``scored``: see
         ``_scored``."""
         from meshsplats.finetuning.journal import Journal
-        from meshsplats.finetuning.run import SCORED_VIEWS
+        from meshsplats.finetuning.reports import SCORED_VIEWS
 
         lines = Journal(files.folder).metrics()
         scores = [line["psnr"] for line in lines if line.get("psnr") is not None]

@@ -16,7 +16,9 @@ from meshsplats.camera import Camera
 from meshsplats.conversion.stars import STARS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.engine import scatter_to_vertices
 from meshsplats.rendering.looks import Look, draw_splats
 
 LEVELS = ((3, 1), (4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
@@ -104,6 +106,7 @@ def visibility(
     triangles = mesh.triangles._replace(values=np.zeros((len(owner), 2), np.float32))
     pixels, error, views = np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
     samples = 1 if look == "splats" else AREA_SAMPLES
+    drawing, options = CpuEngine(threads), TapeOptions((0, 0, 0), samples)
     fewest, most = IMAGES
     chosen = subsample(cameras, min(max(len(cameras) // 8, fewest), most))
     done = 0
@@ -111,12 +114,12 @@ def visibility(
     order = np.argsort(np.argsort(np.arange(len(chosen)) * GOLDEN % 1, kind="stable"), kind="stable")
     for own in (chosen[i] for i in order):
         camera = own.within(SIDE)
-        rendering = TapedRendering(triangles, camera, background=(0, 0, 0), samples=samples, threads=threads)
+        rendering = drawing.tape(triangles, camera, options)
         # Colours over black and alpha: then no background hides a difference.
         target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples, threads=threads)
         square = np.square(rendering.color - target.color).sum(axis=2)
         square += np.square(rendering.alpha - target.alpha)
-        sums = rendering.scatter_to_vertices(np.stack([np.ones_like(square), square], axis=2))
+        sums = scatter_to_vertices(rendering, np.stack([np.ones_like(square), square], axis=2))
         own_pixels = own.width * own.height / (camera.width * camera.height)
         pixels += own_pixels * np.bincount(owner, sums[:, 0], n)
         error += own_pixels * np.bincount(owner, sums[:, 1], n)

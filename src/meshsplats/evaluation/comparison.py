@@ -18,7 +18,7 @@ from meshsplats.datasets.views import View
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import Device
+from meshsplats.rendering.engine import Device
 from meshsplats.rendering.looks import Look, check_look, draw_splats, image_of, mesh_samples
 
 

@@ -100,7 +100,7 @@ def converted(
             wanted = replace(wanted, footprint="framing")
     seen_from = cameras if options.colors == "cameras" else None
     mesh = convert(cloud, wanted, cameras=seen_from, up=guess_up(cloud, cameras))
-    return cut_mesh(mesh, config.cutoff) if config.opacity == "cutoff" else mesh
+    return cut_mesh(mesh, config.cutoff) if config.cuts else mesh
 
 
 def without_cameras(options: ConversionOptions) -> ConversionOptions:

@@ -7,8 +7,10 @@ fingerprints of the inputs.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
+from meshsplats.finetuning.loss import DEFAULT
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -49,11 +52,13 @@ class Checkpoint:
     planned: dict[str, Any] | None = None
     """The length that the run began with (``LENGTHS``), if it was made longer since; None: that of
     ``config``."""
+    loss: str = DEFAULT
+    """``loss_name`` of the run's. The name only: what it computes cannot be compared."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     """Writes ``checkpoint`` to ``path``, atomically replacing an earlier one."""
-    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "planned")
+    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "planned", "loss")
     header = {name: getattr(checkpoint, name) for name in names}
     save_safetensors(path, checkpoint.arrays, {_KEY: json.dumps({"version": VERSION, **header})})
 
@@ -79,7 +84,7 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
             f"{path}: a checkpoint of version {header['version']}, this program reads version {VERSION}"
         )
     step, seconds, config, losses = (header[name] for name in ("step", "seconds", "config", "losses"))
-    planned = header.get("planned")
+    planned, loss = header.get("planned"), header.get("loss", DEFAULT)
     if (
         not isinstance(step, int)
         or step < 0
@@ -87,11 +92,12 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
         or not isinstance(config, dict)
         or not isinstance(losses, list)
         or not all(isinstance(loss, float) for loss in losses)
+        or not isinstance(loss, str)
         or not (planned is None or (isinstance(planned, dict) and set(planned) <= set(LENGTHS)))
     ):
         raise FileFormatError(f"{path}: broken: step {step!r}, seconds {seconds!r}")
     fingerprints = str(header["mesh"]), str(header["dataset"])
-    return Checkpoint(step, float(seconds), config, *fingerprints, arrays, tuple(losses), planned)
+    return Checkpoint(step, float(seconds), config, *fingerprints, arrays, tuple(losses), planned, loss)
 
 
 def planned_length(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -105,8 +111,11 @@ class OtherRunError(ValueError):
     """The checkpoint to resume from belongs to another run; the message names the differences."""
 
 
-def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset: str) -> None:
-    """Raises OtherRunError unless ``found`` has this configuration and these fingerprints of its inputs.
+def check_same_run(
+    found: Checkpoint, config: FinetuneConfig, mesh: str, dataset: str, loss: str = DEFAULT
+) -> None:
+    """Raises OtherRunError unless ``found`` has this configuration, these fingerprints of its inputs, and a
+    loss of this name.
 
     The length may differ, so that a run can be extended.
     """
@@ -119,6 +128,10 @@ def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset
         raise OtherRunError(
             f"the checkpoint is of another configuration: {changes}; give the same options as before"
         )
+    if found.loss != loss:
+        raise OtherRunError(
+            f"the checkpoint was made with the loss {found.loss}, this run has {loss}: give the same loss"
+        )
     if found.mesh != mesh:
         raise OtherRunError(
             "the checkpoint began with another mesh: give the same input, and the same options of reading it,"
@@ -129,6 +142,17 @@ def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset
             "the checkpoint was made with other views or images of other splats, or by an earlier"
             " meshsplats: give the same data set or splats and the same options of the views"
         )
+
+
+@contextlib.contextmanager
+def reading_arrays() -> Iterator[None]:
+    """Turns what is wrong with a checkpoint's arrays into a FileFormatError."""
+    try:
+        yield
+    except KeyError as error:
+        raise FileFormatError(f"the checkpoint lacks {error}") from None
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"the checkpoint is broken: {error}") from None
 
 
 def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:

@@ -162,6 +162,11 @@ class FinetuneConfig:
             )
 
     @property
+    def cuts(self) -> bool:
+        """Whether the triangles become opaque ones."""
+        return self.opacity == "cutoff"
+
+    @property
     def settling(self) -> float:
         """``settle_share``, or its default."""
         if self.settle_share is not None:

@@ -13,13 +13,13 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats.datasets.views import View
-from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.state import MAX_OPACITY
 from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering import render
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.engine import scatter_to_vertices
 
-MAX_OPACITY = np.float32(254 / 255)
-"""Greatest opacity of a corner of blended triangles, so that they differ from opaque ones."""
 SOLID = 1 - 0.5 / 255
 """Least opacity of a fragment of opaque triangles, which blended ones do not reach."""
 ERROR_VIEWS = 24
@@ -31,17 +31,6 @@ COLOR_SLOPE = 0.06
 triangle's least height. Of 0.05 to 0.2 the best in three.js with MSAA."""
 SLOPE_VIEWS = 12
 """Maximum number of training views, evenly spread, in which these heights are measured."""
-
-
-def soft_fraction(config: FinetuneConfig, fraction: float) -> float:
-    """Share of the phase with blended triangles that is over, after ``fraction`` of the run; below 0 before
-    it."""
-    return (fraction - 1 + config.soft_phase) / config.soft_phase if config.soft_share else -1.0
-
-
-def opaque_fraction(config: FinetuneConfig, fraction: float) -> float:
-    """Share of the phase before that is over; of the run, if there is no other."""
-    return min(1.0, fraction / (1 - config.soft_phase)) if config.soft_share else fraction
 
 
 def with_soft_splats(
@@ -81,17 +70,18 @@ def softness(
     assert start.face_splat is not None
     sums = np.zeros(len(start.vertices))
     triangles = start.triangles._replace(values=np.zeros((len(start.vertices), 1), np.float32))
+    drawing = CpuEngine(threads)
     for view in subsample(views, ERROR_VIEWS):
         background, camera = view.background, view.camera
         opaque = render(core, camera, background=background, samples=ERROR_SAMPLES, threads=threads).color
-        rendering = TapedRendering(triangles, camera, background=background, threads=threads)
+        rendering = drawing.tape(triangles, camera, TapeOptions(background))
         error, blended = (
             np.square(color - view.image).sum(axis=2, keepdims=True) for color in (opaque, rendering.color)
         )
         error -= blended
         if view.mask is not None:
             error[~view.mask] = 0  # masked values may be anything
-        sums += rendering.scatter_to_vertices(error)[:, 0]
+        sums += scatter_to_vertices(rendering, error)[:, 0]
     # A corner has the sum of e T a, weighted by its barycentric weight: by these, 1 - a is interpolated.
     sums *= 1 - start.colors[:, 3]
     splats = start.splats

@@ -90,7 +90,7 @@ def starting_mesh(
 
 def _is_for_images_of_splats(options: ConversionOptions, config: FinetuneConfig | None) -> bool:
     """Whether the mesh is blended and trained on means over areas that are rendered from splats."""
-    blended = config is not None and config.opacity == "blended"
+    blended = config is not None and not config.cuts
     return blended and options.look in (None, "area") and options.footprint in (None, "cameras")
 
 
@@ -108,7 +108,7 @@ def starting_sides(splats: int, config: FinetuneConfig | None, views: int) -> in
     (``is_long``). In large clouds fewer (``MANY_TRIANGLES``, ``LONG_TRIANGLES``), but at least 5.
     """
     most, sides = MANY_TRIANGLES, FLAT_SIDES
-    if config is not None and config.opacity == "blended":
+    if config is not None and not config.cuts:
         sides = SIDES
         if is_long(config, views):
             most, sides = LONG_TRIANGLES, LONG_SIDES

@@ -1,4 +1,5 @@
 """Losses between images, as torch functions: L1, SSIM in the 3DGS convention, and their weighted sum.
+``from_torch`` turns such functions into losses of ``finetune``.
 
 Value and gradient come from the compiled core in one pass. Both have the same bits in every run, with any
 number of threads.
@@ -6,12 +7,16 @@ number of threads.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from meshsplats._core.kernels import compare_images
+from meshsplats._kinds import described
 from meshsplats.errors import GET_TORCH, MissingDependencyError
+from meshsplats.finetuning.loss import Loss, Target, loss_name
 
 try:
     import torch
@@ -85,6 +90,33 @@ def photometric_loss(
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight must lie in [0, 1], got {ssim_weight}")
     return _weighted(image, target, mask, 1 - ssim_weight, -ssim_weight, ssim_weight, threads)
+
+
+def from_torch(function: Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None], torch.Tensor]) -> Loss:
+    """The loss ``function(image, target, mask)`` for ``finetune(loss=...)``, with the gradient of torch.
+
+    Args:
+        function: takes (h, w, 3) float32 display RGB of the image and its target, and a (h, w) bool mask,
+            True where pixels count, or None: all do. Returns a tensor with one number.
+
+    The loss raises TypeError if ``function`` returns something else.
+    """
+
+    @functools.wraps(function)
+    def loss(image: np.ndarray, target: Target) -> tuple[float, np.ndarray]:
+        leaf = torch.from_numpy(image).requires_grad_(True)
+        mask = None if target.mask is None else torch.from_numpy(target.mask)
+        with torch.enable_grad():
+            value = function(leaf, torch.from_numpy(target.color), mask)
+        if not (isinstance(value, torch.Tensor) and value.numel() == 1 and value.requires_grad):
+            raise TypeError(
+                f"the loss {loss_name(loss)} must return a tensor with one number that depends on the image,"
+                f" got {described(value)}"
+            )
+        (gradient,) = torch.autograd.grad(value, leaf)
+        return float(value.detach()), gradient.numpy()
+
+    return loss
 
 
 def _weighted(

@@ -29,11 +29,12 @@ from meshsplats.finetuning.pace import (
     of_brief_run,
     worthwhile_steps,
 )
-from meshsplats.finetuning.run import SCORED_VIEWS, RunOptions, finetune, held_out_scores, scored_count
+from meshsplats.finetuning.reports import SCORED_VIEWS, held_out_scores, scored_count
+from meshsplats.finetuning.run import RunOptions, finetune
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import Device
+from meshsplats.rendering.engine import Device
 
 SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""

@@ -17,47 +17,13 @@ from meshsplats._arrays import subsample
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp
+from meshsplats.rendering.backward import ExpectedError
 from meshsplats.rendering.edges import front_faces
 
-STEEPEST = 30.0
-"""Slope of the ramp at the end of the annealing, where it is not limited by its width already."""
-LEAK = 0.05
-"""Derivative outside of the ramp at the start, so that hidden fragments can come back. It falls to 0."""
-EDGES_FROM = 0.4
-"""Share of the annealing after which the motion of edges counts: before, many triangles are translucent."""
 HIT_VIEWS = 64
 """Maximum number of training views, evenly spread, in which triangles are looked for."""
 HIT_SAMPLES = 2
 """Samples along each side of a pixel there."""
-
-
-def ramp_of(config: FinetuneConfig, fraction: float) -> OpacityRamp | None:
-    """The ramp of a step after ``fraction`` (0 to 1) of the run; None for blended meshes."""
-    if config.opacity != "cutoff":
-        return None
-    done = _annealed(config, fraction)
-    return OpacityRamp(
-        config.cutoff,
-        height=config.cutoff + (0.5 - config.cutoff) * done,
-        slope=STEEPEST**done if done < 1 else 1e6,
-        leak=LEAK * (1 - done),
-    )
-
-
-def follows_edges(config: FinetuneConfig, fraction: float) -> bool:
-    """Whether positions follow the edges of opaque triangles, after ``fraction`` of the run."""
-    moves = config.opacity == "cutoff" and config.position_rate > 0
-    return moves and _annealed(config, fraction) >= EDGES_FROM
-
-
-def expected_share(config: FinetuneConfig, fraction: float) -> float:
-    """Share of the expected error in the loss, after ``fraction`` of the run."""
-    return config.expected_share * _annealed(config, fraction) if config.opacity == "cutoff" else 0.0
-
-
-def _annealed(config: FinetuneConfig, fraction: float) -> float:
-    return min(1.0, fraction / config.anneal_share) if config.anneal_share else 1.0
 
 
 def expected_error(

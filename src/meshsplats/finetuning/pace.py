@@ -22,10 +22,11 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.baseline import without_cameras
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
+from meshsplats.finetuning.phases.choice import first_phase
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.api import Device
+from meshsplats.rendering.engine import Device
 
 FEWEST_STEPS = 150
 """Steps that a run for opaque triangles should have."""
@@ -163,9 +164,10 @@ def measure_pace(
         view.load()
         times.append(time.perf_counter() - start)
     state = State.begin(mesh, len(views), config, threads, device=device)
+    phase = first_phase(config, mesh, state)
     steps = []
     for number in range(2):  # the first one allocates
         start = time.perf_counter()
-        make_step(state, views, number, 0.6 if config.opacity == "cutoff" else 0.0)
+        make_step(state, views, number, phase.usual, phase)
         steps.append(time.perf_counter() - start)
     return Pace(min(times), min(steps) / len(part), merging)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -13,23 +13,43 @@ from meshsplats._arrays import checked_array, nonzero_rows
 from meshsplats._core.kernels import round_fans
 from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
-from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
-from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
+from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig, epsilons
-from meshsplats.finetuning.hybrid import MAX_OPACITY, ColorLimits
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
+from meshsplats.finetuning.loss import LossRates
 from meshsplats.mesh import SplatMesh, Triangles, solid_faces
-from meshsplats.rendering.api import Device
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.devices import engine
 from meshsplats.rendering.edges import corners_beyond
-from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
-from meshsplats.webgpu.gradients import WindowLimit, check_limits
-from meshsplats.webgpu.renderer import gpu_errors
-from meshsplats.webgpu.training import MAX_PIXELS, Moments, Rates, Sums, Trainer
+from meshsplats.rendering.engine import Device, Need, Taped, WholeSteps
+from meshsplats.webgpu.training import Moments, Parameters, Sums
+from meshsplats.webgpu.training import Rates as StepRates
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
+
+MAX_OPACITY = np.float32(254 / 255)
+"""Greatest opacity of a corner of blended triangles beside opaque ones, so that they differ."""
+
+
+class Rates(NamedTuple):
+    """Learning rates of a step."""
+
+    colors: float
+    positions: float
+    """0: positions are fixed."""
+
+
+class StepImage(NamedTuple):
+    """The image of a whole step, and what it is compared with."""
+
+    camera: Camera
+    options: TapeOptions
+    target: np.ndarray
+    """(h, w, 3) float32 RGB."""
+    mask: np.ndarray | None
+    """(h, w) bool, True where pixels count; None: all do."""
 
 
 class Gradients(NamedTuple):
@@ -53,8 +73,8 @@ class State:
     """The optimisation state.
 
     Attributes:
-        vertices: (v, 3) float32, scene units, changed in place. After steps on the GPU, reading them waits
-            for the GPU.
+        vertices: (v, 3) float32, scene units, changed in place. After whole steps of the engine, they are
+            fetched when they are read.
         colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, likewise.
         mesh: the initial mesh without pruned triangles: triangles, their splats, attributes.
         sizes: (v,) float32, the unit of each vertex' position or, on a base mesh, of its weights.
@@ -64,9 +84,8 @@ class State:
             they are not fitted.
         solid: for a mesh of opaque and blended triangles, (v,) bool: the vertices of opaque ones, whose
             opacities stay; otherwise None.
-        color_limits: of opaque triangles beside blended ones; None before they are measured.
         frozen: (v,) bool: vertices whose positions and colours stay; None if there are none.
-        limit: of windows on the GPU.
+        device: where images are drawn.
     """
 
     def __init__(
@@ -80,9 +99,9 @@ class State:
     ) -> None:
         self.mesh, self.sizes, self.config, self.threads = mesh, sizes, config, threads
         self.device: Device = device
+        self._session = engine(device, threads).session(mesh)
+        self._ahead: WholeSteps | None = None  # has taken steps that the arrays here do not have
         self._vertices, self._rgba = mesh.vertices.copy(), mesh.colors.copy()
-        self._trainer: Trainer | None = None
-        self._ahead = False  # whether the trainer has taken steps that the arrays here do not have
         self.exposures = None if exposures is None else exposures.copy()
         adam = partial(RowAdam, betas=(config.beta1, config.beta2), threads=threads)
         color_epsilon, position_epsilon = epsilons(config)
@@ -99,14 +118,12 @@ class State:
         if self.exposures is not None:
             self._exposures = adam(self.exposures, lr=config.exposure_rate, eps=color_epsilon)
         self.solid: np.ndarray | None = None
-        self.color_limits: ColorLimits | None = None
         self.frozen: np.ndarray | None = None
-        self.limit = WindowLimit()
-        self._rounds = False  # whether fans change between steps, which the GPU would have to know
+        self._rounds = False
 
     @property
     def vertices(self) -> np.ndarray:
-        self._download()
+        self._fetch()
         return self._vertices
 
     @property
@@ -121,7 +138,7 @@ class State:
 
     @property
     def colors(self) -> np.ndarray:
-        self._download()
+        self._fetch()
         return self._rgba
 
     @classmethod
@@ -136,10 +153,7 @@ class State:
         device: Device = "cpu",
     ) -> State:
         """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
-        if config.opacity == "cutoff":
-            _check_for_cutoff(mesh, config)
-        if device == "gpu":
-            check_limits(open_device(), mesh)
+        engine(device, threads).check(mesh=mesh)
         mesh = replace(mesh, normals=None)  # positions change, normals would not
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
@@ -186,9 +200,8 @@ class State:
     ) -> State:
         """The state in a checkpoint's arrays. FileFormatError if they do not fit each other."""
         mesh = stored_mesh(arrays, blending)
-        if device == "gpu":
-            check_limits(open_device(), mesh)
-        try:
+        engine(device, threads).check(mesh=mesh)
+        with reading_arrays():
             sizes = _checked_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
             exposures = _checked_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
             state = cls(mesh, sizes, exposures, config, threads, device)
@@ -197,34 +210,23 @@ class State:
                 adam.load_state(part)
             if arrays.get("solid", np.zeros(())):
                 state.solid = mesh.vertices_of(solid_faces(mesh))
-            if "color_limits" in arrays:
-                state.color_limits = ColorLimits(state.mesh, arrays["color_limits"])
             if "frozen" in arrays:
                 state.frozen = checked_array("frozen", arrays["frozen"], bool, (len(mesh.vertices),))
-            if device == "gpu" and "window_samples" in arrays:
-                state.limit.samples = _checked_limit(arrays["window_samples"])
-        except KeyError as error:
-            raise FileFormatError(f"the checkpoint lacks {error}") from None
-        except (ValueError, TypeError) as error:
-            raise FileFormatError(f"the checkpoint is broken: {error}") from None
+            state._session.resume(arrays)
         return state
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays that ``resume`` needs, by their names in a checkpoint."""
-        self._download()
-        arrays = mesh_arrays(self.result()) | {"sizes": self.sizes}
+        self._fetch()
+        arrays = mesh_arrays(self.result()) | {"sizes": self.sizes} | self._session.arrays()
         if self.exposures is not None:
             arrays["exposure.values"] = self.exposures
         for name, adam in self._optimisers().items():
             arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
         if self.solid is not None:
             arrays["solid"] = np.ones((), np.int32)
-        if self.color_limits is not None:
-            arrays["color_limits"] = self.color_limits.limits
         if self.frozen is not None:
             arrays["frozen"] = self.frozen
-        if self.device == "gpu":
-            arrays["window_samples"] = np.array(self.limit.samples, np.int64)
         return arrays
 
     def result(self) -> SplatMesh:
@@ -248,8 +250,7 @@ class State:
         """One step of Adam along ``gradients`` for the vertices that the training view of index ``view``
         reached. ``edges``: they include the motion of edges, without which opaque triangles stay in place.
         """
-        self._download()
-        self._trainer = None
+        self._change()
         # Opaque vertices, and those of the colour behind them, have a gradient of their colour alone.
         reached = nonzero_rows(gradients.colors)
         if self.frozen is not None:
@@ -290,103 +291,81 @@ class State:
             mean = self.exposures.mean(axis=0, dtype=np.float64) - [1, 1, 1, 0, 0, 0]
             self.exposures -= mean.astype(np.float32)
 
-    def trains_on_gpu(self, camera: Camera) -> bool:
-        """Whether ``step_on_gpu`` takes steps with images of that size.
+    @property
+    def needs(self) -> set[Need]:
+        """What a step of this state asks of who takes it."""
+        of_state: dict[Need, bool] = {
+            "base mesh": self.bound is not None,
+            "exposure": self.exposures is not None,
+            "linear light": self.mesh.blending != "display",
+            "decay": bool(self.config.opacity_decay),
+            "rounding": self._rounds,
+            "frozen": self.frozen is not None or self.solid is not None,
+            "depth groups": self.mesh.depth_group is not None,
+        }
+        return {need for need, there in of_state.items() if there}
 
-        Others render on the GPU, and compare images and take their step here: those of base meshes,
-        exposures, linear light, decaying opacities and shapes, frozen vertices, depth groups.
+    def tape(self, camera: Camera, options: TapeOptions) -> Taped:
+        """The mesh as it is now from ``camera``, with a backward pass."""
+        return self._session.tape(self.triangles, camera, options)
+
+    def whole_steps(self, camera: Camera, needs: Collection[Need]) -> WholeSteps | None:
+        """What takes whole steps with images of this camera, in ``whole_step``; None: only ``step`` does."""
+        return self._session.whole_steps(camera, self.needs.union(needs))
+
+    def whole_step(self, steps: WholeSteps, image: StepImage, loss: LossRates, rates: Rates) -> Sums:
+        """One step that ``steps`` take, with all that belongs to it. ``rates``: learning rates of colours and
+        of positions.
+
+        Returns the sums. If they or the gradients are not finite, nothing has changed.
         """
-        return (
-            self.device == "gpu"
-            and self.bound is None
-            and self.exposures is None
-            and self.solid is None
-            and self.frozen is None
-            and not self.config.opacity_decay
-            and not self._rounds
-            and self.mesh.blending == "display"
-            and self.mesh.depth_group is None
-            and camera.width * camera.height <= MAX_PIXELS
-        )
-
-    def step_on_gpu(
-        self,
-        camera: Camera,
-        settings: DrawSettings,
-        target: np.ndarray,
-        mask: np.ndarray | None,
-        background: Sequence[float],
-        loss: tuple[float, float, float],
-        rates: tuple[float, float],
-    ) -> Sums:
-        """Renders, compares and takes a step on the GPU, where all arrays stay.
-
-        Args:
-            camera, settings, target, mask, background: as in ``Trainer.step``.
-            loss: derivatives of the loss with respect to the sums of |x - y|, SSIM, and (x - y)^2.
-            rates: learning rates of colours and of positions.
-
-        Returns:
-            The sums. If they or the gradients are not finite, nothing has changed.
-        """
-        optimisers = [self._colors, *([self._positions] if rates[1] > 0 else [])]
-        steps = [optimiser.next_rate(rate) for optimiser, rate in zip(optimisers, rates, strict=False)]
         config = self.config
-        with gpu_errors():
-            if self._trainer is None:
-                self._trainer = self._new_trainer()
-            sums = self._trainer.step(
-                camera,
-                settings,
-                target,
-                mask,
-                background,
-                Rates(*loss, steps[0], (*steps, 0.0)[1], (config.beta1, config.beta2), epsilons(config)),
-            )
+        optimisers = [self._colors, *([self._positions] if rates.positions > 0 else [])]
+        sizes = [optimiser.next_rate(rate) for optimiser, rate in zip(optimisers, rates, strict=False)]
+        betas = (config.beta1, config.beta2)
+        asked = StepRates(*loss[:3], sizes[0], (*sizes, 0.0)[1], betas, epsilons(config))
+        sums = steps.step(self._parameters, image.camera, image.options, image.target, image.mask, asked)
         if sums.finite:
-            self._ahead = True
+            self._ahead = steps
             for optimiser in optimisers:
                 optimiser.steps += 1
         return sums
 
-    def _new_trainer(self) -> Trainer:
-        count = len(self._vertices)
-        scale = self._positions.scale
-        return Trainer(
-            open_device(),
-            self.mesh,
+    @property
+    def _parameters(self) -> Parameters:
+        """The arrays as they are here."""
+        return Parameters(
             self._vertices,
             self._rgba,
             Moments(self._positions.mean, self._positions.square),
             Moments(self._colors.mean, self._colors.square),
-            np.ones(count, np.float32) if scale is None else scale,
-            np.zeros(count, bool) if self._boundary is None else self._boundary,
-            self.limit,
+            self._positions.scale,
+            self._boundary,
         )
 
-    def _download(self) -> None:
-        """Brings the arrays up to the steps that were taken on the GPU."""
-        if not self._ahead or self._trainer is None:
-            return
-        with gpu_errors():
-            vertices, colors, positions, of_colors = self._trainer.download()
-        self._vertices[:], self._rgba[:] = vertices, colors
-        for optimiser, moments in ((self._positions, positions), (self._colors, of_colors)):
-            optimiser.mean[:], optimiser.square[:] = moments
-        self._ahead = False
+    def _fetch(self) -> None:
+        """Brings the arrays up to the last step."""
+        if self._ahead is not None:
+            self._ahead.fetch(self._parameters)
+            self._ahead = None
+
+    def _change(self) -> None:
+        """To be called before the arrays change."""
+        self._fetch()
+        self._session.release()
 
     def round_fans(self, corners: int, share: float) -> None:
         """Moves each fan of ``corners`` vertices, centre first, towards a flat ellipse, by a ``share`` of
         the distance; for meshes that consist of such fans, one after the other."""
-        self._download()
-        self._trainer, self._rounds = None, True
+        self._change()
+        self._rounds = True
         round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
     def prune(self, keep: np.ndarray) -> State:
         """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
         if keep.all():
             return self
-        self._download()
+        self._fetch()
         return self.rebuild(self.result().take(keep), np.flatnonzero(self.mesh.vertices_of(keep)))
 
     def rebuild(self, mesh: SplatMesh, rows: np.ndarray, sizes: np.ndarray | None = None) -> State:
@@ -397,7 +376,7 @@ class State:
             rows: (v,) indices of vertices of this state, in any order.
             sizes: (v,) float32 units of the new positions; by default those of ``rows``.
         """
-        self._download()
+        self._fetch()
         units = self.sizes[rows] if sizes is None else sizes
         result = State(mesh, units, self.exposures, self.config, self.threads, self.device)
         positions = result.vertices if result.bound is None else result.bound.weights
@@ -416,34 +395,13 @@ class State:
 
     def restart(self, rows: np.ndarray) -> None:
         """Zeroes the first moments of the vertices ``rows``, after their values were replaced."""
-        self._download()
-        self._trainer = None
+        self._change()
         self._positions.restart(rows)
         self._colors.restart(rows)
 
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}
         return found if self._exposures is None else found | {"exposure": self._exposures}
-
-
-def _check_for_cutoff(mesh: SplatMesh, config: FinetuneConfig) -> None:
-    """ValueError if ``mesh`` cannot become one of opaque triangles."""
-    if mesh.filter_px2:
-        raise ValueError(
-            "opacity 'cutoff' is for meshes without a filter: choose another footprint, or bake_filter"
-        )
-    if mesh.binding is not None:
-        raise ValueError("opacity 'cutoff' cannot keep the binding to a base mesh")
-    if mesh.blending == "linear":
-        raise ValueError("opacity 'cutoff' is for meshes in display colours, this one is in linear light")
-    if config.soft_share and mesh.face_splat is None:
-        raise ValueError("soft_share chooses splats, but the mesh does not know its own (face_splat)")
-
-
-def _checked_limit(array: np.ndarray) -> int:
-    if array.shape != () or array.dtype != np.int64 or not 0 < array <= WINDOW_SAMPLES:
-        raise ValueError(f"window_samples must be a whole number from 1 to {WINDOW_SAMPLES}, got {array}")
-    return int(array)
 
 
 def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from meshsplats._core.kernels import compare_images
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
-from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
-from meshsplats.finetuning.hybrid import SOLID, opaque_fraction, soft_fraction
-from meshsplats.finetuning.opaque import expected_error, expected_share, follows_edges, ramp_of
-from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp
+from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig
+from meshsplats.finetuning.loss import DefaultLoss, Loss, Target, loss_name, own_loss
+from meshsplats.finetuning.opaque import expected_error
+from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, Rates, State, StepImage
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapeOptions
 from meshsplats.rendering.edges import edge_gradients
-from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
-from meshsplats.webgpu.frames import DrawSettings
+from meshsplats.rendering.engine import Need, Taped, WholeSteps
 
 TRAINING_MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
 """Early termination: a pixel stops below this transmittance, and the background gets the rest. It saves a
@@ -35,15 +33,29 @@ AREA_SAMPLES = 2
 """Samples along each side of a pixel when the target is the mean over each pixel's area."""
 
 
-class Target(NamedTuple):
-    """The ground truth of a step."""
+class Plan(NamedTuple):
+    """How a step draws its view, and what follows from the gradient."""
 
-    color: np.ndarray
-    """(h, w, 3) float32 display RGB."""
-    mask: np.ndarray | None
-    """(h, w) bool, True where pixels count; None: all pixels count."""
-    background: tuple[float, float, float]
-    """Display RGB of the background."""
+    points: bool
+    """Whether the target is sampled at the pixel centres, not averaged."""
+    samples: int
+    """Along each side of a pixel."""
+    color_rate: float
+    position_rate: float
+    """Learning rates."""
+    ramp: OpacityRamp | None = None
+    """Changes opacities."""
+    expected: float = 0.0
+    """Share of the expected error in the loss."""
+    edges: float | None = None
+    """Least opacity at which edges are visible and move positions; None: their motion does not count."""
+
+
+class Schedule(Protocol):
+    """Decides how steps are taken."""
+
+    def plan(self, view: View, step: int, fraction: float) -> Plan:
+        """How step ``step`` (from 0), of ``view``, is taken after ``fraction`` (0 to 1) of the run."""
 
 
 def view_of_step(config: FinetuneConfig, step: int, views: int) -> int:
@@ -78,7 +90,7 @@ class RenderedView:
         color: (h, w, 3) float32 display RGB.
     """
 
-    def __init__(self, rendering: AnyRendering, linear: bool) -> None:
+    def __init__(self, rendering: Taped, linear: bool) -> None:
         self._rendering, self._linear = rendering, linear
         self.color = linear_to_srgb(rendering.color) if linear else rendering.color
 
@@ -113,79 +125,15 @@ def samples_of(view: View, config: FinetuneConfig, fraction: float = 1.0) -> int
     return 1 if fraction < config.one_sample_share else AREA_SAMPLES
 
 
-def render_view(
-    state: State,
-    view: View,
-    background: Sequence[float],
-    samples: int,
-    ramp: OpacityRamp | None = None,
-) -> RenderedView:
-    """The current mesh from the camera of ``view``, over ``background``, display RGB."""
-    linear = state.mesh.blending == "linear"
-    display = np.asarray(background, np.float32)
-    rendering = taped_rendering(
-        state.device,
-        state.triangles,
-        view.camera,
-        background=srgb_to_linear(display) if linear else display,
-        samples=samples,
-        min_transmittance=TRAINING_MIN_TRANSMITTANCE[state.mesh.blending],
-        ramp=ramp,
-        threads=state.threads,
-        limit=state.limit,
+def tape_options(state: State, background: Sequence[float], plan: Plan) -> TapeOptions:
+    """Those of the image of a step over ``background``, display RGB."""
+    display, blending = np.asarray(background, np.float32), state.mesh.blending
+    return TapeOptions(
+        srgb_to_linear(display) if blending == "linear" else display,
+        plan.samples,
+        TRAINING_MIN_TRANSMITTANCE[blending],
+        ramp=plan.ramp,
     )
-    return RenderedView(rendering, linear)
-
-
-class LossRates(NamedTuple):
-    """Derivatives of the loss that ``FinetuneConfig`` defines, with respect to sums over all channels of the
-    pixels that count."""
-
-    l1: float
-    """Of the sum of |x - y|."""
-    ssim: float
-    """Of the sum of SSIM."""
-    l2: float
-    """Of the sum of (x - y)^2."""
-    at_zero: float
-    """The loss where all sums are 0."""
-
-    def loss(self, l1: float, ssim: float, l2: float) -> float:
-        """The loss with these sums."""
-        return self.at_zero + self.l1 * l1 + self.ssim * ssim + self.l2 * l2
-
-
-def loss_rates(config: FinetuneConfig, target: Target) -> LossRates:
-    mask, share = target.mask, config.ssim_weight
-    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
-    return LossRates((1 - share) / count, -share / count, config.l2_weight / count, share)
-
-
-def loss_of(
-    image: np.ndarray, target: Target, config: FinetuneConfig, threads: int | None
-) -> tuple[float, np.ndarray]:
-    """The loss (see ``LossRates``), and its gradient, (h, w, 3) float32 like the ``image``."""
-    mask = target.mask
-    rates = loss_rates(config, target)
-    compared = compare_images(
-        image[None],
-        target.color[None],
-        None if mask is None else mask[None],
-        l1_rate=rates.l1,
-        ssim_rate=rates.ssim,
-        gradient=True,
-        threads=threads,
-    )
-    assert compared.gradient is not None
-    gradient, squares = compared.gradient[0], 0.0
-    if config.l2_weight:
-        difference = image - target.color
-        if mask is not None:
-            difference[~mask] = 0  # masked values may be anything
-        squares = float(np.square(difference).sum())
-        difference *= np.float32(2 * rates.l2)
-        gradient += difference
-    return rates.loss(compared.l1, compared.ssim, squares), gradient
 
 
 class ViewGradients(NamedTuple):
@@ -197,71 +145,78 @@ class ViewGradients(NamedTuple):
     """Whether they include the motion of edges."""
 
 
-def make_step(state: State, views: Sequence[View], step: int, fraction: float) -> float | None:
+def make_step(
+    state: State,
+    views: Sequence[View],
+    step: int,
+    fraction: float,
+    schedule: Schedule,
+    loss: Loss | None = None,
+) -> float | None:
     """Takes step ``step`` (from 0), after ``fraction`` (0 to 1) of the run; returns the loss of its view.
+
+    Args:
+        state: changes.
+        views: the training views.
+        schedule: says how.
+        loss: that of the configuration by default.
 
     Returns None if no pixel of the view counts; the state has not changed then. Raises DivergenceError,
     before anything has changed, if the loss or a gradient is not finite.
     """
     config = state.config
     index = view_of_step(config, step, len(views))
-    if state.trains_on_gpu(views[index].camera):
-        return _step_on_gpu(state, views[index], step, fraction)
-    found = view_gradients(state, views, index, step, fraction)
-    if found is None:
+    view = views[index]
+    plan = schedule.plan(view, step, fraction)
+    target = target_of(view, config, step, plan.points)
+    if target.mask is not None and not target.mask.any():
         return None
-    steps_before = 0.0
-    if state.solid is not None:
-        steps_before = step * (1 - config.soft_phase) / fraction
-        fraction = soft_fraction(config, fraction)
-    else:
-        fraction = opaque_fraction(config, fraction)
-    color_rate, position_rate = learning_rates(config, step - steps_before, fraction)
-    state.step(found.gradients, color_rate, position_rate, index, edges=found.edges)
+    loss = loss or DefaultLoss.of(config, state.threads)
+    default = loss if isinstance(loss, DefaultLoss) else None
+    needs: tuple[Need, ...] = ("loss",) if default is None else ()
+    steps = state.whole_steps(view.camera, needs)
+    if steps is not None and default is not None:
+        return _whole_step(state, steps, view, step, plan, target, default)
+    found = view_gradients(state, (index, view), step, plan, target, loss)
+    state.step(found.gradients, plan.color_rate, plan.position_rate, index, edges=found.edges)
     return found.loss
 
 
 def view_gradients(
-    state: State, views: Sequence[View], index: int, step: int, fraction: float
-) -> ViewGradients | None:
-    """Loss and gradients of the training view of that ``index`` in step ``step``, after ``fraction`` of the
-    run; None if none of its pixels counts. DivergenceError if they are not finite."""
-    config, view = state.config, views[index]
-    hybrid = state.solid is not None
-    fraction = soft_fraction(config, fraction) if hybrid else opaque_fraction(config, fraction)
-    points = not hybrid and uses_point_targets(view, config, fraction)
-    target = target_of(view, config, step, points)
-    if target.mask is not None and not target.mask.any():
-        return None
-    # Viewers shade a pixel once, with MSAA too: values at pixel centres must be right as well as means.
-    centers = points or (hybrid and config.samples is None and step % 2 == 1)
-    samples = 1 if centers else samples_of(view, config, 1.0 if hybrid else fraction)
-    ramp = None if hybrid else ramp_of(config, fraction)
-    rendered = render_view(state, view, target.background, samples, ramp)
+    state: State, numbered: tuple[int, View], step: int, plan: Plan, target: Target, loss: Loss
+) -> ViewGradients:
+    """Loss and gradients of the training view ``numbered``. DivergenceError if they are not finite."""
+    config, (index, view) = state.config, numbered
+    options = tape_options(state, target.background, plan)
+    rendered = RenderedView(state.tape(view.camera, options), state.mesh.blending == "linear")
     image = rendered.color
     if state.exposures is not None:
         exposure = state.exposures[index]
         image = image * exposure[GAIN] + exposure[OFFSET]
-    loss, grad_image = loss_of(image, target, config, state.threads)
-    if not np.isfinite(loss):
+    if isinstance(loss, DefaultLoss):
+        value, grad_image = loss(image, target)
+    else:
+        value, grad_image = own_loss(loss, image, target)
+        if np.isfinite(value) and not np.isfinite(grad_image).all():
+            raise _divergence(step, view, f"the gradient of the loss {loss_name(loss)}")
+    if not np.isfinite(value):
         raise _divergence(step, view, "the loss")
     grad_exposure = None
     if state.exposures is not None:
         grad_exposure = exposure_gradient(rendered.color, grad_image)
         grad_image = grad_image * exposure[GAIN]
     edges = None
-    # Blended triangles in front of an edge are neglected: they are few.
-    if follows_edges(config, 1.0 if hybrid else fraction) and not (hybrid and centers):
+    if plan.edges is not None:
         edges = edge_gradients(
             replace(state.mesh, vertices=state.vertices, colors=state.colors),
             view.camera,
-            SOLID if hybrid else config.cutoff,
+            plan.edges,
             grad_image,
             background=target.background,
             beyond=state.beyond,
             threads=state.threads,
         )
-    expected, share = None, 0.0 if hybrid else expected_share(config, fraction)
+    expected, share = None, plan.expected
     if share:
         expected = expected_error(target.color, target.mask, config, share)
         grad_image = grad_image * np.float32(1 - share)
@@ -270,30 +225,20 @@ def view_gradients(
         np.add(gradients.vertices, edges, out=gradients.vertices)
     if not gradients.finite():
         raise _divergence(step, view, "a gradient")
-    return ViewGradients(loss, gradients, edges is not None)
+    return ViewGradients(value, gradients, edges is not None)
 
 
-def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float | None:
-    """``make_step`` where the loss and Adam are on the GPU, too."""
-    config = state.config
-    points = uses_point_targets(view, config, fraction)
-    target = target_of(view, config, step, points)
-    mask = target.mask
-    if mask is not None and not mask.any():
-        return None
-    samples = 1 if points else samples_of(view, config, fraction)
-    rates = learning_rates(config, step, fraction)
-    loss_by = loss_rates(config, target)
-    settings = DrawSettings(
-        samples=samples,
-        min_transmittance=TRAINING_MIN_TRANSMITTANCE["display"],
-        filter_px2=state.mesh.filter_px2,
-    )
-    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, loss_by[:3], rates)
-    loss = loss_by.loss(*sums[:3])
-    if not (np.isfinite(loss) and sums.finite):
-        raise _divergence(step, view, "a gradient" if np.isfinite(loss) else "the loss")
-    return loss
+def _whole_step(
+    state: State, steps: WholeSteps, view: View, step: int, plan: Plan, target: Target, loss: DefaultLoss
+) -> float:
+    """``make_step`` where the loss and Adam are with the image, too."""
+    image = StepImage(view.camera, tape_options(state, target.background, plan), target.color, target.mask)
+    by_sums = loss.rates(target)
+    sums = state.whole_step(steps, image, by_sums, Rates(plan.color_rate, plan.position_rate))
+    value = by_sums.loss(*sums[:3])
+    if not (np.isfinite(value) and sums.finite):
+        raise _divergence(step, view, "a gradient" if np.isfinite(value) else "the loss")
+    return value
 
 
 def _divergence(step: int, view: View, culprit: str) -> DivergenceError:

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from ctypes import c_double
 from dataclasses import dataclass, field
-from typing import Literal, get_args
 
 import numpy as np
 
 from meshsplats._core import library, structures
 from meshsplats._kinds import need
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, Triangles, checked_cutoff, checked_filter
-
-MAX_SAMPLES = 16
-"""Largest side of the grid of samples in each pixel."""
-
-Device = Literal["cpu", "gpu"]
-"""Where meshes are rendered: by the compiled core, or on a GPU by WebGPU."""
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
+from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
+from meshsplats.rendering.devices import engine
+from meshsplats.rendering.engine import Device, ImageOptions, check_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,19 +113,15 @@ def render(
     need(Camera, camera=camera)
     check_device(device)
     camera = camera.with_near_plane(mesh.vertices)
-    keep = Pointers()
-    options = checked_options(keep, camera, background, samples, threads)
+    checked_options(Pointers(), camera, background, samples, threads)
     if max_layers is not None and not (
         isinstance(max_layers, (int, np.integer)) and 1 <= max_layers <= np.iinfo(np.int32).max
     ):
         raise ValueError(f"max_layers must be a whole number from 1 to 2^31 - 1, got {max_layers!r}")
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
-    options.max_layers = int(max_layers or 0)
     if cutoff is not None:
-        options.cutoff = checked_cutoff(cutoff)
-    options.min_transmittance = min_transmittance
-
+        cutoff = checked_cutoff(cutoff)
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
     values, widths = None, {}
     if attributes:
@@ -155,42 +146,21 @@ def render(
             start += width
         return parts
 
-    if device == "gpu":
-        from meshsplats.webgpu.frames import DrawSettings
-        from meshsplats.webgpu.renderer import draw
-
-        settings = DrawSettings(
-            samples=options.samples,
-            max_layers=options.max_layers,
-            min_transmittance=options.min_transmittance,
-            cutoff=options.cutoff,
-            filter_px2=px2,
-        )
-        drawn = draw(mesh, camera, settings, depth=depth, normals=normals, values=values)
-        backdrop = np.asarray(background, np.float32)
-        return Rendering(
-            drawn.color + drawn.transmittance[:, :, None] * backdrop,
-            1 - drawn.transmittance,
-            drawn.depth,
-            drawn.normals,
-            named(drawn.values),
-            drawn.work.fragments,
-        )
-    struct = mesh_struct(keep, mesh.triangles._replace(values=values, filter_px2=px2))
-    h, w = camera.height, camera.width
-    color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
-    depths = np.empty((h, w), np.float32) if depth else None
-    directions = np.empty((h, w, 3), np.float32) if normals else None
-    sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
-    image = structures.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
-    library.call("ms_render_mesh", struct, camera_struct(camera), options, image)
-    return Rendering(color, alpha, depths, directions, named(sums), int(image.fragments))
-
-
-def check_device(device: str) -> None:
-    """ValueError for a device that does not exist."""
-    if device not in get_args(Device):
-        raise ValueError(f"device must be {' or '.join(map(repr, get_args(Device)))}, got {device!r}")
+    options = ImageOptions(
+        background,
+        int(samples),
+        max_layers=int(max_layers or 0),
+        min_transmittance=min_transmittance,
+        filter_px2=px2,
+        cutoff=cutoff,
+        depth=depth,
+        normals=normals,
+        values=values,
+    )
+    drawn = engine(device, threads).render(mesh, camera, options)
+    return Rendering(
+        drawn.color, drawn.alpha, drawn.depth, drawn.normals, named(drawn.values), drawn.fragments
+    )
 
 
 def render_splats(
@@ -256,85 +226,3 @@ def render_splats(
     image = structures.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
     library.call("ms_render_splats", splats, camera_struct(camera), options, image)
     return Rendering(color, alpha, fragments=int(image.fragments))
-
-
-class Pointers:
-    """Gives the core pointers to arrays, and keeps the arrays alive as long as itself."""
-
-    def __init__(self) -> None:
-        self._arrays: list[np.ndarray] = []
-
-    def __call__(self, array: np.ndarray | None) -> int | None:
-        if array is not None:
-            self._arrays.append(array)
-        return library.pointer(array)
-
-
-def mesh_struct(keep: Pointers, triangles: Triangles) -> structures.MeshStruct:
-    """The core's structure of ``triangles``, whose arrays ``keep`` holds.
-
-    Raises ValueError for a filter that is out of range or has no splats.
-    """
-    values = triangles.values
-    width = 0 if values is None else values.shape[1]
-    return structures.MeshStruct(
-        vertex_count=len(triangles.vertices),
-        face_count=len(triangles.faces),
-        vertices=keep(triangles.vertices),
-        colors=keep(triangles.colors),
-        faces=keep(triangles.faces),
-        face_splat=keep(triangles.face_splat),
-        depth_group=keep(compact_groups(triangles.depth_group)),
-        normals=keep(triangles.normals),
-        attributes=keep(values if width else None),
-        attribute_count=width,
-        filter_px2=checked_filter(triangles.filter_px2, triangles.face_splat),
-    )
-
-
-def camera_struct(camera: Camera) -> structures.CameraStruct:
-    """``camera``, which has a near plane, for the core."""
-    assert camera.near is not None
-    rows = (c_double * 12)(*camera.world_to_camera[:3].ravel())
-    return structures.CameraStruct(
-        rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
-    )
-
-
-def checked_options(
-    keep: Pointers,
-    camera: Camera,
-    background: Sequence[float] | np.ndarray,
-    samples: int,
-    threads: int | None,
-) -> structures.OptionsStruct:
-    if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
-        raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
-    if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
-        raise ValueError(f"threads must be at least 1, got {threads!r}")
-    backdrop = np.ascontiguousarray(background, np.float32)
-    if backdrop.shape not in ((3,), (camera.height, camera.width, 3)):
-        raise ValueError(
-            f"background must have shape (3,) or ({camera.height}, {camera.width}, 3), got {backdrop.shape}"
-        )
-    if not np.isfinite(backdrop).all():
-        raise ValueError("background must be finite")
-    assert max(camera.width, camera.height) <= MAX_SIDE
-    return structures.OptionsStruct(
-        samples=int(samples),
-        max_layers=0,
-        threads=min(int(threads) if threads else library.processors(), 256),
-        min_transmittance=0,
-        background=keep(backdrop),
-        background_per_pixel=backdrop.ndim == 3,
-        cutoff=-1,
-    )
-
-
-def compact_groups(depth_group: np.ndarray | None) -> np.ndarray | None:
-    """The same groups, indexed without gaps, so that tables over them are no larger than the mesh."""
-    if depth_group is None or not len(depth_group) or depth_group.max() < len(depth_group):
-        return depth_group
-    values, indices = np.unique(depth_group, return_inverse=True)
-    shift = int(values[0] == -1)
-    return np.ascontiguousarray(indices.reshape(-1) - shift, np.int32)

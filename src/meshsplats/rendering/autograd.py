@@ -11,8 +11,9 @@ from meshsplats._kinds import need_all
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.mesh import MIN_TRANSMITTANCE
-from meshsplats.rendering.api import Device, check_device
-from meshsplats.rendering.backward import TAPE_BYTES
+from meshsplats.rendering.backward import TAPE_BYTES, TapeOptions
+from meshsplats.rendering.devices import engine
+from meshsplats.rendering.engine import Device
 
 if TYPE_CHECKING:
     import torch
@@ -87,7 +88,7 @@ def rasterize(
         MissingDependencyError: no GPU, or no library for it.
         DeviceError: the GPU failed, or did not finish.
     """
-    check_device(device)
+    drawing = engine(device, threads)
     if not isinstance(cameras, Camera):
         need_all(Camera, cameras=cameras)
     try:
@@ -114,8 +115,8 @@ def rasterize(
         background,
         world_to_camera,
         Scene(views, faces, face_splat, depth_group, filter_px2),
-        dict(samples=samples, min_transmittance=min_transmittance, threads=threads),
+        TapeOptions(samples=samples, min_transmittance=min_transmittance),
+        drawing,
         tape_bytes,
-        device,
     )
     return Raster(*((part[0] for part in images) if single else images))

@@ -12,12 +12,7 @@ import numpy as np
 from meshsplats._core import library, structures
 from meshsplats.camera import Camera
 from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_cutoff
-from meshsplats.rendering.api import (
-    Pointers,
-    camera_struct,
-    checked_options,
-    mesh_struct,
-)
+from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options, mesh_struct
 
 TAPE_BYTES = 128 << 20
 """Largest size of the tape of one image, which takes about two bytes a fragment. The backward pass renders
@@ -65,6 +60,19 @@ class ExpectedError(NamedTuple):
     """(h, w) float32 weight of the loss in each pixel, which counts the mean over its samples."""
 
 
+@dataclass(frozen=True, eq=False)
+class TapeOptions:
+    """Options of an image with a backward pass, as in ``render``."""
+
+    background: Sequence[float] | np.ndarray = (1, 1, 1)
+    samples: int = 1
+    min_transmittance: float = MIN_TRANSMITTANCE
+    pose: np.ndarray | None = None
+    """(4, 4) float64 world to camera, overrides that of the camera."""
+    ramp: OpacityRamp | None = None
+    """Changes opacities."""
+
+
 class TapedRendering:
     """The image that ``render`` gives, with a tape of the blended fragments for the backward pass."""
 
@@ -72,12 +80,8 @@ class TapedRendering:
         self,
         triangles: Triangles,
         camera: Camera,
+        options: TapeOptions | None = None,
         *,
-        background: Sequence[float] | np.ndarray = (1, 1, 1),
-        world_to_camera: np.ndarray | None = None,
-        samples: int = 1,
-        min_transmittance: float = MIN_TRANSMITTANCE,
-        ramp: OpacityRamp | None = None,
         threads: int | None = None,
         tape_bytes: int | None = TAPE_BYTES,
     ) -> None:
@@ -87,24 +91,25 @@ class TapedRendering:
             triangles: the mesh. Its arrays are kept, not copied, and must not change before ``backward``;
                 normals are not used.
             camera: viewpoint, lens and size of the image.
-            background, samples, min_transmittance, threads: as in ``render``.
-            world_to_camera: (4, 4) float64, overrides the camera's.
-            ramp: changes opacities; none by default.
+            options: those of ``TapeOptions()`` by default.
+            threads: at most this many; all processors by default.
             tape_bytes: limit on the size of the tape; None: no tape and no backward pass, which is faster.
 
         Raises ValueError for options out of range, and MemoryError where the scene does not fit.
         """
+        options = options or TapeOptions()
+        ramp, pose = options.ramp, options.pose
         self._tape = ctypes.c_void_p()
         keep = self._pointers = Pointers()
-        self._options = checked_options(keep, camera, background, samples, threads)
-        self._options.min_transmittance = min_transmittance
+        self._options = checked_options(keep, camera, options.background, options.samples, threads)
+        self._options.min_transmittance = options.min_transmittance
         if ramp is not None:
             self._options.cutoff, self._options.ramp_height = ramp.cutoff, ramp.height
             self._options.ramp_slope, self._options.ramp_leak = ramp.slope, ramp.leak
-            self._options.ramp_width = ramp.width * samples
-        self._camera = camera_struct(camera.with_near_plane(triangles.vertices, world_to_camera))
-        if world_to_camera is not None:
-            self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
+            self._options.ramp_width = ramp.width * options.samples
+        self._camera = camera_struct(camera.with_near_plane(triangles.vertices, pose))
+        if pose is not None:
+            self._camera.world_to_camera = (ctypes.c_double * 12)(*pose[:3].ravel())
         self._mesh = mesh_struct(keep, triangles._replace(normals=None))
         width = self._mesh.attribute_count
         h, w = camera.height, camera.width
@@ -187,29 +192,3 @@ class TapedRendering:
             image_gradients,
             vertex_gradients,
         )
-
-    def scatter_to_vertices(self, values: np.ndarray) -> np.ndarray:
-        """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) over the pixels, with the weights
-        by which the vertex is blended into them.
-
-        For renderings with k attributes, whose own values do not matter: a weight is the derivative of a
-        pixel's attribute with respect to the vertex's.
-        """
-        mesh = self._mesh
-        sums = np.zeros((mesh.vertex_count, mesh.attribute_count), np.float32)
-        self.backward(
-            np.zeros_like(self.color),
-            None,
-            np.ascontiguousarray(values, np.float32),
-            vertices=np.zeros((mesh.vertex_count, 3), np.float32),
-            colors=np.zeros((mesh.vertex_count, 4), np.float32),
-            vertex_attributes=sums,
-        )
-        return sums
-
-
-def visible_pixels(triangles: Triangles, camera: Camera, *, threads: int | None = None) -> np.ndarray:
-    """(v,) float32 visible pixels of each vertex: sums of its blending weights over the image."""
-    blank = np.zeros((len(triangles.vertices), 1), np.float32)
-    rendering = TapedRendering(triangles._replace(values=blank), camera, threads=threads)
-    return rendering.scatter_to_vertices(np.ones_like(rendering.attributes))[:, 0]

@@ -12,7 +12,8 @@ from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import Device, Rendering, render, render_splats
+from meshsplats.rendering.api import Rendering, render, render_splats
+from meshsplats.rendering.engine import Device
 from meshsplats.rendering.samples import needed_samples
 
 Look = Literal["area", "splats"]

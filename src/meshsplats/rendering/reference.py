@@ -1,6 +1,7 @@
 """The executable specification of :mod:`meshsplats.rendering`: slow, in float64, written to be read.
 
-``render`` and ``render_splats`` here define a correct image; the compiled core is tested against them.
+``render`` here and ``reference_splats.render_splats`` define a correct image; the compiled core is tested
+against them.
 Nothing is culled, binned or bounded: every triangle and every splat is tried at every sample, so the cost is
 their product (about a second for 2,000 triangles on 64 x 64 samples).
 """
@@ -14,16 +15,14 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
 from meshsplats.rendering.api import Rendering
-
-SPLAT_MIN_ALPHA = 1 / 255
-"""Splats fainter than this at a sample are left out there, as in 3DGS."""
-SPLAT_MAX_ALPHA = 0.99
-"""No splat is more opaque than this at a sample, as in 3DGS."""
-SPLAT_MIN_TRANSMITTANCE = 1e-4
-"""A sample terminates before the splat that would leave less transmittance than this, as in 3DGS."""
+from meshsplats.rendering.reference_samples import (
+    checked_background,
+    pixel_means,
+    sample_positions,
+    to_camera,
+)
 
 FILTER_MIN_VARIANCE = 1e-4
 """The filter takes no fan to have a smaller variance than this share of its own."""
@@ -68,15 +67,15 @@ def render(
 
     Raises ValueError for options out of range, a background of another shape, or a missing attribute.
     """
-    backdrop = _checked_background(background, camera)
+    backdrop = checked_background(background, camera)
     if max_layers is not None and not (max_layers == int(max_layers) and max_layers >= 1):
         raise ValueError(f"max_layers must be a whole number from 1 on, or None for all, got {max_layers}")
     if unknown := [name for name in attributes if name not in mesh.attributes]:
         present = ", ".join(mesh.attributes) or "none"
         raise ValueError(f"the mesh has no attribute {unknown[0]!r}; it has {present}")
-    x, y = _sample_positions(camera, samples)
+    x, y = sample_positions(camera, samples)
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
-    sheet = _fragments(mesh, camera, x, y, px2)
+    sheet = fragments_of(mesh, camera, x, y, px2)
     corners = mesh.faces[sheet.face]
 
     def interpolated(values: np.ndarray) -> np.ndarray:
@@ -95,9 +94,9 @@ def render(
         sums = np.empty((len(x), values.shape[1]))
         for channel, value in enumerate(values.T):
             sums[:, channel] = np.bincount(sheet.sample, share * value, minlength=len(x))
-        return _pixel_means(sums, camera, samples)
+        return pixel_means(sums, camera, samples)
 
-    through = _pixel_means(transmittance[:, None], camera, samples)
+    through = pixel_means(transmittance[:, None], camera, samples)
     extra = {}
     for name in attributes:
         values = mesh.attributes[name]
@@ -111,67 +110,6 @@ def render(
         attributes=extra,
         fragments=int(np.count_nonzero(share)),
     )
-
-
-def render_splats(
-    cloud: GaussianCloud,
-    camera: Camera,
-    *,
-    background: Sequence[float] | np.ndarray = (1, 1, 1),
-    samples: int = 1,
-    sh_degree: int | None = None,
-    dilation: float = 0.3,
-) -> Rendering:
-    """The image of splats as 3D Gaussian Splatting draws it (Kerbl et al. 2023). Arrays are float64.
-
-    Splats are blended front to back in the order of the depth z of their centres, equal depths by index;
-    those with a centre nearer than the near plane are left out. ``dilation`` (square pixels for any
-    ``samples``) widens every projected splat; for the kernel '2dgs', 5/3 of it is the least variance.
-    ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
-
-    Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is
-    drawn wherever its alpha reaches 1/255.
-
-    Raises ValueError for options out of range or a background of another shape.
-    """
-    backdrop = _checked_background(background, camera)
-    if sh_degree is not None and not (sh_degree == int(sh_degree) and sh_degree >= 0):
-        raise ValueError(f"sh_degree must be a whole number from 0 on, or None for all, got {sh_degree}")
-    if not (np.isfinite(dilation) and dilation >= 0):
-        raise ValueError(f"dilation must be >= 0, got {dilation}")
-    camera = camera.with_near_plane(cloud.means)
-    x, y = _sample_positions(camera, samples)
-    rgb = splat_colors(cloud, camera, cloud.sh_degree if sh_degree is None else int(sh_degree))
-    opacities = cloud.opacities.astype(np.float64)
-    centers = _to_camera(cloud.means, camera)
-    in_front = np.flatnonzero(centers[:, 2] >= (camera.near or 0))
-    nearest_first = in_front[np.argsort(centers[in_front, 2], kind="stable")]
-    # Columns are the splat's own axes in the camera's frame.
-    axes = camera.world_to_camera[:3, :3] @ _rotations(cloud)
-    scales = cloud.scales.astype(np.float64)
-
-    color, transmittance = np.zeros((len(x), 3)), np.ones(len(x))
-    unfinished = np.ones(len(x), bool)
-    fragments = 0
-    for i in nearest_first:
-        if cloud.kernel == "2dgs":
-            falloff = _flat_falloff(centers[i], axes[i], scales[i], camera, x, y, dilation)
-        else:
-            falloff = _projected_falloff(centers[i], axes[i], scales[i], camera, x, y, dilation, cloud.kernel)
-        alpha = np.minimum(SPLAT_MAX_ALPHA, opacities[i] * falloff)
-        drawn = unfinished & (alpha >= SPLAT_MIN_ALPHA)
-        after = transmittance * (1 - alpha)
-        unfinished &= ~(drawn & (after < SPLAT_MIN_TRANSMITTANCE))
-        drawn &= unfinished
-        color[drawn] += (transmittance * alpha)[drawn, None] * rgb[i]
-        transmittance[drawn] = after[drawn]
-        fragments += int(drawn.sum())
-    through = _pixel_means(transmittance[:, None], camera, samples)
-    mean = _pixel_means(color, camera, samples)
-    return Rendering(color=mean + through * backdrop, alpha=1 - through[..., 0], fragments=fragments)
-
-
-# Samples and pixels
 
 
 VIEWER_SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
@@ -194,9 +132,9 @@ def viewer_images(
     and opacity, cut to [0, 1], are those of the plane of the triangle at the centre of the pixel.
     """
     positions = VIEWER_SAMPLES if multisample else ((0.5, 0.5),)
-    middle_x, middle_y = _sample_positions(camera, 1)
+    middle_x, middle_y = sample_positions(camera, 1)
     near = camera.near_plane(mesh.vertices)
-    corners = _to_camera(mesh.vertices, camera)
+    corners = to_camera(mesh.vertices, camera)
     corners[:, 0] = camera.fx * corners[:, 0] + camera.cx * corners[:, 2]
     corners[:, 1] = camera.fy * corners[:, 1] + camera.cy * corners[:, 2]
     corners = corners[mesh.faces]
@@ -229,44 +167,8 @@ def viewer_images(
     return color.mean(axis=1).reshape(len(cutoffs), camera.height, camera.width, 3) / 255
 
 
-def _checked_background(background: Sequence[float] | np.ndarray, camera: Camera) -> np.ndarray:
-    array = np.asarray(background, np.float64)
-    if array.shape not in ((3,), (camera.height, camera.width, 3)):
-        raise ValueError(
-            f"background must have shape (3,) or ({camera.height}, {camera.width}, 3), got {array.shape}"
-        )
-    return array
-
-
-def _sample_positions(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (n,) in pixels of all samples, row by row: pixel centres where ``samples`` is 1."""
-    if not (samples == int(samples) and samples >= 1):
-        raise ValueError(f"samples must be a whole number from 1 on, got {samples}")
-    across = (np.arange(camera.width * samples) + 0.5) / samples
-    down = (np.arange(camera.height * samples) + 0.5) / samples
-    y, x = np.meshgrid(down, across, indexing="ij")
-    return x.ravel(), y.ravel()
-
-
-def _pixel_means(values: np.ndarray, camera: Camera, samples: int) -> np.ndarray:
-    """(h, w, c) means over the samples of each pixel of ``values`` (n, c)."""
-    grid = values.reshape(camera.height, samples, camera.width, samples, values.shape[1])
-    return grid.mean(axis=(1, 3))
-
-
-def _to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(n, 3) world points in the camera's frame."""
-    columns = camera.world_to_camera[:3].T
-    x, y, z = points.astype(np.float64).T[:, :, None]
-    # Summed term by term so that a point's rounding does not depend on its row.
-    return x * columns[0] + y * columns[1] + z * columns[2] + columns[3]
-
-
-# Triangles
-
-
 @dataclass
-class _Fragments:
+class Fragments:
     """n fragments, triangles at samples; sorted by sample, then nearest first, then face."""
 
     sample: np.ndarray
@@ -319,10 +221,10 @@ def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) ->
     return result
 
 
-def _fragments(
+def fragments_of(
     mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray, filter_px2: float = 0.0
-) -> _Fragments:
-    points = _to_camera(mesh.vertices, camera)
+) -> Fragments:
+    points = to_camera(mesh.vertices, camera)
     if filter_px2:
         points = filtered(points, mesh, camera, filter_px2)
     # Pixel space before the division by z: a point (X, Y, Z) is seen at (X / Z, Y / Z) pixels.
@@ -335,14 +237,14 @@ def _fragments(
     near = camera.near_plane(mesh.vertices)
     covers = [_cover(*triangle, x, y, near) for triangle in zip(corners, edges, determinants, strict=True)]
     if not covers:
-        return _Fragments(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
+        return Fragments(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
     sample, depth, weights = (np.concatenate(parts) for parts in zip(*covers, strict=True))
     face = np.repeat(np.arange(len(covers)), [len(cover[0]) for cover in covers])
     nearness = 1 / depth
     if mesh.depth_group is not None:
         _share_depths(mesh, homogeneous, near, sample, face, nearness, x, y)
     order = np.lexsort((face, -nearness, sample))
-    return _Fragments(sample[order], face[order], depth[order], weights[order])
+    return Fragments(sample[order], face[order], depth[order], weights[order])
 
 
 def _edge_functions(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -415,7 +317,7 @@ def _share_depths(
 
 
 def _front_to_back(
-    sheet: _Fragments, alpha: np.ndarray, count: int, max_layers: int | None, min_transmittance: float
+    sheet: Fragments, alpha: np.ndarray, count: int, max_layers: int | None, min_transmittance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """T_k a_k of every fragment (0 where it is not blended), and the final T of each of ``count`` samples."""
     share, transmittance = np.zeros(len(alpha)), np.ones(count)
@@ -437,7 +339,7 @@ def _front_to_back(
 
 
 def _facing_normals(
-    mesh: SplatMesh, camera: Camera, sheet: _Fragments, x: np.ndarray, y: np.ndarray
+    mesh: SplatMesh, camera: Camera, sheet: Fragments, x: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
     """(n, 3) unit normals in the world frame that face the camera; 0 where the mesh has none."""
     corners = mesh.faces[sheet.face]
@@ -451,134 +353,3 @@ def _facing_normals(
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
     away = np.einsum("nc,nc->n", normals, rays[sheet.sample] @ camera.world_to_camera[:3, :3]) > 0
     return np.where(away[:, None], -normals, normals)
-
-
-# Splats
-
-
-def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(n, (degree + 1)^2) real spherical harmonics, degree 0 to 3, of unit ``directions`` (n, 3).
-
-    Orthonormal on the sphere, ordered by degree l and then order m = -l .. l, with the Condon-Shortley sign
-    (-1)^m: the convention of splat files.
-
-    Raises ValueError for another degree.
-    """
-    if not 0 <= degree <= 3:
-        raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-
-    def norm(numerator: int, denominator: int) -> float:
-        return float(np.sqrt(numerator / (denominator * np.pi)))
-
-    basis = [
-        np.full(len(x), norm(1, 4)),
-        -norm(3, 4) * y,
-        norm(3, 4) * z,
-        -norm(3, 4) * x,
-        norm(15, 4) * x * y,
-        -norm(15, 4) * y * z,
-        norm(5, 16) * (2 * zz - xx - yy),
-        -norm(15, 4) * x * z,
-        norm(15, 16) * (xx - yy),
-        -norm(35, 32) * y * (3 * xx - yy),
-        norm(105, 4) * x * y * z,
-        -norm(21, 32) * y * (4 * zz - xx - yy),
-        norm(7, 16) * z * (2 * zz - 3 * xx - 3 * yy),
-        -norm(21, 32) * x * (4 * zz - xx - yy),
-        norm(105, 16) * z * (xx - yy),
-        -norm(35, 32) * x * (xx - 3 * yy),
-    ]
-    return np.stack(basis[: (degree + 1) ** 2], axis=1)
-
-
-def splat_colors(cloud: GaussianCloud, camera: Camera, degree: int) -> np.ndarray:
-    """(n, 3) RGB of every splat seen from the camera: max(0, 0.5 + SH), direction camera centre to splat.
-
-    ``degree`` is limited to the stored one. As in 3DGS, there is no upper limit to colours, but for those of
-    degree 0 alone: they are ``cloud.colors``, at most 1, as a vertex can hold them.
-    """
-    degree = min(degree, cloud.sh_degree)
-    directions = cloud.means.astype(np.float64) - camera.center
-    length = np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = np.divide(directions, length, out=np.zeros_like(directions), where=length > 0)
-    basis = sh_basis(directions, degree)
-    sh = cloud.sh[:, : basis.shape[1]].astype(np.float64)
-    return np.clip(0.5 + np.einsum("nk,nkc->nc", basis, sh), 0, 1 if degree == 0 else None)
-
-
-def _rotations(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 3, 3) rotation matrices; columns are the splat's own axes in the world frame."""
-    w, x, y, z = cloud.quaternions.astype(np.float64).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _projected_falloff(
-    center: np.ndarray,
-    axes: np.ndarray,
-    scales: np.ndarray,
-    camera: Camera,
-    x: np.ndarray,
-    y: np.ndarray,
-    dilation: float,
-    kernel: str,
-) -> np.ndarray:
-    """exp(-d^T cov^-1 d / 2) of one splat at all samples, with its covariance in the image.
-
-    The projection is linearised at the centre (EWA, Zwicker et al. 2001). Where that is far outside the
-    image the Jacobian is taken at 1.3 times the half field of view, as in 3DGS; a principal point off the
-    middle moves these limits with it: 0.3 times the half field of view beyond each side of the image. For the
-    kernel 'antialiased' the values are scaled to keep the integral that they had before the dilation.
-    """
-    tan_x, tan_y = center[0] / center[2], center[1] / center[2]
-    beyond_x, beyond_y = 0.3 * camera.width / (2 * camera.fx), 0.3 * camera.height / (2 * camera.fy)
-    u = np.clip(tan_x, -camera.cx / camera.fx - beyond_x, (camera.width - camera.cx) / camera.fx + beyond_x)
-    v = np.clip(tan_y, -camera.cy / camera.fy - beyond_y, (camera.height - camera.cy) / camera.fy + beyond_y)
-    jacobian = np.array([[camera.fx, 0, -camera.fx * u], [0, camera.fy, -camera.fy * v]]) / center[2]
-    projected_axes = jacobian @ (axes * scales)
-    sharp = projected_axes @ projected_axes.T
-    cov = sharp + dilation * np.eye(2)
-    determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
-    if determinant <= 0:  # edge on and not widened
-        return np.zeros_like(x)
-    dx, dy = x - (camera.fx * tan_x + camera.cx), y - (camera.fy * tan_y + camera.cy)
-    power = (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / determinant
-    falloff = np.exp(-0.5 * np.maximum(0, power))  # below 0 by rounding only
-    if kernel == "antialiased":
-        falloff *= np.sqrt(max(0.0, sharp[0, 0] * sharp[1, 1] - sharp[0, 1] ** 2) / determinant)
-    return falloff
-
-
-def _flat_falloff(
-    center: np.ndarray,
-    axes: np.ndarray,
-    scales: np.ndarray,
-    camera: Camera,
-    x: np.ndarray,
-    y: np.ndarray,
-    dilation: float,
-) -> np.ndarray:
-    """exp(-rho / 2) of one flat splat at all samples, rho = min(rho3d, rho2d) (2DGS, Huang et al. 2024).
-
-    rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of
-    the splat's first two axes; it is infinite where that is nearer than the near plane, behind the camera or
-    nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 0.6 / dilation |p - c|^2 (2 in the
-    2DGS code), with p the sample and c the projected centre in pixels, keeps splats that are tiny or seen
-    edge on from falling between the samples.
-    """
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
-    normal = np.cross(axes[:, 0], axes[:, 1])
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        z = (normal @ center) / (rays @ normal)
-        local = (z[:, None] * rays - center) @ axes[:, :2] / scales[:2]
-        rho3d = (local**2).sum(axis=1)
-    rho3d = np.where((z >= (camera.near or 0)) & np.isfinite(rho3d), rho3d, np.inf)
-    dx = x - (camera.fx * center[0] / center[2] + camera.cx)
-    dy = y - (camera.fy * center[1] / center[2] + camera.cy)
-    return np.exp(-0.5 * np.minimum(rho3d, 0.6 / max(dilation, 1e-6) * (dx * dx + dy * dy)))

@@ -26,6 +26,7 @@ except ImportError as error:
 
 from meshsplats.rendering.autograd import Raster
 from meshsplats.rendering.backward import OpacityRamp
+from meshsplats.rendering.reference_samples import sample_positions
 
 
 def rasterize(
@@ -171,17 +172,17 @@ def _image(
     """The image, and (h, w) ``sum_k T_k a_k |c_k|^2``, with the background's."""
     camera = camera.with_near_plane(triangles.vertices, pose.detach().numpy())
     posed = replace(camera, world_to_camera=pose.detach().numpy())
-    x, y = reference._sample_positions(camera, samples)
+    x, y = sample_positions(camera, samples)
     vertices, attributes = vertices.double(), attributes.double()
     faces, face_splat, px2 = triangles.faces, triangles.face_splat, triangles.filter_px2
     mesh = SplatMesh(
         triangles.vertices, faces, triangles.colors, face_splat=face_splat, depth_group=triangles.depth_group
     )
-    sheet = reference._fragments(mesh, posed, x, y, px2)
+    sheet = reference.fragments_of(mesh, posed, x, y, px2)
     sample, face = torch.from_numpy(sheet.sample), torch.from_numpy(sheet.face)
 
     corner = torch.from_numpy(np.asarray(faces, np.int64))[face]
-    # Weights of the corners at each fragment (reference._cover).
+    # Weights of the corners at each fragment (``reference._cover``).
     in_camera = vertices @ pose[:3, :3].T + pose[:3, 3]
     if px2:
         assert face_splat is not None

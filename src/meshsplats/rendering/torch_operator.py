@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,8 +12,8 @@ from meshsplats._kinds import described
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.mesh import Triangles
-from meshsplats.rendering.api import Device
-from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.engine import Engine, Taped
 
 try:
     import torch
@@ -41,9 +42,9 @@ class _Constant(NamedTuple):
     cameras: list[Camera]
     triangles: Triangles
     """Without positions and colours, which are tensors."""
-    options: dict[str, Any]
+    options: TapeOptions
+    engine: Engine
     tape_bytes: int
-    device: Device
 
 
 def images_of(
@@ -52,9 +53,9 @@ def images_of(
     background: Sequence[float] | np.ndarray | torch.Tensor,
     poses: torch.Tensor | None,
     scene: Scene,
-    options: dict[str, Any],
+    options: TapeOptions,
+    engine: Engine,
     tape_bytes: int,
-    device: Device,
 ) -> Images:
     """The images of ``rasterize``.
 
@@ -93,8 +94,8 @@ def images_of(
             filter_px2=scene.filter_px2,
         ),
         options,
+        engine,
         tape_bytes,
-        device,
     )
     inputs = (vertices, attributes, backdrop, poses)
     if torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in inputs):
@@ -109,7 +110,7 @@ def _forward(
     background: torch.Tensor,
     poses: torch.Tensor | None,
     constant: _Constant,
-    tapes: list[AnyRendering] | None,
+    tapes: list[Taped] | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Colour, alpha and attributes of the images; appends the renderings to ``tapes``, where there is one."""
     values = attributes.detach()
@@ -121,14 +122,13 @@ def _forward(
     backdrop = background.detach().numpy()
     images = []
     for i, camera in enumerate(constant.cameras):
-        rendering = taped_rendering(
-            constant.device,
-            triangles,
-            camera,
+        options = replace(
+            constant.options,
             background=backdrop[i] if backdrop.ndim == 4 else backdrop,
-            world_to_camera=None if poses is None else poses[i].detach().double().numpy(),
-            tape_bytes=None if tapes is None else constant.tape_bytes,
-            **constant.options,
+            pose=None if poses is None else poses[i].detach().double().numpy(),
+        )
+        rendering = constant.engine.tape(
+            triangles, camera, options, tape_bytes=None if tapes is None else constant.tape_bytes
         )
         images.append((rendering.color, rendering.alpha, rendering.attributes))
         if tapes is not None:

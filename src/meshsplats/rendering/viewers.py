@@ -10,7 +10,7 @@ from meshsplats._core import kernels
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb
 from meshsplats.mesh import SplatMesh, checked_cutoff
-from meshsplats.rendering.api import Pointers, camera_struct, checked_options
+from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
 
 
 def viewer_images(

@@ -13,7 +13,9 @@ from meshsplats.datasets.views import View
 from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, samples_of
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.devices import engine
+from meshsplats.rendering.engine import scatter_to_vertices
 
 JUDGED_VIEWS = 20
 """Maximum number of training views, evenly spread, in which fans are judged."""
@@ -60,17 +62,14 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
     all_pixels, clear_pixels = np.zeros(n), np.zeros(n)
     in_view = np.zeros(n, bool)
     triangles = mesh.triangles._replace(values=np.zeros((len(mesh.vertices), 3), np.float32))
+    drawing = engine(state.device, state.threads)
     step = -(-len(views) // JUDGED_VIEWS)
     for index in range(turn % step, len(views), step):
         view = views[index]
-        rendering = TapedRendering(
-            triangles,
-            view.camera,
-            background=view.background,
-            samples=samples_of(view, state.config),
-            min_transmittance=TRAINING_MIN_TRANSMITTANCE[mesh.blending],
-            threads=state.threads,
+        options = TapeOptions(
+            view.background, samples_of(view, state.config), TRAINING_MIN_TRANSMITTANCE[mesh.blending]
         )
+        rendering = drawing.tape(triangles, view.camera, options)
         image = rendering.color
         if state.exposures is not None:
             exposure = state.exposures[index]
@@ -82,7 +81,7 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
             counts[~view.mask] = 0
         alpha = view.alpha
         clear = np.zeros_like(counts) if alpha is None else (1 - alpha) * counts
-        sums = rendering.scatter_to_vertices(np.stack([difference, counts, clear], axis=2))
+        sums = scatter_to_vertices(rendering, np.stack([difference, counts, clear], axis=2))
         error, count, outside = sums.reshape(n, corners, 3).sum(axis=1, dtype=np.float64).T
         total += error
         np.maximum(most, error, out=most)

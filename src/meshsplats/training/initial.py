@@ -16,7 +16,8 @@ from meshsplats.datasets.views import View
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
-from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.engine import scatter_to_vertices
 from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
 from meshsplats.training.patches import Patches, SurfacePoints, merged, sums_around
 from meshsplats.training.stereo import SIDE, WITNESSES, dense_points
@@ -308,7 +309,7 @@ def colored(
     for view in subsample(views, COLOR_VIEWS):
         image = view.load()
         values = np.zeros((len(mesh.vertices), 4), np.float32)
-        rendering = TapedRendering(mesh.triangles._replace(values=values), view.camera, threads=threads)
+        rendering = CpuEngine(threads).tape(mesh.triangles._replace(values=values), view.camera)
         # Colour times alpha, and alpha: mixed pixels on the outline show other things, too.
         alpha = np.ones(image.color.shape[:2], np.float32) if view.alpha is None else view.alpha.copy()
         if image.mask is not None:
@@ -316,7 +317,7 @@ def colored(
         values = np.concatenate([image.over((0, 0, 0)), np.ones_like(alpha)[..., None]], axis=2)
         values[..., 3] = alpha
         values[alpha == 0] = 0
-        sums += rendering.scatter_to_vertices(values)
+        sums += scatter_to_vertices(rendering, values)
     colors = mesh.colors.copy()
     seen = sums[:, 3] > 1e-6
     colors[seen, :3] = np.clip(sums[seen, :3] / sums[seen, 3:], 0, 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,42 +13,28 @@ import numpy as np
 from meshsplats._kinds import need
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
-from meshsplats.datasets.reduced import opaque_views, reduced_views
-from meshsplats.datasets.views import Dataset, ImageCache, View
+from meshsplats.datasets.reduced import reduced_views
+from meshsplats.datasets.views import Dataset, ImageCache
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.finetuning.config import learning_rates
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_bytes, estimate_bytes
-from meshsplats.finetuning.run import Progress, RunOptions, RunStart, TrainingLoop, run_start
-from meshsplats.finetuning.step import view_of_step
+from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.devices import engine
 from meshsplats.training.config import TrainConfig, with_train_changes
-from meshsplats.training.growth import (
-    SHELL,
-    NearFields,
-    corners_of,
-    fan_count,
-    grow,
-    score,
-    select_fans,
-)
+from meshsplats.training.growing import REDUCED_PART, Growing
+from meshsplats.training.growth import SHELL
 from meshsplats.training.hull import carving_bytes
 from meshsplats.training.initial import colored, fans_of, flat_splats, starting_patches
 from meshsplats.training.patches import Patches
-from meshsplats.training.schedule import budget, events_passed, image_factor
 from meshsplats.training.stereo import MATCHING_BYTES
-from meshsplats.webgpu.device import open_device
 
-MISFIT = 3.0
-"""A photograph whose mean loss is this many times the median of all does not fit the others."""
 SHOWN_NAMES = 10
 """Maximum number of such photographs that are named."""
 START, SO_FAR = "start.npz", "mesh.npz"
 """Files in the folder of a run: the fans that it started from, and those at an interruption."""
-REDUCED_PART = 3
-"""Reduced images are kept up to the limit of the image cache divided by this."""
 
 
 def train(
@@ -96,8 +82,7 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
-    if run.device == "gpu":
-        open_device()
+    engine(run.device, run.threads).check()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     if run.resume and journal is not None:
@@ -109,7 +94,10 @@ def train(
     if journal is not None and not run.resume:
         (journal.folder / SO_FAR).unlink(missing_ok=True)
         save_mesh(mesh, journal.folder / START)
-    loop = GrowingLoop(start, dataset, config, run, journal, on_progress)
+    clock, views = start.clock(run), start.dataset.train
+    phase = Growing(config, mesh, views, clock.fraction, run.cache_bytes)
+    loop = TrainingLoop(start, clock, phase, run, on_progress)
+    del start
     try:
         mesh = loop.run()
     except Interrupted:
@@ -118,7 +106,7 @@ def train(
         raise
     if journal is not None:
         (journal.folder / SO_FAR).unlink(missing_ok=True)
-    if names := loop.misfits():
+    if names := phase.misfits(views):
         shown = ", ".join(names[:SHOWN_NAMES]) + (" ..." if len(names) > SHOWN_NAMES else "")
         warnings.warn(
             f"{len(names)} of {len(dataset.train)} photographs do not fit the others: {shown}. Their cameras"
@@ -173,74 +161,3 @@ def _stored_start(journal: Journal) -> SplatMesh:
     if mesh.face_splat is None or not len(mesh.faces):
         raise FileFormatError(f"{path}: not the fans that a training started from")
     return mesh
-
-
-class GrowingLoop(TrainingLoop):
-    """The loop of fine-tuning, on images that become larger, with a set of fans that grows."""
-
-    config: TrainConfig
-
-    def __init__(
-        self,
-        start: RunStart,
-        dataset: Dataset,
-        config: TrainConfig,
-        options: RunOptions,
-        journal: Journal | None,
-        on_progress: Callable[[Progress], None] | None,
-    ) -> None:
-        super().__init__(start, dataset, config, options, journal, on_progress)
-        self._store = ImageCache(options.cache_bytes // REDUCED_PART)
-        self._reduced: dict[float, Sequence[View]] = {}
-        self.first_fans = fan_count(start.mesh)
-        self.near = NearFields.around(self.dataset.train, start.mesh)
-        self.events = events_passed(config, self.fraction)
-        self._loss_sums, self._loss_counts = np.zeros((2, len(dataset.train)))
-
-    def misfits(self) -> list[str]:
-        """Names of the training views whose images the mesh cannot show as it shows the others, judged by
-        the losses since the last growth event. Those of a resumed run since then do not count."""
-        known = np.flatnonzero(self._loss_counts)
-        if not len(known):
-            return []
-        means = self._loss_sums[known] / self._loss_counts[known]
-        return [self.dataset.train[i].name for i in known[means > MISFIT * np.median(means)]]
-
-    def _note(self, step: int, loss: float) -> None:
-        super()._note(step, loss)
-        if self.fraction >= max(self.config.growth_end, self.config.half_share):
-            view = view_of_step(self.config, step, len(self.dataset.train))
-            self._loss_sums[view] += loss
-            self._loss_counts[view] += 1
-
-    def result(self) -> SplatMesh:
-        """The current fans, but those in the near field of a camera."""
-        mesh = replace(super().result(), attributes={})
-        assert mesh.face_splat is not None
-        stray = self.near.contain(mesh)
-        return mesh.take(~stray[mesh.face_splat]) if stray.any() and not stray.all() else mesh
-
-    def _views(self) -> Sequence[View]:
-        factor = image_factor(self.config, self.fraction)
-        if factor not in self._reduced:
-            # With alpha, some steps have a random background: what is opaque must be covered.
-            views = opaque_views(self.dataset.train)
-            self._reduced[factor] = reduced_views(views, factor, self._store)
-        return self._reduced[factor]
-
-    def _adapt(self) -> None:
-        if self.config.shape_decay:
-            # In proportion to the learning rate, as the steps that it is weighed against.
-            color_rate, _ = learning_rates(self.config, self.step - 1, self.fraction)
-            share = self.config.shape_decay * color_rate / self.config.color_rate
-            self.state.round_fans(corners_of(self.state.mesh), min(share, 1.0))
-        # In a run by minutes, a slow step or report may put the fraction back.
-        before, self.events = self.events, max(self.events, events_passed(self.config, self.fraction))
-        if self.events <= before or self._done():
-            return
-        state = self.state
-        stray = self.near.contain(state.result())
-        if stray.any() and not stray.all():
-            state = select_fans(state, np.flatnonzero(~stray))
-        target = budget(self.config, self.events, self.first_fans)
-        self.state = grow(state, score(state, self._views(), self.events), target)

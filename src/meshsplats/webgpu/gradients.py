@@ -6,9 +6,8 @@ docs/webgpu.md describes the kernels.
 from __future__ import annotations
 
 import functools
-import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,18 +16,9 @@ from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.webgpu import kernels
-from meshsplats.webgpu.device import Device, open_device
-from meshsplats.webgpu.frames import (
-    WINDOW_SAMPLES,
-    DrawSettings,
-    MeshFrames,
-    Output,
-    Program,
-    check_size,
-    checked_fans,
-    find_groups,
-    halves,
-)
+from meshsplats.webgpu.device import Device
+from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings, MeshFrames, Output, Program, Work
+from meshsplats.webgpu.layout import check_size, checked_fans, find_groups, halves
 from meshsplats.webgpu.renderer import DRAWING, Images, drawing_pipeline, fits
 
 PAIR_BYTES = 100
@@ -65,15 +55,17 @@ class Window:
 
 
 @dataclass(eq=False)
-class Forward:
-    """A forward pass: its images, and what the backward pass starts from. Its arrays must not change."""
+class Tape:
+    """What the backward pass of an image starts from: the windows whose fragments it marks again. The arrays
+    must not change."""
 
     triangles: Triangles
     camera: Camera
-    pose: np.ndarray | None
     settings: DrawSettings
-    images: Images
-    windows: list[Window]
+    pose: np.ndarray | None = None
+    """(4, 4) float64 world to camera; None: that of the camera."""
+    windows: list[Window] = field(default_factory=list)
+    work: Work = field(default_factory=Work)
 
     def part(self, area: tuple[int, int, int, int]) -> Camera:
         """The camera of a window."""
@@ -114,47 +106,21 @@ def check_limits(device: Device, mesh: SplatMesh) -> None:
         checked_fans(mesh, MAX_FAN)
 
 
-_lock = threading.Lock()
-_last: GradientRenderer | None = None
-_last_arrays: tuple[np.ndarray | None, ...] = ()
-
-
-def gradient_renderer(triangles: Triangles) -> GradientRenderer:
-    """The renderer of ``triangles``, wherever their vertices lie: that of the last call if they are the same.
-    Consecutive triangles of one splat have the same ``face_splat``, which need not ascend."""
-    global _last, _last_arrays
-    device = open_device()
-    faces, face_splat, depth_group = arrays = (
-        triangles.faces,
-        triangles.face_splat,
-        triangles.depth_group,
-    )
+def changing_mesh(triangles: Triangles) -> SplatMesh:
+    """The mesh of a ``GradientRenderer`` for these triangles, wherever their vertices lie. Consecutive
+    triangles of one splat have the same ``face_splat``, which need not ascend."""
+    face_splat, depth_group = triangles.face_splat, triangles.depth_group
+    splat = None
+    if face_splat is not None and len(face_splat):
+        splat = np.cumsum(np.append(0, face_splat[1:] != face_splat[:-1])).astype(np.int32)
     vertices = len(triangles.vertices)
-    with _lock:
-        if (
-            _last is None
-            or _last.device is not device
-            or len(_last.mesh.vertices) != vertices
-            or not all(map(_same, _last_arrays, arrays))
-        ):
-            _last = None  # frees its buffers first
-            splat = None
-            if face_splat is not None and len(face_splat):
-                splat = np.cumsum(np.append(0, face_splat[1:] != face_splat[:-1])).astype(np.int32)
-            blank = SplatMesh(
-                np.zeros((vertices, 3), np.float32),
-                faces.copy(),
-                np.zeros((vertices, 4), np.float32),
-                face_splat=splat,
-                depth_group=None if depth_group is None else depth_group.copy(),
-            )
-            _last = GradientRenderer(device, blank)
-            _last_arrays = tuple(None if part is None else part.copy() for part in arrays)
-        return _last
-
-
-def _same(one: np.ndarray | None, two: np.ndarray | None) -> bool:
-    return one is two or (one is not None and two is not None and np.array_equal(one, two))
+    return SplatMesh(
+        np.zeros((vertices, 3), np.float32),
+        triangles.faces.copy(),
+        np.zeros((vertices, 4), np.float32),
+        face_splat=splat,
+        depth_group=None if depth_group is None else depth_group.copy(),
+    )
 
 
 def _reserve(frames: MeshFrames, camera: Camera, settings: DrawSettings) -> None:
@@ -204,9 +170,9 @@ class GradientRenderer:
         self.frames = MeshFrames(device, mesh, program)
         self.limit = WindowLimit()
         """Of windows, for images without one of their own."""
-        self.marked: Forward | None = None
-        """The forward pass whose only window is marked."""
-        self._loaded: Forward | None = None  # whose positions and colours are on the GPU
+        self.marked: Tape | None = None
+        """The tape whose only window is marked."""
+        self._loaded: Tape | None = None  # whose positions and colours are on the GPU
         frames, counts = self.frames, self.frames.counts
         counts["run_columns"] = min(counts["runs"], ROWS)
         counts["run_rows"] = -(-counts["runs"] // ROWS)
@@ -236,15 +202,18 @@ class GradientRenderer:
         *,
         pose: np.ndarray | None = None,
         limit: WindowLimit | None = None,
-    ) -> Forward:
+    ) -> tuple[Images, Tape]:
         """Renders the mesh with these positions, colours and further values, and finds the windows of its
         tape.
 
         Args:
-            triangles: those of ``gradient_renderer``.
-            camera, settings: as in ``draw``; without ``max_layers`` and ``cutoff``.
+            triangles: those of the mesh, with other positions, colours and values.
+            camera, settings: as in ``MeshRenderer.draw``; without ``max_layers`` and ``cutoff``.
             pose: (4, 4) float64 world to camera, overrides that of the camera.
             limit: of windows; by default that of all images of this renderer that have none.
+
+        Returns:
+            The images, and what ``backward`` takes.
 
         Raises:
             DeviceError: the GPU did not finish.
@@ -256,75 +225,73 @@ class GradientRenderer:
         images = Images(np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32))
         values = triangles.values
         images.values = None if values is None else np.zeros((h, w, values.shape[1]), np.float32)
-        result = Forward(triangles, camera, pose, settings, images, [])
+        tape = Tape(triangles, camera, settings, pose, work=images.work)
         if not len(self.mesh.faces):
-            return result
+            return images, tape
         with self.frames.lock:
-            self._load(result)
+            self._load(tape)
             waiting = [(0, 0, w, h)]
             while waiting:
                 area = waiting.pop()
-                window = self.mark_window(result, area, limit or self.limit)
+                window = self.mark_window(tape, area, limit or self.limit)
                 if window is None:
                     waiting += halves(area)
                     continue
-                result.windows.append(window)
+                tape.windows.append(window)
                 images.work.add(window.tiles, window.counters)
                 part = np.s_[area[1] : area[1] + area[3], area[0] : area[0] + area[2]]
                 pixels = self.frames.read_pixels(area[2], area[3], settings.samples)
                 images.color[part], images.transmittance[part] = pixels[..., :3], pixels[..., 3]
                 if images.values is not None:
-                    self._render_values(result, window, images.values[part])
+                    self._render_values(tape, window, images.values[part])
             images.work.bytes = self.frames.bytes
-        return result
+        return images, tape
 
-    def _render_values(self, forward: Forward, window: Window, out: np.ndarray) -> None:
+    def _render_values(self, tape: Tape, window: Window, out: np.ndarray) -> None:
         """Blends the further values in place of the colours: the fragments and their marks are the same."""
-        for columns, some in _triples(forward):
+        for columns, some in _triples(tape):
             self._load_values(some)
-            self.try_mark(forward, window.area, window.settings)
+            self.try_mark(tape, window.area, window.settings)
             pixels = self.frames.read_pixels(window.area[2], window.area[3], window.settings.samples)
             out[..., columns] = pixels[..., : columns.stop - columns.start]
-        self._load_values(forward.triangles.colors)
+        self._load_values(tape.triangles.colors)
 
-    def _load(self, forward: Forward) -> None:
+    def _load(self, tape: Tape) -> None:
         """Uploads positions and colours."""
         self._loaded, self.marked = None, None
-        self.frames.prepare_filter(forward.settings)
-        self.frames.upload("vertices", forward.triangles.vertices)
-        self.frames.upload("values", forward.triangles.colors)
-        self._load_values(forward.triangles.colors)
+        self.frames.prepare_filter(tape.settings)
+        self.frames.upload("vertices", tape.triangles.vertices)
+        self.frames.upload("values", tape.triangles.colors)
+        self._load_values(tape.triangles.colors)
         if self.frames.counts["groups"]:  # the plane of a group is that of its largest triangle
-            moved = replace(self.mesh, vertices=forward.triangles.vertices)
+            moved = replace(self.mesh, vertices=tape.triangles.vertices)
             largest = find_groups(moved)[1]
             self.frames.write("mesh", largest, 4 * self.frames.offsets[2])
-        self._loaded = forward
+        self._loaded = tape
 
     def _load_values(self, values: np.ndarray) -> None:
         """Uploads what is blended: (v, 4) float32 colours and opacities."""
         self.frames.write("projected", np.ascontiguousarray(values), self.values_at)
 
-    def mark_window(
-        self, forward: Forward, area: tuple[int, int, int, int], limit: WindowLimit
-    ) -> Window | None:
+    def mark_window(self, tape: Tape, area: tuple[int, int, int, int], limit: WindowLimit) -> Window | None:
         """``_mark``, which is left out for windows as large as one that had too many fragments."""
-        samples = area[2] * area[3] * forward.settings.samples**2
+        samples = area[2] * area[3] * tape.settings.samples**2
         if samples > limit.samples and area[2:] != (1, 1):
             return None
-        window = self._mark(forward, area)
+        window = self._mark(tape, area)
         if window is None:
             limit.samples = samples - 1
         return window
 
-    def _mark(self, forward: Forward, area: tuple[int, int, int, int]) -> Window | None:
+    def _mark(self, tape: Tape, area: tuple[int, int, int, int]) -> Window | None:
         """Renders a window and marks its fragments; None if it has too many."""
-        if not self._fits(area, forward.settings.samples):
+        if not self._fits(area, tape.settings.samples):
             return None
-        budgets = self.device.budgets if forward.settings.budget is None else (forward.settings.budget,)
+        budgets = self.device.budgets if tape.settings.budget is None else (tape.settings.budget,)
         for budget in budgets:
-            settings = replace(forward.settings, budget=budget)
+            settings = replace(tape.settings, budget=budget)
             try:
-                return self.try_mark(forward, area, settings)
+                return self.try_mark(tape, area, settings)
             except DeviceError:
                 if budget == budgets[-1]:
                     raise
@@ -334,14 +301,12 @@ class GradientRenderer:
         size = window[2] * window[3] * (32 * samples**2 + 16)
         return size <= self.device.binding_limit and fits(self.device, window, samples)
 
-    def try_mark(
-        self, forward: Forward, area: tuple[int, int, int, int], settings: DrawSettings
-    ) -> Window | None:
+    def try_mark(self, tape: Tape, area: tuple[int, int, int, int], settings: DrawSettings) -> Window | None:
         self.marked = None
-        part = forward.part(area)
+        part = tape.part(area)
         most = min(kernels.MAX_PAIRS, (self.device.binding_limit - 64) // PAIR_BYTES)
-        counts = self.frames.begin(part, settings, forward.pose)
-        work = forward.images.work
+        counts = self.frames.begin(part, settings, tape.pose)
+        work = tape.work
         while True:
             rounds, counters = self.frames.repeat(
                 _MARK_STEPS, _MARK_AGAIN_STEPS, "color", counts, settings, work
@@ -352,30 +317,30 @@ class GradientRenderer:
             if needed > most:
                 return None
             self.frames.capacity = min(most, needed + needed // 4)
-            counts = self.frames.begin(part, settings, forward.pose)
+            counts = self.frames.begin(part, settings, tape.pose)
         fragments, sums = int(counters[13]), int(counters[14])
         limit = self.device.binding_limit
         if FRAGMENT_BYTES * fragments > limit or SUM_BYTES * sums > limit:
             return None
         window = Window(area, settings, rounds, fragments, sums, counts["tiles"], counters)
-        if area[2:] == (forward.camera.width, forward.camera.height):
-            self.marked = forward
+        if area[2:] == (tape.camera.width, tape.camera.height):
+            self.marked = tape
         return window
 
-    def mark_again(self, forward: Forward, window: Window) -> None:
-        """Marks the fragments of a window of ``forward``, unless they are marked."""
-        if self.marked is not forward and not self.try_mark(forward, window.area, window.settings):
+    def mark_again(self, tape: Tape, window: Window) -> None:
+        """Marks the fragments of a window of ``tape``, unless they are marked."""
+        if self.marked is not tape and not self.try_mark(tape, window.area, window.settings):
             raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
 
     # ---- Backward pass
 
     def backward(
-        self, forward: Forward, gradient: np.ndarray, values: np.ndarray | None = None
+        self, tape: Tape, gradient: np.ndarray, values: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """The gradients of vertices.
 
         Args:
-            forward: the result of ``forward``, whose arrays have not changed.
+            tape: of ``forward``; its arrays have not changed.
             gradient: (h, w, 4) float32: of RGB without background, and of the background's share.
             values: (h, w, c) float32 gradient of the further values, or None.
 
@@ -386,44 +351,44 @@ class GradientRenderer:
         Raises:
             DeviceError: the GPU did not finish.
         """
-        count = len(forward.triangles.vertices)
+        count = len(tape.triangles.vertices)
         more = None if values is None else np.zeros((count, values.shape[2]), np.float32)
-        if not forward.windows:
+        if not tape.windows:
             return np.zeros((count, 8), np.float32), more
         with self.frames.lock:
-            if self._loaded is not forward:
-                self._load(forward)
-            result = self._add_windows(forward, gradient)
+            if self._loaded is not tape:
+                self._load(tape)
+            result = self._add_windows(tape, gradient)
             if values is not None and more is not None:
-                for columns, some in _triples(forward):
+                for columns, some in _triples(tape):
                     self._load_values(some)
                     part = np.zeros_like(gradient)
                     part[..., : columns.stop - columns.start] = values[..., columns]
-                    found = self._add_windows(forward, part)
+                    found = self._add_windows(tape, part)
                     more[:, columns] = found[:, 4 : 4 + columns.stop - columns.start]
                     result[:, :3] += found[:, :3]
                     result[:, 7] += found[:, 7]
-                self._load_values(forward.triangles.colors)
+                self._load_values(tape.triangles.colors)
         return result, more
 
-    def _add_windows(self, forward: Forward, gradient: np.ndarray) -> np.ndarray:
+    def _add_windows(self, tape: Tape, gradient: np.ndarray) -> np.ndarray:
         """(v, 8) float32 gradients of what is blended now."""
         self.frames.clear("gradients")
-        for window in forward.windows:
-            self.mark_again(forward, window)
-            self._add_window(forward, window, gradient)
-        if forward.settings.filter_px2:
-            last = forward.windows[-1]
-            counts = self.frames.begin(forward.part(last.area), last.settings, forward.pose)
+        for window in tape.windows:
+            self.mark_again(tape, window)
+            self._add_window(tape, window, gradient)
+        if tape.settings.filter_px2:
+            last = tape.windows[-1]
+            counts = self.frames.begin(tape.part(last.area), last.settings, tape.pose)
             self.frames.run(_FILTER_STEPS, "color", counts, last.settings)
-        size = 32 * len(forward.triangles.vertices)
+        size = 32 * len(tape.triangles.vertices)
         return self.frames.read("gradients", size).view(np.float32).reshape(-1, 8).copy()
 
-    def _add_window(self, forward: Forward, window: Window, gradient: np.ndarray) -> None:
+    def _add_window(self, tape: Tape, window: Window, gradient: np.ndarray) -> None:
         """Adds the gradients of a window whose fragments are marked."""
         x, y, w, h = window.area
         s = window.settings.samples
-        counts = self.make_room(forward, window)
+        counts = self.make_room(tape, window)
         of_samples = np.ascontiguousarray(gradient[y : y + h, x : x + w]) * np.float32(1 / s**2)
         self.frames.write("samples", of_samples, 32 * w * h * s**2)
         self.frames.run(_gradient_steps(window.rounds), "color", counts, window.settings)
@@ -433,17 +398,17 @@ class GradientRenderer:
         if counters[15]:
             raise DeviceError("a sample has too many fragments for gradients on the GPU: use device='cpu'")
 
-    def make_room(self, forward: Forward, window: Window) -> dict[str, int]:
+    def make_room(self, tape: Tape, window: Window) -> dict[str, int]:
         """Room for the tape of a window, its frame and counts."""
-        counts = self.frames.begin(forward.part(window.area), window.settings, forward.pose)
+        counts = self.frames.begin(tape.part(window.area), window.settings, tape.pose)
         self.frames.allocate("tape", FRAGMENT_BYTES * window.fragments)
         self.frames.allocate("tile_sums", SUM_BYTES * window.sums)
         return counts
 
 
-def _triples(forward: Forward) -> Iterator[tuple[slice, np.ndarray]]:
+def _triples(tape: Tape) -> Iterator[tuple[slice, np.ndarray]]:
     """The further values, three at a time: their columns, and (v, 4) float32 with the opacities."""
-    values, colors = forward.triangles.values, forward.triangles.colors
+    values, colors = tape.triangles.values, tape.triangles.colors
     for first in range(0, 0 if values is None else values.shape[1], 3):
         assert values is not None
         columns = slice(first, min(first + 3, values.shape[1]))

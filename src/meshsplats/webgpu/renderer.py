@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,8 +12,9 @@ from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import frames, kernels
-from meshsplats.webgpu.device import Device, open_device
-from meshsplats.webgpu.frames import DrawSettings, MeshFrames, Output, Program, Work, halves, tiles_of
+from meshsplats.webgpu.device import Device
+from meshsplats.webgpu.frames import DrawSettings, MeshFrames, Output, Program, Work
+from meshsplats.webgpu.layout import halves, tiles_of
 
 _LIST_STEPS, _RASTER_STEPS = tuple(kernels.list_steps()), tuple(kernels.raster_steps())
 _AGAIN_STEPS = tuple(kernels.again_steps())
@@ -23,7 +22,7 @@ _AGAIN_STEPS = tuple(kernels.again_steps())
 
 @dataclass
 class Images:
-    """The outputs of ``draw``: sums over the fragments of each pixel, weighted as their colours are."""
+    """Images of a mesh: sums over the fragments of each pixel, weighted as their colours are."""
 
     color: np.ndarray
     """(h, w, 3) float32, without the background."""
@@ -44,70 +43,6 @@ class _Pass:
     """(v, 4) float32: what is blended, and opacities; None: the depth."""
     image: np.ndarray
     """(h, w, c) float32, where it goes."""
-
-
-def draw(
-    mesh: SplatMesh,
-    camera: Camera,
-    settings: DrawSettings,
-    *,
-    depth: bool = False,
-    normals: bool = False,
-    values: np.ndarray | None = None,
-) -> Images:
-    """Draws a mesh on the best GPU of this machine; arguments are those of ``rendering.render``, checked.
-
-    Args:
-        values: (v, c) float32 further values of the vertices to blend.
-
-    Raises:
-        MissingDependencyError: there is no wgpu or no GPU.
-        DeviceError: the GPU failed or did not finish.
-        MemoryError: the scene does not fit.
-        ValueError: two splats share a vertex, and the mesh has a filter.
-    """
-    with gpu_errors():
-        return _renderer(mesh).draw(camera, settings, depth=depth, normals=normals, values=values)
-
-
-@contextlib.contextmanager
-def gpu_errors() -> Iterator[None]:
-    """Turns the errors of wgpu into MemoryError and DeviceError, and opens the device anew afterwards.
-
-    Raises MissingDependencyError at once if there is no wgpu or no GPU.
-    """
-    open_device()
-    import wgpu
-
-    try:
-        yield
-    except wgpu.GPUError as error:
-        _forget()  # the device may be lost
-        if isinstance(error, MemoryError):
-            raise MemoryError(f"the GPU has too little memory: {error}") from None
-        raise DeviceError(f"the GPU failed: {error}") from None
-
-
-_lock = threading.Lock()
-_last: MeshRenderer | None = None
-
-
-def _renderer(mesh: SplatMesh) -> MeshRenderer:
-    """The renderer of ``mesh``: that of the last call if it was for the same mesh."""
-    global _last
-    with _lock:
-        if _last is None or _last.mesh is not mesh:
-            _last = None  # frees its buffers first
-            _last = MeshRenderer(open_device(), mesh)
-        return _last
-
-
-def _forget() -> None:
-    """Opens the device anew at the next call."""
-    global _last
-    with _lock:
-        _last = None
-        open_device.cache_clear()
 
 
 def drawing_pipeline(
@@ -136,7 +71,11 @@ def fits(device: Device, window: tuple[int, int, int, int], samples: int) -> boo
 
 
 class MeshRenderer:
-    """A mesh on a GPU."""
+    """A mesh on a GPU, for images.
+
+    Raises:
+        MemoryError: a mesh that does not fit.
+    """
 
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
         self.mesh = mesh
@@ -151,6 +90,16 @@ class MeshRenderer:
         normals: bool = False,
         values: np.ndarray | None = None,
     ) -> Images:
+        """Draws the mesh; arguments are those of ``rendering.render``, checked.
+
+        Args:
+            values: (v, c) float32 further values of the vertices to blend.
+
+        Raises:
+            DeviceError: the GPU did not finish.
+            MemoryError: the scene does not fit.
+            ValueError: two splats share a vertex, and there is a filter.
+        """
         camera = camera.with_near_plane(self.mesh.vertices)
         h, w = camera.height, camera.width
         images = Images(np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32))

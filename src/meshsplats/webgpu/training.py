@@ -17,9 +17,9 @@ from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import CORE_BINDING, Device
-from meshsplats.webgpu.frames import DrawSettings, Output, halves
-from meshsplats.webgpu.gradients import GRADIENTS, Forward, GradientRenderer, WindowLimit, gradient_pipeline
-from meshsplats.webgpu.renderer import Images
+from meshsplats.webgpu.frames import DrawSettings, Output
+from meshsplats.webgpu.gradients import GRADIENTS, GradientRenderer, Tape, WindowLimit, gradient_pipeline
+from meshsplats.webgpu.layout import halves
 
 DERIVATIVE_BYTES = 48
 """Bytes of the derivatives of SSIM in each pixel, the largest buffer of an image."""
@@ -38,6 +38,21 @@ class Moments(NamedTuple):
 
     mean: np.ndarray
     square: np.ndarray
+
+
+class Parameters(NamedTuple):
+    """What steps change, and what they know of each vertex."""
+
+    vertices: np.ndarray
+    """(v, 3) float32 positions."""
+    colors: np.ndarray
+    """(v, 4) float32 RGBA."""
+    position_moments: Moments
+    color_moments: Moments
+    units: np.ndarray | None = None
+    """(v,) float32 factors of the learning rate of positions; None: 1."""
+    transparent: np.ndarray | None = None
+    """(v,) bool: vertices whose opacity stays 0 once it is 0; None: no vertex."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +95,7 @@ class Trainer:
     Args:
         device: the GPU.
         mesh: the triangles, without depth groups; its positions and colours are not used.
-        vertices, colors: (v, 3) and (v, 4) float32.
-        position_moments, color_moments: of the same shapes.
-        units: (v,) float32 factors of the learning rate of positions.
-        transparent: (v,) bool: vertices whose opacity stays 0 once it is 0.
+        start: where steps begin; copied.
         limit: of windows.
 
     Raises:
@@ -91,31 +103,23 @@ class Trainer:
         DeviceError: a vertex with too many triangles.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        mesh: SplatMesh,
-        vertices: np.ndarray,
-        colors: np.ndarray,
-        position_moments: Moments,
-        color_moments: Moments,
-        units: np.ndarray,
-        transparent: np.ndarray,
-        limit: WindowLimit,
-    ) -> None:
+    def __init__(self, device: Device, mesh: SplatMesh, start: Parameters, limit: WindowLimit) -> None:
         self.mesh = mesh
         self._taping = GradientRenderer(device, mesh, TRAINING)
         self._frames = self._taping.frames
         self._limit = limit
         assert not self._frames.counts["groups"]
         count = len(mesh.vertices)
-        self._frames.upload("vertices", vertices)
-        self._frames.upload("values", colors)
+        self._frames.upload("vertices", start.vertices)
+        self._frames.upload("values", start.colors)
         padded = np.zeros((count, 2, 4), np.float32)
-        padded[:, 0, :3], padded[:, 1, :3] = position_moments
+        padded[:, 0, :3], padded[:, 1, :3] = start.position_moments
         self._frames.upload("position_moments", padded)
-        self._frames.upload("color_moments", np.stack(color_moments, axis=1))
-        self._frames.upload("traits", np.stack([units, transparent.astype(np.float32)], axis=1))
+        self._frames.upload("color_moments", np.stack(start.color_moments, axis=1))
+        traits = np.zeros((count, 2), np.float32)
+        traits[:, 0] = 1 if start.units is None else start.units
+        traits[:, 1] = 0 if start.transparent is None else start.transparent
+        self._frames.upload("traits", traits)
         self._frames.allocate("results", 64)
         self._frames.allocate("step", 80)
 
@@ -147,34 +151,27 @@ class Trainer:
         """
         with self._frames.lock:
             self._prepare(camera, settings, target, mask)
-            forward = Forward(
-                self.mesh.triangles,
-                camera,
-                None,
-                settings,
-                Images(np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32)),
-                [],
-            )
+            tape = Tape(self.mesh.triangles, camera, settings)
             waiting = [(0, 0, camera.width, camera.height)]
             while waiting:
                 area = waiting.pop()
-                window = self._taping.mark_window(forward, area, self._limit)
+                window = self._taping.mark_window(tape, area, self._limit)
                 if window is None:
                     waiting += halves(area)
                     continue
-                forward.windows.append(window)
-                self._write_step(forward, window.area, 0, background, rates)
-                self._run_for(_STORE_STEPS, forward, window.area)
-            self._run_for(_LOSS_STEPS, forward, forward.windows[-1].area)
+                tape.windows.append(window)
+                self._write_step(tape, window.area, 0, background, rates)
+                self._run_for(_STORE_STEPS, tape, window.area)
+            self._run_for(_LOSS_STEPS, tape, tape.windows[-1].area)
             self._frames.clear("gradients")
-            for window in forward.windows:
-                self._taping.mark_again(forward, window)
-                counts = self._taping.make_room(forward, window)
-                self._write_step(forward, window.area, counts["tiles"], background, rates)
+            for window in tape.windows:
+                self._taping.mark_again(tape, window)
+                counts = self._taping.make_room(tape, window)
+                self._write_step(tape, window.area, counts["tiles"], background, rates)
                 steps = _window_steps(window.rounds)
                 self._frames.run(steps, "color", counts | self._image_counts(camera), window.settings)
-            last = forward.windows[-1]
-            counts = self._frames.begin(forward.part(last.area), last.settings)
+            last = tape.windows[-1]
+            counts = self._frames.begin(tape.part(last.area), last.settings)
             self._frames.run(_ADAM_STEPS, "color", counts, last.settings)
             words = self._frames.read("results", 32)
         if words[4]:
@@ -184,21 +181,18 @@ class Trainer:
         l1, l2, ssim = (float(value) for value in words[:3].view(np.float32))
         return Sums(l1, ssim, l2, not words[5])
 
-    def download(self) -> tuple[np.ndarray, np.ndarray, Moments, Moments]:
-        """(v, 3) positions, (v, 4) colours, and the moments of both."""
+    def fetch(self, into: Parameters) -> None:
+        """Writes positions, colours and the moments of both into the arrays of ``into``."""
         count = len(self.mesh.vertices)
-        vertices = self._download("vertices", 12 * count).reshape(count, 3)
-        colors = self._download("values", 16 * count).reshape(count, 4)
-        positions = self._download("position_moments", 32 * count).reshape(count, 2, 4)[..., :3]
-        of_colors = self._download("color_moments", 32 * count).reshape(count, 2, 4)
-        return (
-            vertices,
-            colors,
-            Moments(positions[:, 0], positions[:, 1]),
-            Moments(of_colors[:, 0], of_colors[:, 1]),
-        )
+        vertices = self._read("vertices", 12 * count).reshape(count, 3)
+        colors = self._read("values", 16 * count).reshape(count, 4)
+        positions = self._read("position_moments", 32 * count).reshape(count, 2, 4)[..., :3]
+        of_colors = self._read("color_moments", 32 * count).reshape(count, 2, 4)
+        into.vertices[:], into.colors[:] = vertices, colors
+        for known, found in ((into.position_moments, positions), (into.color_moments, of_colors)):
+            known.mean[:], known.square[:] = found[:, 0], found[:, 1]
 
-    def _download(self, name: str, size: int) -> np.ndarray:
+    def _read(self, name: str, size: int) -> np.ndarray:
         return self._frames.read(name, size).view(np.float32)
 
     def _prepare(
@@ -224,16 +218,14 @@ class Trainer:
     def _image_counts(camera: Camera) -> dict[str, int]:
         return {"image_columns": camera.width, "image_rows": camera.height}
 
-    def _run_for(
-        self, steps: Sequence[dict[str, Any]], forward: Forward, area: tuple[int, int, int, int]
-    ) -> None:
-        counts = self._frames.counts | self._image_counts(forward.camera)
+    def _run_for(self, steps: Sequence[dict[str, Any]], tape: Tape, area: tuple[int, int, int, int]) -> None:
+        counts = self._frames.counts | self._image_counts(tape.camera)
         counts |= {"columns": area[2], "rows": area[3]}
-        self._frames.run(steps, "color", counts, forward.settings)
+        self._frames.run(steps, "color", counts, tape.settings)
 
     def _write_step(
         self,
-        forward: Forward,
+        tape: Tape,
         area: tuple[int, int, int, int],
         tiles: int,
         background: Sequence[float],
@@ -242,8 +234,8 @@ class Trainer:
         """Writes the uniform ``Step`` of a window."""
         data = np.zeros(20, np.float32)
         words = data.view(np.uint32)
-        camera = forward.camera
-        words[:8] = camera.width, camera.height, *area, forward.settings.samples, tiles
+        camera = tape.camera
+        words[:8] = camera.width, camera.height, *area, tape.settings.samples, tiles
         data[8:12] = *background, rates.epsilons[1]
         data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilons[0]
         data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]

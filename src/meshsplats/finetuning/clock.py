@@ -1,0 +1,79 @@
+"""How far a run is: by its steps or, where its length is in minutes, by the time."""
+
+from __future__ import annotations
+
+import time
+
+from meshsplats.finetuning.config import FinetuneConfig
+
+WRAP_UP_SECONDS = 1.5
+"""Time that a run with a length in minutes reserves for writing the mesh and rendering its preview. In short
+runs it is a hundredth of the length."""
+
+
+class Clock:
+    """The steps and the time of a run.
+
+    Args:
+        config: has the length.
+        views: number of training views.
+        step: number of steps already taken.
+        seconds: time already used.
+        reserve: seconds to leave at the end.
+
+    Attributes:
+        step: number of steps taken, counted by the loop.
+        steps: total number of steps; None if the length is given in minutes.
+        step_cost, report_cost, save_cost: seconds of the last step, report and checkpoint.
+    """
+
+    def __init__(
+        self, config: FinetuneConfig, views: int, *, step: int = 0, seconds: float = 0.0, reserve: float = 0.0
+    ) -> None:
+        self.step, self.steps = step, config.total_steps(views)
+        self.step_cost = self.report_cost = self.save_cost = 0.0
+        self._minutes, self._reserve = config.minutes, reserve
+        self._began = time.perf_counter() - seconds
+        self._first_step, self._first_seconds = step, self.seconds
+
+    @property
+    def seconds(self) -> float:
+        """Time used so far, including that before a resumed run's checkpoint."""
+        return time.perf_counter() - self._began
+
+    @property
+    def limit(self) -> float | None:
+        """Seconds after which no step begins, so that the last report and the result are written in time."""
+        if self._minutes is None:
+            return None
+        total = 60 * self._minutes
+        reserve = 1.5 * (self.report_cost + self.save_cost) + self.step_cost + self._reserve
+        return max(total - (reserve + min(0.01 * total, WRAP_UP_SECONDS)), 0)
+
+    @property
+    def fraction(self) -> float:
+        """Share of the run that is over, 0 to 1."""
+        if self.limit is not None:
+            return min(1.0, self.seconds / self.limit) if self.limit > 0 else 1.0
+        return self.step / self.steps if self.steps else 1.0
+
+    @property
+    def done(self) -> bool:
+        """Whether the last step was taken."""
+        if self.limit is not None:
+            return self.seconds >= self.limit
+        return self.step >= (self.steps or 0)
+
+    def due(self, interval: int) -> bool:
+        """Whether the count of steps is a multiple of ``interval``; 0: never."""
+        return bool(interval) and self.step % interval == 0
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Estimated remaining time; None if unknown."""
+        if self.limit is not None:
+            return max(self.limit - self.seconds, 0.0)
+        if self.steps is not None and self.step > self._first_step:
+            pace = (self.seconds - self._first_seconds) / (self.step - self._first_step)
+            return pace * (self.steps - self.step)
+        return None

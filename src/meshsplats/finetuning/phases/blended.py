@@ -1,0 +1,40 @@
+"""Translucent triangles, from the first step to the last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshsplats.datasets.views import View
+from meshsplats.finetuning.config import FinetuneConfig, learning_rates
+from meshsplats.finetuning.phases.phase import Moment, pruned
+from meshsplats.finetuning.state import State
+from meshsplats.finetuning.step import Plan, samples_of, uses_point_targets
+from meshsplats.mesh import SplatMesh
+
+
+@dataclass(frozen=True)
+class Blended:
+    """The only phase of opacity 'blended'."""
+
+    config: FinetuneConfig
+    usual: float = 0.0
+
+    def plan(self, view: View, step: int, fraction: float) -> Plan:
+        points = uses_point_targets(view, self.config, fraction)
+        samples = 1 if points else samples_of(view, self.config, fraction)
+        return Plan(points, samples, *learning_rates(self.config, step, fraction))
+
+    def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
+        return views
+
+    def after_step(self, state: State, moment: Moment) -> tuple[Blended, State]:
+        return self, pruned(state, self.config, moment)
+
+    def result(self, state: State) -> SplatMesh:
+        return state.result()
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}

@@ -1,0 +1,60 @@
+"""Which phases a run has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from meshsplats.finetuning.checkpoint import reading_arrays
+from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.phases.blended import Blended
+from meshsplats.finetuning.phases.cutting import Cutting, check_for_cutoff
+from meshsplats.finetuning.phases.hybrid import Hybrid
+from meshsplats.finetuning.phases.phase import Phase
+from meshsplats.finetuning.state import State
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.engine import Engine, Need
+
+PHASE_ARRAYS = ("color_limits",)
+"""Names of the arrays of all phases in a checkpoint (``Phase.arrays``)."""
+
+
+def check_phases(
+    config: FinetuneConfig, mesh: SplatMesh, engine: Engine, frozen: np.ndarray | None = None
+) -> None:
+    """ValueError if a phase of the run is not for ``mesh``, ``frozen`` vertices or the ``engine``, whose own
+    errors are those of ``Engine.check``."""
+    if not config.cuts:
+        engine.check()
+        return
+    needs: tuple[Need, ...] = ("cutoff",)
+    engine.check(needs)
+    check_for_cutoff(mesh, config, frozen)
+
+
+def first_phase(
+    config: FinetuneConfig,
+    start: SplatMesh,
+    state: State,
+    *,
+    resumed: float | None = None,
+    arrays: Mapping[str, np.ndarray] | None = None,
+) -> Phase:
+    """The phase in which a run begins, or goes on.
+
+    Args:
+        config: of the run.
+        start: the mesh before the first step.
+        state: the state now.
+        resumed: the fraction at which the run is resumed; None: it begins.
+        arrays: of its checkpoint.
+
+    Raises FileFormatError if these do not fit.
+    """
+    if not config.cuts:
+        return Blended(config)
+    if state.solid is None:
+        return Cutting(config, start, resumed)
+    with reading_arrays():
+        return Hybrid.resume(config, state, arrays or {})
