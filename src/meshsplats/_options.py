@@ -18,7 +18,7 @@ import math
 import textwrap
 import types
 from collections.abc import Collection, Iterable
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -163,7 +163,7 @@ def _declared(kind: type) -> dict[str, Setting]:
             name=name,
             kinds=inner,
             optional=type(None) in every,
-            default=part.default if part.default_factory is MISSING else part.default_factory(),
+            default=part.default_factory() if callable(part.default_factory) else part.default,
             marks=tuple(marks[name].values()),
             owner=kind,
         )

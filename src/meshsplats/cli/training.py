@@ -214,8 +214,8 @@ class TrainingCommand(Command):
         with together():  # a run that is killed before has no result, and its checkpoint
             save_mesh(mesh, files.mesh, **given)
             write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
-            self.save_more(files, plan, trained)
             draw_preview(trained.shown, files.preview, self.preview_camera(plan))
+        self.save_more(files, plan, trained)  # which may fail: the mesh is there by now
         self._print_result(files, time.perf_counter() - start, earlier, trained, scored)
         if not self.json:
             for line in self.next_steps(files, config, plan):
