@@ -175,8 +175,8 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
     pytest.importorskip("skimage", reason="base needs its extra: pip install 'meshsplats[base]'")
     lines = "".join(code_blocks(ROOT / "README.md", "sh")).replace("\\\n", " ").splitlines()
     commands = [shlex.split(line, comments=True) for line in lines if line.startswith("meshsplats ")]
-    # blender needs an environment of its own; tests/blender runs it.
-    assert {command[1] for command in commands} >= set(cli.COMMANDS) - {"blender"}
+    # blender needs an environment of its own, where tests/blender runs it; demo runs some of these commands.
+    assert {command[1] for command in commands} >= set(cli.COMMANDS) - {"blender", "demo"}
     monkeypatch.chdir(tmp_path)
     for name in ("scene.ply", "city.ply"):
         (tmp_path / name).write_bytes(scene_file.read_bytes())

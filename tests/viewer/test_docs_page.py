@@ -45,7 +45,7 @@ def site(tmp_path, mesh, cloud):
 def test_the_scene_is_drawn_within_the_site(browser, site):
     page = browser.page(site, 640, 560)
     inside = "document.querySelector('iframe').contentDocument.body"
-    page.wait(f"{inside}.dataset.state === 'still'", 400)
+    page.wait(f"{inside}?.dataset.state === 'still'", 400)
     drawn = page.screenshot()[120:500, 100:540]
     assert page.run(f"{inside}.dataset.renderer") in ("exact", "sorted")
     assert np.unique(drawn.reshape(-1, 3), axis=0).shape[0] > 100  # a scene, not a message

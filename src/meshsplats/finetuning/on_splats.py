@@ -183,7 +183,7 @@ class SplatTuning:
             self._setup.phase("timing steps")
             pace = measure_pace(run.cloud, dataset, config, self._options, run.threads, run.device)
             left = (1 - SETUP_SHARE) * (seconds or 0)
-            if config.opacity == "cutoff" and not limited:
+            if config.cuts and not limited:
                 count = pace.splats(count, worthwhile_steps(config), left)
             steps = pace.steps(self._limited(count), left)
         brief = may_be_brief and steps is not None and is_brief(self._limited(count), pixels, steps, timed)
