@@ -27,6 +27,7 @@ class GradientTile {
           triangles_(scene, attribute_channels_),
           fragments_(CHUNK),
           visible_(CHUNK),
+          recorded_(CHUNK),
           depths_(attribute_channels_ ? CHUNK : 0),
           opacities_(has_ramp(options) ? CHUNK : 0),
           slot_of_step_(CHUNK) {}
@@ -37,9 +38,16 @@ class GradientTile {
         out.count = 0;
         if (!tape.face_count() || !gradients_.load(area)) return;
         triangles_.set_up(area, tape.faces(), tape.face_count());
-        for (int block = 0; block < BLOCKS; ++block) {
+        for (int block = 0; block < area.blocks; ++block) {
             tape.entries(block, entries_);
             masks_ = tape.masks(block);
+            if (mesh_.by_splat) {
+                if (attribute_channels_)
+                    backward_block_by_splat<true>(block);
+                else
+                    backward_block_by_splat<false>(block);
+                continue;
+            }
             steps_ = tape.steps(block);
             step_count_ = tape.step_count(block);
             if (has_ramp(options_) && attribute_channels_)
@@ -111,7 +119,53 @@ class GradientTile {
         }
     }
 
-    const PackedTape::IndexedLanes *chunk_steps(int64_t chunk) const { return steps_ + chunk * CHUNK; }
+    // Likewise in the order of the splats, where each entry is one step. A sweep from the front and one from
+    // the back over each chunk do everything.
+    template <bool ATTRIBUTES>
+    void backward_block_by_splat(int block) {
+        const BlockSamples samples(block);
+        const size_t chunks = (entries_.size() + CHUNK - 1) / CHUNK;
+        chunk_transmittance_.resize(chunks + 1);
+        chunk_transmittance_[0] = broadcast(1);
+        for (size_t chunk = 0; chunk < chunks; ++chunk)
+            chunk_transmittance_[chunk + 1] =
+                sweep_forward<ATTRIBUTES>(samples, chunk * CHUNK, chunk_transmittance_[chunk]);
+        Lanes behind = gradients_.background_behind(block);
+        for (size_t chunk = chunks; chunk-- > 0;) {
+            if (chunk + 1 < chunks)
+                sweep_forward<ATTRIBUTES>(samples, chunk * CHUNK, chunk_transmittance_[chunk]);
+            for (uint32_t slot = slot_count_; slot-- > 0;) {
+                EntryFragments &f = fragments_[slot];
+                f.d_alpha = f.d_alpha - behind;
+                behind = behind + masked(recorded_[slot], f.rgba[3] * f.d_alpha);
+                add_moments<ATTRIBUTES, false>(samples, slot);
+            }
+        }
+    }
+
+    // Evaluates the entries of the chunk that begins at entry `first` and multiplies their weights by the
+    // transmittance in front of them. Takes the transmittance in front of the chunk and returns that behind
+    // it.
+    template <bool ATTRIBUTES>
+    Lanes sweep_forward(const BlockSamples &samples, size_t first, Lanes transmittance) {
+        const Lanes limit = broadcast(options_.min_transmittance);
+        slot_count_ = (uint32_t)std::min<size_t>(CHUNK, entries_.size() - first);
+        for (uint32_t slot = 0; slot < slot_count_; ++slot) {
+            const TapeEntry entry = entries_[first + slot];
+            const Lanes z = evaluate<ATTRIBUTES, false>(samples, entry, slot);
+            if (ATTRIBUTES) depths_[slot] = z;
+            LaneMask lanes = 0;
+            for (uint32_t i = 0; i < entry.mask_count; ++i) lanes |= masks_[entry.first_mask + i].lanes;
+            EntryFragments &f = fragments_[slot];
+            f.z_weight = transmittance * f.z_weight;
+            recorded_[slot] = lanes;
+            visible_[slot] = {(uint32_t)first + slot, lanes & greater_equal(transmittance, limit)};
+            transmittance = transmittance - masked(lanes, transmittance * f.rgba[3]);
+        }
+        return transmittance;
+    }
+
+    const IndexedLanes *chunk_steps(int64_t chunk) const { return steps_ + chunk * CHUNK; }
     int64_t chunk_size(int64_t chunk) const {
         return std::min(step_count_, (chunk + 1) * CHUNK) - chunk * CHUNK;
     }
@@ -121,7 +175,7 @@ class GradientTile {
     template <bool ATTRIBUTES, bool RAMP>
     Lanes replay_forward(const BlockSamples &samples, int64_t chunk, Lanes transmittance) {
         const Lanes limit = broadcast(options_.min_transmittance);
-        const PackedTape::IndexedLanes *steps = chunk_steps(chunk);
+        const IndexedLanes *steps = chunk_steps(chunk);
         const int64_t n = chunk_size(chunk);
         assign_slots(steps, n);
         for (uint32_t slot = 0; slot < slot_count_; ++slot) {
@@ -141,7 +195,7 @@ class GradientTile {
     // Gives the entries of n steps slots [0, slot_count_), in the order of their first steps. slot_of_entry_
     // holds first_slot_ + slot, and first_slot_ grows beyond all earlier values: smaller ones are of earlier
     // chunks.
-    __attribute__((always_inline)) void assign_slots(const PackedTape::IndexedLanes *steps, int64_t n) {
+    __attribute__((always_inline)) void assign_slots(const IndexedLanes *steps, int64_t n) {
         const uint32_t first = first_slot_ + slot_count_;
         uint32_t count = 0;
         for (int64_t i = 0; i < n; ++i) {
@@ -160,7 +214,7 @@ class GradientTile {
 
     // Subtracts B . g from d_alpha. Takes B . g behind the chunk and returns that in front of it.
     __attribute__((always_inline)) Lanes propagate_behind(int64_t chunk, Lanes behind) {
-        const PackedTape::IndexedLanes *steps = chunk_steps(chunk);
+        const IndexedLanes *steps = chunk_steps(chunk);
         for (int64_t i = chunk_size(chunk); i-- > 0;) {
             EntryFragments &f = fragments_[slot_of_step_[i]];
             const Lanes d_alpha = f.d_alpha - behind;
@@ -176,7 +230,7 @@ class GradientTile {
                                                   uint32_t slot) {
         EntryFragments &f = fragments_[slot];
         MS_ASSERT(entry.mask_count >= 1);
-        const PackedTape::IndexedLanes *mask = masks_ + entry.first_mask;
+        const IndexedLanes *mask = masks_ + entry.first_mask;
         Lanes q, linear[4];  // 1 / depth, RGBA / depth
         const TapeTriangles::Triangle *t = &triangles_[mask->index()];
         f4 low = load4(t->low), high = load4(t->high);
@@ -232,7 +286,7 @@ class GradientTile {
     // Replaces the opacity of the entry in a slot by that of the ramp. z is its depth.
     void evaluate_ramp(const TapeEntry entry, const Lanes &z, uint32_t slot) {
         Lanes &alpha = fragments_[slot].rgba[3];
-        const PackedTape::IndexedLanes *mask = masks_ + entry.first_mask;
+        const IndexedLanes *mask = masks_ + entry.first_mask;
         Lanes a, b, qa, qb;
         for (uint32_t i = 0; i < entry.mask_count; ++i) {
             const TapeTriangles::Triangle &t = triangles_[mask[i].index()];
@@ -265,7 +319,7 @@ class GradientTile {
         if (RAMP) grad[3] = grad[3] * opacities_[slot].slope;
         const Lanes &alpha = RAMP ? opacities_[slot].interpolated : f.rgba[3];
         for (uint32_t i = entry.first_mask; i < entry.first_mask + entry.mask_count; ++i) {
-            const PackedTape::IndexedLanes mask = masks_[i];
+            const IndexedLanes mask = masks_[i];
             const uint32_t triangle = mask.index();
             const TapeTriangles::Triangle &t = triangles_[triangle];
             const Lanes x = samples.x - broadcast(t.x0), y = samples.y - broadcast(t.y0);
@@ -304,7 +358,7 @@ class GradientTile {
 
     // Of the block.
     std::vector<TapeEntry> entries_;
-    const PackedTape::IndexedLanes *masks_, *steps_;
+    const IndexedLanes *masks_, *steps_;
     int64_t step_count_;
     std::vector<uint32_t> slot_of_entry_;     // see assign_slots
     std::vector<Lanes> chunk_transmittance_;  // in front of each chunk
@@ -313,6 +367,7 @@ class GradientTile {
     uint32_t first_slot_, slot_count_;
     std::vector<EntryFragments> fragments_;
     std::vector<VisibleEntry> visible_;
+    std::vector<LaneMask> recorded_;         // lanes of the entry on the tape, in the order of the splats
     std::vector<Lanes> depths_;              // if there are attributes
     std::vector<EntryOpacities> opacities_;  // if there is a ramp
     std::vector<uint16_t> slot_of_step_;

@@ -19,17 +19,18 @@ class SampleGradients {
           camera_(camera),
           image_gradients_(image_gradients),
           channels_(channels),
-          grad_attributes_((size_t)channels * SAMPLES) {}
+          grad_attributes_((size_t)channels * MAX_SAMPLES) {}
 
     // Fills the gradients of the samples of a tile; false if all are 0.
     bool load(const TileArea &area) {
         const int s = grid_.samples;
         const float share = 1.0f / (s * s);
         bool any = false;
-        for (int c = 0; c < 3; ++c) std::fill(grad_color_[c], grad_color_[c] + SAMPLES, 0.0f);
-        for (int c = 0; c < 3; ++c) std::fill(target_[c], target_[c] + SAMPLES, 0.0f);
-        std::fill(expected_weight_, expected_weight_ + SAMPLES, 0.0f);
-        std::fill(background_behind_, background_behind_ + SAMPLES, 0.0f);
+        const int samples = area.blocks * LANES;
+        for (int c = 0; c < 3; ++c) std::fill(grad_color_[c], grad_color_[c] + samples, 0.0f);
+        for (int c = 0; c < 3; ++c) std::fill(target_[c], target_[c] + samples, 0.0f);
+        std::fill(expected_weight_, expected_weight_ + samples, 0.0f);
+        std::fill(background_behind_, background_behind_ + samples, 0.0f);
         std::fill(grad_attributes_.begin(), grad_attributes_.end(), 0.0f);
         for (int y = 0; y < area.rows; ++y) {
             for (int x = 0; x < area.columns; ++x) {
@@ -57,7 +58,7 @@ class SampleGradients {
                 }
                 for (int c = 0; c < channels_; ++c) {
                     const float g = image_gradients_.attributes[pixel * channels_ + c] * share;
-                    grad_attributes_[(size_t)c * SAMPLES + sample] = g;
+                    grad_attributes_[(size_t)c * MAX_SAMPLES + sample] = g;
                     any |= g != 0;
                 }
                 background_behind_[sample] = behind;
@@ -69,7 +70,7 @@ class SampleGradients {
     // Of the samples of a block.
     Lanes color(int channel, int block) const { return load_lanes(grad_color_[channel] + block * LANES); }
     Lanes attribute(int channel, int block) const {
-        return load_lanes(&grad_attributes_[(size_t)channel * SAMPLES + block * LANES]);
+        return load_lanes(&grad_attributes_[(size_t)channel * MAX_SAMPLES + block * LANES]);
     }
     // B . g at the end, B the background.
     Lanes background_behind(int block) const { return load_lanes(background_behind_ + block * LANES); }
@@ -84,11 +85,11 @@ class SampleGradients {
     const MsCamera &camera_;
     const MsImageGradients &image_gradients_;
     const int channels_;
-    alignas(64) float grad_color_[3][SAMPLES];
-    alignas(64) float background_behind_[SAMPLES];
-    alignas(64) float target_[3][SAMPLES];
-    alignas(64) float expected_weight_[SAMPLES];  // 0 without one
-    std::vector<float> grad_attributes_;          // (channel, sample)
+    alignas(64) float grad_color_[3][MAX_SAMPLES];
+    alignas(64) float background_behind_[MAX_SAMPLES];
+    alignas(64) float target_[3][MAX_SAMPLES];
+    alignas(64) float expected_weight_[MAX_SAMPLES];  // 0 without one
+    std::vector<float> grad_attributes_;              // (channel, sample)
 };
 
 }  // namespace ms

@@ -206,6 +206,7 @@ class TapeTriangles {
     // Rounded to an integer, so that the distances of samples from it are exact.
     void choose_origins(double p[3][LANES], int size, float *origin) {
         const TriangleSetup<LANES> &t = batch_;
+        const double side = scene_.grid.largest_side;
         for (int k = 0; k < size; ++k) {
             double sum = 0, count = 0;
             for (int i = 0; i < 3; ++i) {
@@ -213,7 +214,7 @@ class TapeTriangles {
                 count += t.w[i][k] > 0 ? 1 : 0;
             }
             const double mean = sum / (count > 0 ? count : 1);
-            origin[k] = (float)(int)(mean > 0 ? (mean < TILE ? mean : TILE) : 0);
+            origin[k] = (float)(int)(mean > 0 ? (mean < side ? mean : side) : 0);
             for (int i = 0; i < 3; ++i) p[i][k] -= origin[k];
         }
     }
