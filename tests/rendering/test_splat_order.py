@@ -24,7 +24,7 @@ from test_rendering_variants import in_another_process
 from meshsplats import SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
-from meshsplats.rendering.backward import OpacityRamp, TapedRendering
+from meshsplats.rendering.backward import OpacityRamp, TapedRendering, TapeOptions
 
 
 def scenes() -> dict[str, tuple[SplatMesh, dict]]:
@@ -167,7 +167,7 @@ def test_what_has_no_order_by_the_splat():
     with pytest.raises(ValueError, match="order='splat' blends splats, and a cutoff"):
         render(known, view, order="splat", cutoff=0.5)
     with pytest.raises(ValueError, match=r"ramp .*order='fragment'"):
-        TapedRendering(known.triangles, view, ramp=OpacityRamp(0.5))
+        TapedRendering(known.triangles, view, TapeOptions(ramp=OpacityRamp(0.5)))
     with pytest.raises(ValueError, match="order='splat' needs device='cpu'"):
         render(known, view, device="gpu")
 
@@ -183,13 +183,13 @@ def test_cut_triangles_have_a_depth_buffer():
 # ---- Gradients
 
 
-def gradients(mesh: SplatMesh, *, view=None, threads=None, tape_bytes=1 << 27, extra=True, **options):
+def gradients(mesh: SplatMesh, *, view=None, threads=None, tape_bytes=1 << 27, extra=True):
     """Of positions, colours and attributes, for random gradients of an image."""
     view = view or camera(48, 40)
     rng = np.random.default_rng(0)
     values = rng.normal(size=(len(mesh.vertices), 2)).astype(np.float32) if extra else None
     triangles = mesh.triangles._replace(values=values)
-    image = TapedRendering(triangles, view, threads=threads, tape_bytes=tape_bytes, **options)
+    image = TapedRendering(triangles, view, threads=threads, tape_bytes=tape_bytes)
     towards = [rng.normal(size=(view.height, view.width, n)).astype(np.float32) for n in (3, 1, 2)]
     found = [np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)]
     more = np.zeros_like(values) if extra else None
