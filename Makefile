@@ -46,8 +46,8 @@ SANITIZER_CXX ?= g++
 SANITIZER_FLAGS := -std=gnu++17 -O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -fPIC -shared -pthread \
 	-ffp-contract=off -fno-math-errno -fno-trapping-math -fvisibility=hidden -Wno-psabi -Wno-uninitialized \
 	-Wno-maybe-uninitialized $(if $(filter x86_64,$(shell uname -m)),-march=x86-64-v3) -DMS_CHECKS -D_GLIBCXX_ASSERTIONS
-CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_rasterize test_cutoff test_ramp \
-	test_fan_filter test_viewers test_losses test_adam test_merging
+CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_splat_order test_rasterize \
+	test_cutoff test_ramp test_fan_filter test_viewers test_losses test_adam test_merging
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 

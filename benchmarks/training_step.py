@@ -1,6 +1,7 @@
 """Cost of one step of fine-tuning, its growth, and the cost of others' steps.
 
     python benchmarks/training_step.py                        steps at 160k, 1 M and 4 M triangles
+    python benchmarks/training_step.py --order fragment splat the same, exact and by whole splats, in turns
     python benchmarks/training_step.py --growth               with triangles, pixels and layers, one at a time
     python benchmarks/training_step.py --beside               beside torch and, where installed, Mitsuba 3
 
@@ -16,6 +17,8 @@ blending. --beside needs torch.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 from _common import FANS, Report, Stopwatch, arguments, median_ms, random_fans
@@ -24,6 +27,7 @@ from meshsplats._core.kernels import compare_images
 from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TapedRendering
 
@@ -69,14 +73,24 @@ def timed(step: Step, repeat: int) -> list[float]:
     return list(1e3 * np.median([step() for _ in range(repeat)], axis=0))
 
 
-def steps(report: Report, scenes: list[str], threads: list[int], repeat: int) -> None:
-    report.table("triangles", "image", "threads", *Step.parts, "step")
+def in_turns(steps: dict[Order, Step], repeat: int) -> dict[Order, list[float]]:
+    """The median times of steps that take turns, so that other work disturbs all alike."""
+    for step in steps.values():
+        step()
+    found = [{name: step() for name, step in steps.items()} for _ in range(repeat)]
+    return {name: list(1e3 * np.median([turn[name] for turn in found], axis=0)) for name in steps}
+
+
+def steps(report: Report, scenes: list[str], orders: list[Order], threads: list[int], repeat: int) -> None:
+    report.table("triangles", "image", "order", "threads", *Step.parts, "step")
     for name in scenes:
         mesh, camera = random_fans(*FANS[name])
         for count in threads:
-            times = timed(Step(mesh, camera, count), repeat)
-            size = f"{camera.width} x {camera.height}"
-            report.row(f"{len(mesh.faces):,}", size, count, *(f"{t:.0f}" for t in (*times, sum(times))))
+            found = {order: Step(replace(mesh, order=order), camera, count) for order in orders}
+            for order, times in in_turns(found, repeat).items():
+                size = f"{camera.width} x {camera.height}"
+                parts = (f"{t:.0f}" for t in (*times, sum(times)))
+                report.row(f"{len(mesh.faces):,}", size, order, count, *parts)
 
 
 def growth(report: Report, repeat: int) -> None:
@@ -203,6 +217,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--scenes", nargs="+", choices=FANS, default=list(FANS))
+    parser.add_argument("--order", nargs="+", choices=get_args(Order), default=["fragment"])
     parser.add_argument("--growth", action="store_true")
     parser.add_argument("--beside", action="store_true")
     parser.add_argument("--fans", type=int, default=1250, help="of the scene of --beside")
@@ -213,7 +228,7 @@ def main() -> None:
         elif asked.beside:
             beside(report, asked.fans, asked.repeat)
         else:
-            steps(report, asked.scenes, asked.threads, asked.repeat)
+            steps(report, asked.scenes, asked.order, asked.threads, asked.repeat)
 
 
 if __name__ == "__main__":

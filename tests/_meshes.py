@@ -50,6 +50,7 @@ def assert_same(got, mesh, color_error=0.0):
             np.testing.assert_array_equal(getattr(got, name), getattr(mesh, name))
     np.testing.assert_allclose(got.up, mesh.up, atol=1e-6)  # the mesh scales it to unit length again
     assert (got.blending, got.filter_px2) == (mesh.blending, mesh.filter_px2)
+    assert got.order == mesh.order
     np.testing.assert_array_equal(got.origin, mesh.origin)
     assert list(got.attributes) == list(mesh.attributes)
     for name, values in mesh.attributes.items():

@@ -17,7 +17,6 @@ MOST_LINES_OF_THE_COMMAND_LINE = 6100
 KINDS = {".py", ".h", ".cpp", ".js", ".wgsl", ".html", ".css"}
 
 LONGER = {
-    "csrc/gradient.h": "the backward pass in one piece, so that the compiler inlines it",
     "csrc/fan_filter.h": "the filter and its adjoint share the moments of a fan",
     "csrc/splats.h": "projection, order and blending of splats in one piece, as in gradient.h",
     "cli/common.py": "options of all commands",

@@ -100,6 +100,7 @@ def test_take_carries_everything_of_the_chosen_triangles(chosen):
     assert_same(by_corner(taken), {name: value[chosen] for name, value in by_corner(mesh).items()})
     assert len(np.unique(taken.faces)) == len(taken.vertices)
     assert (taken.filter_px2, taken.blending) == (mesh.filter_px2, mesh.blending)
+    assert replace(mesh, order="splat").take(chosen).order == "splat"
 
 
 def test_take_of_all_has_the_same_bits_and_drops_unused_vertices():
@@ -213,6 +214,7 @@ def test_joined_meshes_far_apart_keep_their_detail():
     [
         ({"blending": "linear"}, "the same blending: 'display' first, 'linear' in parts.1."),
         ({"filter_px2": 0.0}, "the same filter_px2: 0.3 first, 0.0 in parts.1."),
+        ({"order": "splat"}, "the same order: 'fragment' first, 'splat' in parts.1."),
         ({"up": (0, 0, 1)}, r"the same up: .* in parts.1."),
         ({"normals": None}, "normals is 3 numbers wide first, missing in parts.1."),
         ({"attributes": {}}, "attribute 'flow' is 2 numbers wide first, missing in parts.1."),

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +29,7 @@ from meshsplats.levels import (
     views_to_score,
 )
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 
 TABLE = "levels.json"
 OnLevel = Callable[[int, Level], AbstractContextManager[Callable[[Progress], None] | None]]
@@ -52,6 +53,8 @@ class ChainOptions:
     up: Sequence[float] | np.ndarray | None = None
     sh_degree: int | None = None
     """Of the images of the splats; None: all that are stored."""
+    order: Order | None = None
+    """In which triangles are blended and tuned; None: that of the meshes and of the configuration."""
     threads: int | None = None
 
     def plan(self, splats: int) -> list[Level]:
@@ -142,7 +145,11 @@ def _made(
             own = merged(splats, each, [view.camera for view in seen], threads)
             splats = own if merges_further(each) else splats
     run = RunOptions(threads=threads, spent=time.perf_counter() - start)
+    if chosen.order is not None and config is not None:
+        config = replace(config, order=chosen.order)
     mesh = make_level(own, level, targets, config, run=run, on_progress=show, up=chosen.up)
+    if chosen.order is not None:
+        mesh = replace(mesh, order=chosen.order)
     choice = None
     if chosen.alpha == "auto" and chosen.format == "glb":
         choice = choose_alpha(mesh, cameras, threads=threads)

@@ -14,6 +14,7 @@ from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import encode_array, encode_depth_png, encode_image, straight_rgba
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.samples import needed_samples
 from meshsplats.tiles.drawing import MAX_ERROR, render_tiles, samples_for
@@ -35,6 +36,7 @@ class FrameOptions:
     sh_degree: int | None = None
     max_layers: int | None = None
     cutoff: float | None = None
+    order: Order | None = None
     device: Literal["cpu", "gpu"] = "cpu"
     depth: Literal["none", "png", "npy"] = "none"
     """Depth images of meshes: 16-bit PNG, in steps of ``depth_unit``, or float arrays."""
@@ -102,7 +104,7 @@ class _Frames:
             drawn = render_splats(scene, camera, sh_degree=chosen.sh_degree, **common)
         else:
             common |= {"max_layers": chosen.max_layers, "depth": chosen.depth != "none"}
-            common |= {"cutoff": chosen.cutoff, "device": chosen.device}
+            common |= {"cutoff": chosen.cutoff, "order": chosen.order, "device": chosen.device}
             if isinstance(scene, Tileset):
                 drawn = render_tiles(scene, camera, max_error=chosen.max_error, **common)
             else:

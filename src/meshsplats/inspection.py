@@ -154,6 +154,7 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
         "up": _rounded(mesh.up),
         "blending": mesh.blending,
         "filter_px2": mesh.filter_px2,
+        "order": mesh.order,
         "normals": mesh.normals is not None,
         "depth_groups": mesh.depth_group is not None,
         "attributes": list(mesh.attributes),

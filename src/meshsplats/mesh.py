@@ -13,6 +13,7 @@ from meshsplats._arrays import checked_array, chosen_rows, joined_rows
 from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
+from meshsplats.order import Order, checked_order
 
 Blending = Literal["display", "linear"]
 
@@ -42,6 +43,7 @@ class Triangles(NamedTuple):
     depth_group: np.ndarray | None = None
     """(f,) int32"""
     filter_px2: float = 0.0
+    order: Order = "fragment"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,9 @@ class SplatMesh:
     filter_px2: float = 0.0
     """Variance in square pixels, 0 to 100, of the low-pass filter that ``render`` applies to the triangles of
     each splat, as splat renderers do; 0: none. Needs ``face_splat``."""
+    order: Order = "fragment"
+    """What is sorted: 'fragment', triangles at every sample, or 'splat', whole splats by their centres, as
+    splat renderers do. 'splat' needs ``face_splat``."""
     binding: Binding | None = None
     """For a mesh prior: where the vertices lie on the faces of its base mesh, each triangle on one face."""
     origin: np.ndarray = field(default_factory=zero_origin)
@@ -123,6 +128,7 @@ class SplatMesh:
             known = ", ".join(get_args(Blending))
             raise ValueError(f"blending must be one of {known}, got {self.blending!r}")
         set_("filter_px2", checked_filter(self.filter_px2, self.face_splat))
+        checked_order(self.order, self.face_splat)
         attributes = {}
         for name, value in self.attributes.items():
             ndim = np.ndim(value)
@@ -146,6 +152,7 @@ class SplatMesh:
         parts += [f"blending {self.blending!r}", *(f"attribute {name!r}" for name in self.attributes)]
         parts += ["normals"] if self.normals is not None else []
         parts += ["bound to a base"] if self.binding is not None else []
+        parts += [f"order {self.order!r}"] if self.order != "fragment" else []
         parts += [f"origin {in_words(self.origin)}"] if self.origin.any() else []
         return f"SplatMesh({', '.join(parts)})"
 
@@ -160,16 +167,18 @@ class SplatMesh:
             face_splat=self.face_splat,
             depth_group=self.depth_group,
             filter_px2=self.filter_px2,
+            order=self.order,
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The contents of the mesh by name: its fields, ``attribute.NAME`` and ``binding.NAME``.
 
-        ``blending`` (a text) and ``filter_px2`` are arrays without dimensions. Optional arrays that are None,
-        a filter of 0 and an origin of zeros are left out.
+        ``blending`` and ``order`` (texts) and ``filter_px2`` are arrays without dimensions. Optional arrays
+        that are None, a filter of 0, the order by the fragment and an origin of zeros are left out.
         """
         arrays = {f.name: getattr(self, f.name) for f in self.FIELDS if not f.optional}
         arrays["blending"] = np.array(self.blending)
+        arrays |= {} if self.order == "fragment" else {"order": np.array(self.order)}
         optional = {f.name: getattr(self, f.name) for f in self.FIELDS if f.optional}
         arrays |= {name: value for name, value in optional.items() if value is not None}
         if self.filter_px2:
@@ -200,6 +209,7 @@ class SplatMesh:
             **{f.name: arrays[f.name] for f in cls.FIELDS if f.name in arrays or not f.optional},
             blending=str(arrays["blending"]),  # type: ignore[arg-type]
             filter_px2=float(arrays.get("filter_px2", 0.0)),
+            order=str(arrays.get("order", "fragment")),  # type: ignore[arg-type]
             origin=arrays.get("origin", zero_origin()),
             attributes={name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)},
             binding=Binding.from_arrays({n: arrays[f"binding.{n}"] for n in names}) if bound else None,
@@ -281,9 +291,9 @@ class SplatMesh:
     def joined(parts: Sequence[SplatMesh], *, same_splats: bool = False) -> SplatMesh:
         """One mesh of all ``parts``, at least one, vertices and triangles one part behind the other.
 
-        The parts must agree in ``blending``, ``filter_px2`` and ``up``, in the base that they are bound to,
-        and in which optional arrays and attributes they have; only ``depth_group`` may be missing in some.
-        Positions are relative to the first ``origin`` that is not zero. Depth groups stay apart.
+        The parts must agree in ``blending``, ``filter_px2``, ``order``, ``up``, in their base, and in which
+        optional arrays and attributes they have; only ``depth_group`` may be missing in some. Positions are
+        relative to the first ``origin`` that is not zero. Depth groups stay apart.
 
         Args:
             parts: the meshes.
@@ -329,7 +339,7 @@ class SplatMesh:
 
     def check_alike(self, other: SplatMesh, name: str) -> None:
         """Raises ValueError, which names the ``other`` mesh, unless both can be joined; bases may differ."""
-        for what in ("blending", "filter_px2"):
+        for what in ("blending", "filter_px2", "order"):
             if (own := getattr(self, what)) != (theirs := getattr(other, what)):
                 raise ValueError(
                     f"meshes to be joined must have the same {what}: {own!r} first, {theirs!r} in {name}"

@@ -127,6 +127,21 @@ def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, o
     assert printed == pytest.approx(scored, abs=0.005)
 
 
+def test_order_is_tuned_recorded_and_drawn(tmp_path, capsys):
+    save_gaussians(make_scene(200), tmp_path / "scene.ply")
+    options = ["--steps", "2", "--views", "4", "--width", "32"]
+    for order in ("fragment", "splat"):
+        out = tmp_path / f"{order}.npz"
+        assert run(tmp_path / "scene.ply", "-o", out, "--order", order, *options) == 0
+        assert load_mesh(out).order == order
+    by_splat, exact = (load_mesh(tmp_path / f"{order}.npz") for order in ("splat", "fragment"))
+    assert not np.array_equal(by_splat.colors, exact.colors)  # other gradients
+    capsys.readouterr()
+    cut = ["--opacity", "cutoff", "--order", "splat"]
+    assert run(tmp_path / "scene.ply", "-o", tmp_path / "cut.glb", *cut, *options) != 0
+    assert "order 'splat' is for opacity 'blended'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("kernel", "options", "filtered"),
     [

@@ -283,6 +283,8 @@ def test_a_cutoff_draws_solid_triangles_or_none(triangle, tmp_path):
         (("--cutoff", "1.5"), "cutoff must be an opacity from 0 to 1"),
         (("--cutoff", "0.5", "--max-layers", "3"), "--max-layers has no effect with --cutoff"),
         (("--cutoff", "0.5", "--as-splats"), "--cutoff is for a mesh"),
+        (("--cutoff", "0.5", "--order", "splat"), "order='splat' blends splats, and a cutoff"),
+        (("--order", "splat", "--as-splats"), "--order is that of a mesh: leave out --as-splats"),
     ],
 )
 def test_a_cutoff_that_says_nothing_is_refused(splats, tmp_path, capsys, options, message):

@@ -444,7 +444,9 @@ def test_files_of_a_run(scene, tmp_path):
     assert lines[0]["loss"] is None
     assert lines[-1]["psnr"] > lines[0]["psnr"]
     assert lines[-1]["ssim"] > lines[0]["ssim"]
-    tuned = State.resume(load_checkpoint(Journal(folder).checkpoint_path).arrays, "display", 12, config, None)
+    tuned = State.resume(
+        load_checkpoint(Journal(folder).checkpoint_path).arrays, "display", "fragment", 12, config, None
+    )
     scores = evaluate(tuned.result(), dataset).method("mesh")
     assert lines[-1]["psnr"] == pytest.approx(scores.mean("psnr"))
     assert lines[-1]["ssim"] == pytest.approx(scores.mean("ssim"))
@@ -523,3 +525,20 @@ def test_killed_at_random_moments_nothing_is_lost(tmp_path):
         finetune(mesh, dataset, make_config(steps=40), run=RunOptions(folder))
     tuned = finetune(mesh, dataset, make_config(steps=40), run=RunOptions(folder, resume=True))
     assert same(tuned, whole)
+
+
+def test_a_mesh_keeps_its_order_unless_another_is_asked_for():
+    exact = convert(make_scene(200))
+    by_splat = replace(exact, order="splat")
+    for mesh, asked, expected in (
+        (exact, "mesh", "fragment"),
+        (exact, "splat", "splat"),
+        (by_splat, "mesh", "splat"),
+        (by_splat, "fragment", "fragment"),
+    ):
+        state = State.begin(mesh, 2, make_config(steps=1, order=asked), None)
+        assert (state.triangles.order, state.result().order) == (expected, expected)
+    cut = make_config(steps=1, opacity="cutoff")
+    assert State.begin(by_splat, 2, cut, None).triangles.order == "fragment"
+    with pytest.raises(ValueError, match="order='splat' blends whole splats, but the mesh does not know"):
+        State.begin(replace(exact, face_splat=None), 2, make_config(steps=1, order="splat"), None)

@@ -3,6 +3,7 @@
 import json
 import struct
 import warnings
+from dataclasses import replace
 
 import _splat_encoders as encode
 import numpy as np
@@ -279,7 +280,7 @@ def test_our_mesh_moved_by_another_program(tmp_path):
 
 
 def test_our_extras_renumbered_by_another_program_are_not_believed(tmp_path):
-    mesh = random_mesh(np.random.default_rng(0))
+    mesh = replace(random_mesh(np.random.default_rng(0)), order="splat")
     save_mesh(mesh, tmp_path / "m.glb")
 
     def renumber(document):
@@ -291,9 +292,10 @@ def test_our_extras_renumbered_by_another_program_are_not_believed(tmp_path):
         del document["meshes"][0]["primitives"][0]["attributes"]["_FLAT"]
 
     edit_glb(tmp_path / "m.glb", renumber)
-    with pytest.warns(DataWarning, match="left out: face_splat, depth_group, flat"):
+    with pytest.warns(DataWarning, match="left out: face_splat, depth_group, the order of its splats, flat"):
         got = load_mesh(tmp_path / "m.glb")
     assert got.face_splat is None
+    assert got.order == "fragment"
     assert got.depth_group is None
     assert "flat" not in got.attributes
     np.testing.assert_array_equal(got.attributes["FLAT"], mesh.attributes["FLAT"])
@@ -331,6 +333,16 @@ def test_ply_polygons_become_triangles(tmp_path):
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4]]
     assert mesh.face_splat.tolist() == [4, 5, 5, 5]
     np.testing.assert_allclose(mesh.colors[3], [0.2, 0.2, 0.2, 1], atol=1e-7)
+
+
+def test_a_ply_that_has_lost_its_splats_has_lost_their_order_and_filter(tmp_path):
+    mesh = replace(random_mesh(np.random.default_rng(0)), order="splat", filter_px2=0.3)
+    save_mesh(mesh, tmp_path / "m.ply")
+    whole = (tmp_path / "m.ply").read_bytes()
+    (tmp_path / "m.ply").write_bytes(whole.replace(b"property int face_splat", b"property int other_name"))
+    with pytest.warns(DataWarning, match="left out: the filter of its splats, their order"):
+        got = load_mesh(tmp_path / "m.ply")
+    assert (got.order, got.filter_px2) == ("fragment", 0)
 
 
 @pytest.mark.parametrize("order", "<>")

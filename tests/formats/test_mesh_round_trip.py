@@ -31,10 +31,16 @@ SUFFIXES = (".npz", ".ply", ".glb")
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@given(seed=st.integers(0, 2**32 - 1), extras=st.booleans(), blending=st.sampled_from(["display", "linear"]))
-def test_round_trip(tmp_path_factory, suffix, seed, extras, blending):
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    extras=st.booleans(),
+    blending=st.sampled_from(["display", "linear"]),
+    order=st.sampled_from(["fragment", "splat"]),
+)
+def test_round_trip(tmp_path_factory, suffix, seed, extras, blending, order):
     rng = np.random.default_rng(seed)
     mesh = random_mesh(rng, *rng.integers(3, 40, 2), extras=extras, blending=blending)
+    mesh = replace(mesh, order=order if extras else "fragment")
     path = tmp_path_factory.mktemp("mesh") / f"mesh{suffix}"
     save_mesh(mesh, path)
     assert_same(load_mesh(path), mesh, 1 / 10_000 if suffix == ".glb" else 0)

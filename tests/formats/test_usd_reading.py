@@ -75,11 +75,14 @@ def test_a_mesh_of_ours_that_was_moved_is_read_where_it_stands(tmp_path):
 @needs_usd
 @pytest.mark.parametrize("first", ["", "9, "], ids=["one too few", "not in order"])
 def test_splat_numbers_that_no_longer_fit_are_left_out(tmp_path, first):
-    save_mesh(replace(MESH, normals=None, attributes={}), tmp_path / "m.usda")
+    save_mesh(replace(MESH, normals=None, attributes={}, order="splat"), tmp_path / "m.usda")
     text = (tmp_path / "m.usda").read_text()
+    assert read(tmp_path, text)[1]["order"] == "splat"
     at = text.index("int[] primvars:face_splat = [") + len("int[] primvars:face_splat = [")
     arrays, report = read(tmp_path, text[:at] + first + text[text.index(",", at) + 1 :])
-    assert report["warnings"] == ["another program has altered the file, left out: face_splat"]
+    lost = "face_splat, the order of its splats"
+    assert report["warnings"] == [f"another program has altered the file, left out: {lost}"]
+    assert "order" not in report
     assert "face_splat" not in arrays
     np.testing.assert_array_equal(arrays["depth_group"], MESH.depth_group)
 

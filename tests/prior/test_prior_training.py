@@ -234,10 +234,10 @@ def test_a_checkpoint_with_a_broken_binding_is_refused(task, tmp_path):
     base, data = task
     train_prior(bind(base), data, make_config(steps=1), run=RunOptions(folder=tmp_path / "run", threads=1))
     arrays = dict(load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").arrays)
-    assert set(mesh_arrays(stored_mesh(arrays, "display"))) <= set(arrays)
+    assert set(mesh_arrays(stored_mesh(arrays, "display", "fragment"))) <= set(arrays)
     lacking = {k: v for k, v in arrays.items() if k != "mesh.binding.weights"}
     with pytest.raises(FileFormatError, match=r"lacks 'mesh.binding.weights'"):
-        stored_mesh(lacking, "display")
+        stored_mesh(lacking, "display", "fragment")
     arrays["mesh.binding.vertex_face"] = arrays["mesh.binding.vertex_face"] + 10**6
     with pytest.raises(FileFormatError, match="vertex_face must be indices"):
-        stored_mesh(arrays, "display")
+        stored_mesh(arrays, "display", "fragment")

@@ -39,6 +39,7 @@ def assert_same_but_rounded(back: SplatMesh, mesh: SplatMesh, precision: Precisi
         assert (ours is None) == (theirs is None)
         assert ours is None or np.array_equal(ours, theirs)
     assert (back.blending, back.filter_px2) == (mesh.blending, mesh.filter_px2)
+    assert back.order == mesh.order
     assert np.allclose(back.up, mesh.up, atol=1e-6)
     step = max(radius * 2.0**-precision.position, np.ptp(mesh.vertices, axis=0).max() * FINER * 2.0**-31)
     size = float(np.abs(mesh.vertices).max())
@@ -85,6 +86,7 @@ def meshes(draw: st.DrawFn) -> SplatMesh:
         up=random.normal(0, 1, 3),
         blending=draw(st.sampled_from(["display", "linear"])),
         filter_px2=0.3 if known and draw(st.booleans()) else 0.0,
+        order="splat" if known and draw(st.booleans()) else "fragment",
     )
 
 

@@ -254,7 +254,9 @@ def test_a_broken_limit_of_windows_is_refused(scene, value):
     config = make_config(steps=8)
     arrays = State.begin(mesh, 6, config, None, device="gpu").arrays()
     with pytest.raises(FileFormatError, match="window_samples must be a whole number"):
-        State.resume(arrays | {"window_samples": np.asarray(value)}, "display", 6, config, None, "gpu")
+        State.resume(
+            arrays | {"window_samples": np.asarray(value)}, "display", "fragment", 6, config, None, "gpu"
+        )
 
 
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path):

@@ -52,6 +52,7 @@ class MeshStruct(CoreStruct):
         ("normals", c_void_p),
         ("attributes", c_void_p),
         ("attribute_count", c_int32),
+        ("by_splat", c_int32),
         ("filter_px2", c_double),
     ]
 

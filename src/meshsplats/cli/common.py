@@ -296,6 +296,9 @@ class DrawOptions:
     max_layers: Count = None
     """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default:
     all."""
+    order: Literal["fragment", "splat"] | None = None
+    """Order in which the triangles of a mesh are blended: exact at every sample, or whole splats by their
+    centres. Default: that of the mesh."""
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
     device: Literal["cpu", "gpu"] = "cpu"

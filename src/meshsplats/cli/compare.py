@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -96,6 +96,8 @@ class Compare(Command):
             if identify(self.mesh) != "mesh":
                 raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
             mesh = self.part.of(load_mesh(self.mesh, origin=cloud.origin))
+        if self.draw.order is not None:
+            mesh = replace(mesh, order=self.draw.order)
         start = time.perf_counter()
         background = choose_background(
             optional_color(self.draw.background),

@@ -116,6 +116,9 @@ class Evaluate(Command):
     samples: Count = None
     """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
     with --look splats."""
+    order: Literal["fragment", "splat"] | None = None
+    """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
+    centres. Default: that of each mesh."""
     background: Text = None
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs without
     alpha that of the model folder, else black or white, the one that fits the splats best."""
@@ -189,7 +192,7 @@ class Evaluate(Command):
         if self.protocol is not None:
             if self.data is None or len(self.mesh) != 1:
                 raise UsageError("--protocol needs a folder of meshes or models, and --data with the scenes")
-            for name in ("before", "splats", "images", "cameras", "sh_degree"):
+            for name in ("before", "splats", "images", "cameras", "sh_degree", "order"):
                 if getattr(self, name) is not None:
                     raise UsageError(f"{flag(name)} has no effect with --protocol")
             if self.missing != "error":
@@ -224,7 +227,7 @@ class Evaluate(Command):
             raise FileFormatError(
                 f"{path}: splats, not a mesh; give them with --splats, or convert them first"
             )
-        return found
+        return found if self.order is None else replace(found, order=self.order)
 
     def _dataset(self, splats: GaussianCloud | None, origin: np.ndarray | None) -> Dataset:
         if self.data is not None:

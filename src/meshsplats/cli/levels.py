@@ -80,6 +80,9 @@ class Levels(Command):
     """Length of the fine-tuning of each level. Default: 2."""
     steps: Count = None
     """Length of the fine-tuning of each level, in place of --minutes."""
+    order: Literal["fragment", "splat"] = "fragment"
+    """Order in which triangles are blended, tuned and scored: exact at every sample, or whole splats by their
+    centres."""
     sh_degree: Count = None
     """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
     up: Text = None
@@ -122,6 +125,7 @@ class Levels(Command):
             alpha=self.alpha,
             up=None if self.up is None else parse_up(self.up),
             sh_degree=self.sh_degree,
+            order=self.order,
             threads=self.threads,
         )
         options.plan(len(cloud))  # before the folder is made

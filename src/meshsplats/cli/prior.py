@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     PriorTuningOptions = FinetuneConfig
 else:
     PriorTuningOptions = tuning_options(
-        "The optimisation.", lambda name: f"(default: {getattr(prior_config(), name)})"
+        "The optimisation.",
+        lambda name: f"(default: {getattr(prior_config(), name)})",
+        without=("order",),  # layers on a base share a depth, which only the order of fragments knows
     )
 
 

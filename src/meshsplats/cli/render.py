@@ -162,6 +162,7 @@ class Render(Command):
             sh_degree=self.draw.sh_degree,
             max_layers=self.draw.max_layers,
             cutoff=self.cutoff,
+            order=self.draw.order,
             device=self.draw.device,
             depth=self.depth,
             depth_unit=unit,
@@ -231,6 +232,8 @@ class Render(Command):
                 )
         if self.as_splats and self.draw.max_layers is not None:
             raise UsageError("--max-layers counts triangles: it has no effect with --as-splats")
+        if self.as_splats and self.draw.order is not None:
+            raise UsageError("--order is that of a mesh: leave out --as-splats")
         if self.as_splats and self.draw.device == "gpu":
             raise UsageError("--device gpu draws meshes: leave out --as-splats")
         self.draw.check_device()

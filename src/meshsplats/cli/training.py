@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -58,13 +58,15 @@ _CHANGEABLE = {
 ShowProgress = Callable[[Progress], None]
 
 
-def tuning_options(about: str, default_of: Callable[[str], str]) -> type[FinetuneConfig]:
+def tuning_options(
+    about: str, default_of: Callable[[str], str], without: Sequence[str] = ()
+) -> type[FinetuneConfig]:
     """The configuration of an optimisation as command-line options. ``about``: their description;
-    ``default_of``: the end of an option's help."""
+    ``default_of``: the end of an option's help; ``without``: options that it does not have."""
     return as_cli_options(
         FinetuneConfig,
         about,
-        without=("preset", *LENGTHS),
+        without=("preset", *LENGTHS, *without),
         defaults=default_of,
         checked=False,
     )

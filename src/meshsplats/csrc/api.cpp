@@ -17,6 +17,7 @@
 #include "viewer.h"
 #endif
 #include "mesh_tile.h"
+#include "splat_order_tile.h"
 #include "splats.h"
 #include "ssim.h"
 
@@ -58,20 +59,35 @@ void render_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::T
     worker.render(x, y, list, length);
 }
 
-// Forward pass; records on `tape` if it is not null.
-int64_t render_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera,
-                    const MsOptions &options, const MsImage &image, ms::Tape *tape) {
+ms::Grid mesh_grid(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options) {
+    return ms::Grid(camera, options.samples, mesh.by_splat ? ms::LARGE_TILE : ms::TILE);
+}
+
+// Forward pass by tiles of one class; records on `tape` if it is not null.
+template <class Tile>
+int64_t render_mesh_tiles(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera,
+                          const MsOptions &options, const MsImage &image, ms::Tape *tape) {
     return render_tiles(
         grid, scene.items, options.threads,
         [&] {
-            auto worker = std::make_unique<ms::MeshTile>(scene, ms::ImageTile(scene, options, image, camera));
-            if (tape) worker->image().record_tape();
+            auto worker = std::make_unique<Tile>(scene, ms::ImageTile(scene, options, image, camera));
+            if (tape) worker->record_tape();
             return worker;
         },
-        [&](ms::MeshTile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
+        [&](Tile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
             render_tile(grid, worker, tile, list, length);
-            if (tape) tape->record(tile, worker.image().tape(), *worker.image().coverage());
+            if (tape)
+                tape->record(tile, [&](ms::PackedTape &packed, auto allocate) {
+                    return worker.image().pack_tape(packed, allocate);
+                });
         });
+}
+
+int64_t render_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera,
+                    const MsOptions &options, const MsImage &image, ms::Tape *tape) {
+    if (scene.mesh.by_splat)
+        return render_mesh_tiles<ms::SplatOrderTile>(scene, grid, camera, options, image, tape);
+    return render_mesh_tiles<ms::MeshTile>(scene, grid, camera, options, image, tape);
 }
 
 // The results of the forward pass that the backward pass needs.
@@ -92,7 +108,7 @@ class BackwardPass {
           filter_(record.filter.get()),
           image_gradients_(image_gradients),
           out_(out),
-          grid_(camera, options.samples),
+          grid_(mesh_grid(mesh, camera, options)),
           scene_(mesh, camera, grid_, options.threads, !tape_.complete(), filter_),
           threads_((int)std::min<int64_t>(options.threads, grid_.tiles())),
           filtered_positions_(filter_ ? 3 * mesh.vertex_count : 0),
@@ -119,8 +135,10 @@ class BackwardPass {
 
     struct Worker {
         ms::GradientTile gradient;
-        std::unique_ptr<ms::MeshTile> forward;  // to render tiles again
-        ms::PackedTape tape;                    // of such a tile
+        // To render tiles again, one of them:
+        std::unique_ptr<ms::MeshTile> by_fragment;
+        std::unique_ptr<ms::SplatOrderTile> by_splat;
+        ms::PackedTape tape;  // of such a tile
         ms::PooledVector<unsigned char> tape_memory;
     };
 
@@ -132,8 +150,11 @@ class BackwardPass {
             ms::on_threads(threads_, [&](int thread) {
                 auto &worker = workers_[thread];
                 if (!worker)
-                    worker.reset(new Worker{
-                        ms::GradientTile(scene_, options_, camera_, image_gradients_), nullptr, {}, {}});
+                    worker.reset(new Worker{ms::GradientTile(scene_, options_, camera_, image_gradients_),
+                                            nullptr,
+                                            nullptr,
+                                            {},
+                                            {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
                     const int64_t tile = begin + i;
                     const ms::PackedTape *tape = tape_.find(tile);
@@ -161,17 +182,22 @@ class BackwardPass {
     }
 
     const ms::PackedTape &render_again(Worker &worker, int64_t tile, const ms::TileLists &lists) const {
-        if (!worker.forward) {
-            worker.forward =
-                std::make_unique<ms::MeshTile>(scene_, ms::ImageTile(scene_, options_, no_image_, camera_));
-            worker.forward->image().record_tape();
+        return scene_.mesh.by_splat ? render_again(worker.by_splat, worker, tile, lists)
+                                    : render_again(worker.by_fragment, worker, tile, lists);
+    }
+
+    template <class Tile>
+    const ms::PackedTape &render_again(std::unique_ptr<Tile> &forward, Worker &worker, int64_t tile,
+                                       const ms::TileLists &lists) const {
+        if (!forward) {
+            forward = std::make_unique<Tile>(scene_, ms::ImageTile(scene_, options_, no_image_, camera_));
+            forward->record_tape();
         }
-        render_tile(grid_, *worker.forward, tile, lists.list(tile), lists.length(tile));
-        worker.tape.pack(worker.forward->image().tape(), *worker.forward->image().coverage(),
-                         [&](size_t bytes) {
-                             worker.tape_memory.resize(bytes);
-                             return worker.tape_memory.data();
-                         });
+        render_tile(grid_, *forward, tile, lists.list(tile), lists.length(tile));
+        forward->image().pack_tape(worker.tape, [&](size_t bytes) {
+            worker.tape_memory.resize(bytes);
+            return worker.tape_memory.data();
+        });
         return worker.tape;
     }
 
@@ -217,7 +243,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 9; }
+MS_EXPORT int ms_interface_version() { return 10; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -241,7 +267,7 @@ MS_EXPORT const char *ms_best_variant() {
 MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
                              MsImage *image, char *message, int message_size) {
     return guarded(message, message_size, [&] {
-        ms::Grid grid(*camera, options->samples);
+        const ms::Grid grid = mesh_grid(*mesh, *camera, *options);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
         image->fragments = render_mesh(scene, grid, *camera, *options, *image, nullptr);
     });
@@ -252,7 +278,7 @@ MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const M
 MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
                            MsImage *image, int64_t budget, void **tape, char *message, int message_size) {
     return guarded(message, message_size, [&] {
-        ms::Grid grid(*camera, options->samples);
+        const ms::Grid grid = mesh_grid(*mesh, *camera, *options);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
         std::unique_ptr<ForwardRecord> record(new ForwardRecord{{grid.tiles(), budget}, nullptr});
         image->fragments = render_mesh(scene, grid, *camera, *options, *image, &record->tape);

@@ -13,20 +13,23 @@
 
 namespace ms {
 
-// Largest tile side in samples. Fixed, so that rounding does not depend on the vector width.
-constexpr int TILE = 16;
+// Largest tile side in samples. Fixed, so that rounding does not depend on the vector width. Large tiles set
+// up fewer triangles twice; the queues of fragments fit the cache with small ones.
+constexpr int TILE = 16, LARGE_TILE = 32;
 
 struct Grid {
     int samples;        // per pixel and axis
     int width, height;  // in samples
-    int tile_side;  // in samples: the largest multiple of `samples` up to TILE, so tiles hold whole pixels
+    int largest_side;   // of a tile: TILE or LARGE_TILE
+    int tile_side;      // in samples: the largest multiple of `samples` up to it, so tiles hold whole pixels
     int tiles_x, tiles_y;  // number of tiles, at most 2^15 each
 
-    Grid(const MsCamera &camera, int samples)
+    Grid(const MsCamera &camera, int samples, int largest_side = TILE)
         : samples(samples),
           width(camera.width * samples),
           height(camera.height * samples),
-          tile_side(TILE / samples * samples),
+          largest_side(largest_side),
+          tile_side(largest_side / samples * samples),
           tiles_x((width + tile_side - 1) / tile_side),
           tiles_y((height + tile_side - 1) / tile_side) {
         MS_ASSERT(samples >= 1 && samples <= TILE);
@@ -61,13 +64,13 @@ struct Grid {
     }
 
   private:
-    // 2^32 / tile_side, rounded up: tile_of is exact for samples below 2^28 and sides up to 16.
+    // 2^32 / tile_side, rounded up: tile_of is exact for samples below 2^28 and sides up to 32.
     uint64_t reciprocal_ = (UINT64_C(1) << 32) / tile_side + 1;
 };
 
 // An entry of a tile list: a group of consecutive triangles, or a splat.
 struct TileEntry {
-    float key;  // largest 1 / depth in the group, >= 0: no fragment of it is nearer
+    float key;  // greater is nearer: see bound_group of Scene; of a splat, 1 / depth of its centre
     int32_t first, length;
 };
 
@@ -89,7 +92,7 @@ inline bool sample_range(double lo, double hi, int count, int &first, int &last)
 }
 
 // Sorts items nearest first, by a stable LSD radix sort of the bits of their keys: floats >= 0 order like
-// their bit patterns, and the complement turns the order around.
+// their bit patterns, and the complement turns the order around. Negative floats do so already.
 inline void sort_items(std::vector<BinItem> &items) {
     struct Slot {
         uint32_t key, item;
@@ -100,11 +103,13 @@ inline void sort_items(std::vector<BinItem> &items) {
     std::vector<uint32_t> start(PASSES * DIGITS);
     auto digit = [](uint32_t key, int pass) { return key >> (BITS * pass) & (DIGITS - 1); };
     for (size_t i = 0; i < items.size(); ++i) {
-        MS_ASSERT(items[i].entry.key >= 0);
-        uint32_t bits;
-        std::memcpy(&bits, &items[i].entry.key, 4);
-        slots[i] = {~bits, (uint32_t)i};
-        for (int pass = 0; pass < PASSES; ++pass) ++start[pass * DIGITS + digit(~bits, pass)];
+        const float value = items[i].entry.key + 0.0f;  // no -0
+        MS_ASSERT(value == value);
+        uint32_t key;
+        std::memcpy(&key, &value, 4);
+        key = key >> 31 ? key : ~key & 0x7fffffff;
+        slots[i] = {key, (uint32_t)i};
+        for (int pass = 0; pass < PASSES; ++pass) ++start[pass * DIGITS + digit(key, pass)];
     }
     for (int pass = 0; pass < PASSES; ++pass) {
         uint32_t sum = 0, *counts = &start[pass * DIGITS];

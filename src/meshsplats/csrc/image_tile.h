@@ -34,7 +34,7 @@ class ImageTile {
           image_(image),
           camera_(camera),
           extras_(image, scene.mesh),
-          extra_sums_((size_t)SAMPLES * extras_.count) {
+          extra_sums_((size_t)MAX_SAMPLES * extras_.count) {
         MS_ASSERT(options.min_transmittance >= 0 && options.min_transmittance < 1 && options.max_layers >= 0);
     }
 
@@ -45,11 +45,20 @@ class ImageTile {
         MS_ASSERT(!has_cutoff(options_) || has_ramp(options_));
         tape_ = std::make_unique<TileTape>();
     }
-    const TileTape &tape() const { return *tape_; }
+    void record_splat_tape() {
+        MS_ASSERT(!has_cutoff(options_));
+        splat_tape_ = std::make_unique<SplatTape>();
+    }
+    SplatTape *splat_tape() { return splat_tape_.get(); }
+    // Packs the tape of the tile into memory that allocate(bytes) returns.
+    template <class Allocate>
+    bool pack_tape(PackedTape &packed, Allocate &&allocate) {
+        return splat_tape_ ? packed.pack(*splat_tape_, allocate) : packed.pack(*tape_, coverage_, allocate);
+    }
 
     // Where to add the coverage masks of queue entries, or null if nothing needs them.
     TileCoverage *coverage() { return tape_ || extras_.any() ? &coverage_ : nullptr; }
-    bool keeps_transparent() const { return tape_ != nullptr; }
+    bool keeps_transparent() const { return tape_ || splat_tape_; }
     const MsOptions &options() const { return options_; }
     bool needs_weights() const { return extras_.any(); }
     // Number of fragments blended so far, in all tiles.
@@ -60,12 +69,14 @@ class ImageTile {
         area_ = area;
         coverage_.clear();
         if (tape_) tape_->clear();
-        for (int i = 0; i < SAMPLES; ++i) {
+        if (splat_tape_) splat_tape_->clear();
+        std::fill(capped_, capped_ + area.blocks, false);
+        for (int i = 0; i < area.blocks * LANES; ++i) {
             layers_[i] = 0;
             color_[0][i] = color_[1][i] = color_[2][i] = 0;
             transmittance_[i] = capped_transmittance_[i] = 1;
         }
-        for (int block = 0; block < BLOCKS; ++block) active_[block] = area.valid_lanes(block);
+        for (int block = 0; block < area.blocks; ++block) active_[block] = area.valid_lanes(block);
         std::fill(extra_sums_.begin(), extra_sums_.end(), 0.0f);
     }
 
@@ -75,6 +86,47 @@ class ImageTile {
             drain_queue<true>(block, queue, nearest_to_come);
         else
             drain_queue<false>(block, queue, nearest_to_come);
+    }
+
+    // Before fragments of at most this opacity: until one exceeds the cap, the capped transmittance is the
+    // transmittance and needs no arithmetic of its own.
+    void expect_opacity(int block, float opacity) {
+        if (capped_[block] || opacity <= ALPHA_CAP) return;
+        capped_[block] = true;
+        store_lanes(capped_transmittance_ + block * LANES, load_lanes(transmittance_ + block * LANES));
+    }
+
+    // Blends the next fragments of a block, behind all earlier ones, in the lanes `ready`, which are active.
+    // Returns the lanes of the block that are still active. TAPED: with a splat tape. GENERAL: perhaps with
+    // extra outputs, of these masks and weights, or a layer limit.
+    template <bool GENERAL, bool TAPED>
+    __attribute__((always_inline)) LaneMask blend_next(int block, const Lanes rgba[4], LaneMask ready,
+                                                       const FragmentWeights *weights, uint32_t first_mask,
+                                                       uint32_t mask_count) {
+        MS_ASSERT(ready && !(ready & ~active_[block]) && TAPED == (splat_tape_ != nullptr));
+        const Lanes limit = broadcast(options_.min_transmittance);
+        Lanes transmittance = load_lanes(transmittance_ + block * LANES);
+        LaneMask blending = ready;
+        if (TAPED && capped_[block]) blending &= greater_equal(transmittance, limit);
+        const Lanes weight = masked(blending, transmittance * rgba[3]);
+        for (int c = 0; c < 3; ++c)
+            store_lanes(color_[c] + block * LANES, load_lanes(color_[c] + block * LANES) + weight * rgba[c]);
+        transmittance = transmittance - weight;
+        store_lanes(transmittance_ + block * LANES, transmittance);
+        const LaneMask visible = greater(weight, broadcast(0));
+        fragments_ += __builtin_popcount(visible);
+        LaneMask left = greater_equal(transmittance, limit);
+        if (TAPED && capped_[block]) {
+            float *const capped = capped_transmittance_ + block * LANES;
+            const Lanes before = load_lanes(capped),
+                        after = before - masked(ready, before * min_lanes(rgba[3], broadcast(ALPHA_CAP)));
+            store_lanes(capped, after);
+            left |= greater_equal(after, limit);
+        }
+        LaneMask active = active_[block] & left;
+        if (GENERAL && extras_.any()) add_extras(block, first_mask, mask_count, *weights, visible, weight);
+        if (GENERAL && options_.max_layers) count_layers(block, visible, active);
+        return active_[block] = active;
     }
 
     // Removes from a queue the fragments that are hidden behind others of it, whatever else is pushed.
@@ -171,12 +223,10 @@ class ImageTile {
             } else {
                 active &= blending;
             }
-            if (extras_.any()) add_extras(block, queue, entry, visible, weight);
-            if (options_.max_layers) {
-                for (LaneMask rest = visible; rest; rest &= rest - 1)
-                    if (++layers_[block * LANES + __builtin_ctz(rest)] >= options_.max_layers)
-                        active &= ~lowest_lane(rest);
-            }
+            if (extras_.any())
+                add_extras(block, queue.first_mask(entry), queue.mask_count(entry), queue.weights(entry),
+                           visible, weight);
+            if (options_.max_layers) count_layers(block, visible, active);
         });
         MS_ASSERT(!(active & ~active_[block]));
         active_[block] = active;
@@ -192,16 +242,24 @@ class ImageTile {
         tape.add_step(index, lanes);
     }
 
+    // Counts the visible fragments of an entry; samples with all their layers are no longer active.
+    void count_layers(int block, LaneMask visible, LaneMask &active) {
+        for (LaneMask rest = visible; rest; rest &= rest - 1)
+            if (++layers_[block * LANES + __builtin_ctz(rest)] >= options_.max_layers)
+                active &= ~lowest_lane(rest);
+    }
+
     // Adds the extra outputs of the visible fragments of an entry, by their blending weights.
-    void add_extras(int block, const FragmentQueue &queue, int entry, LaneMask visible, const Lanes &weight) {
+    void add_extras(int block, uint32_t first_mask, uint32_t mask_count, const FragmentWeights &fragments,
+                    LaneMask visible, const Lanes &weight) {
         alignas(64) float weights[LANES];
         store_lanes(weights, weight);
-        const CoverageMask *mask = coverage_.masks.data() + queue.first_mask(entry);
-        for (uint32_t i = 0; i < queue.mask_count(entry); ++i) {
+        const CoverageMask *mask = coverage_.masks.data() + first_mask;
+        for (uint32_t i = 0; i < mask_count; ++i) {
             const int32_t face = coverage_.triangles[mask[i].triangle].face;
             for (LaneMask rest = mask[i].lanes & visible; rest; rest &= rest - 1) {
                 const int lane = __builtin_ctz(rest);
-                add_extras(block * LANES + lane, face, queue.weights(entry), lane, weights[lane]);
+                add_extras(block * LANES + lane, face, fragments, lane, weights[lane]);
             }
         }
     }
@@ -288,13 +346,15 @@ class ImageTile {
     const MsCamera &camera_;
     ExtraChannels extras_;
     TileArea area_;
-    alignas(64) float color_[3][SAMPLES];
-    alignas(64) float transmittance_[SAMPLES];
-    alignas(64) float capped_transmittance_[SAMPLES];  // with alphas limited to alpha_cap()
+    alignas(64) float color_[3][MAX_SAMPLES];
+    alignas(64) float transmittance_[MAX_SAMPLES];
+    alignas(64) float capped_transmittance_[MAX_SAMPLES];  // with alphas limited to alpha_cap()
+    bool capped_[MAX_BLOCKS];  // with a splat tape: blocks whose capped transmittance is another
     std::unique_ptr<TileTape> tape_;
+    std::unique_ptr<SplatTape> splat_tape_;
     TileCoverage coverage_;
-    int32_t layers_[SAMPLES];  // fragments blended, if there is a layer limit
-    LaneMask active_[BLOCKS];  // active samples
+    int32_t layers_[MAX_SAMPLES];  // fragments blended, if there is a layer limit
+    LaneMask active_[MAX_BLOCKS];  // active samples
     std::vector<float> extra_sums_;
     int64_t fragments_ = 0;
 };

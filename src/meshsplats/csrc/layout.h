@@ -73,6 +73,7 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsMesh, normals),
     MS_FIELD(MsMesh, attributes),
     MS_FIELD(MsMesh, attribute_count),
+    MS_FIELD(MsMesh, by_splat),
     MS_FIELD(MsMesh, filter_px2),
     MS_WHOLE(MsSplats),
     MS_FIELD(MsSplats, count),

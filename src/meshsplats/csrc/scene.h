@@ -61,6 +61,7 @@ struct Scene {
     std::vector<int32_t> group_start;  // group g: the triangles [group_start[g], group_start[g + 1])
     std::vector<DepthPlane> planes;    // by depth group
     PooledVector<TileBox> boxes;       // by triangle
+    std::vector<float> splat_keys;     // by group, for the order by the splat
     std::vector<BinItem> items;        // groups that may cover samples, nearest first
 
     // Rasterization needs items; replaying a tape does not. `known_filter` is the filter of an earlier scene
@@ -69,7 +70,7 @@ struct Scene {
           const FanFilter *known_filter = nullptr)
         : mesh(mesh), grid(grid), projection(camera, grid.samples), filtered(mesh.filter_px2 > 0) {
         MS_ASSERT(mesh.vertex_count >= 0 && mesh.face_count >= 0 && mesh.face_count <= INT32_MAX);
-        MS_ASSERT(!filtered || mesh.face_splat);
+        MS_ASSERT((!filtered && !mesh.by_splat) || mesh.face_splat);
         if (filtered && !known_filter) {
             filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, threads);
             known_filter = filter.get();
@@ -83,7 +84,10 @@ struct Scene {
         vertices = known_filter ? known_filter->filtered() : projected_.data();
         if (!with_items) return;
         find_groups();
-        if (mesh.depth_group) find_depth_planes();
+        if (mesh.by_splat)
+            find_splat_keys(threads);
+        else if (mesh.depth_group)
+            find_depth_planes();
         find_items(threads);
     }
 
@@ -134,6 +138,32 @@ struct Scene {
             if (!joins) group_start.push_back((int32_t)i);
         }
         group_start.push_back((int32_t)mesh.face_count);
+    }
+
+    // The key of all groups of a splat: minus the depth of its centre, the mean of the corners of its
+    // triangles.
+    void find_splat_keys(int threads) {
+        const int64_t groups = (int64_t)group_start.size() - 1;
+        splat_keys.resize(groups);
+        auto splat = [&](int64_t group) { return mesh.face_splat[group_start[group]]; };
+        parallel_blocks(threads, groups, 1 << 12, [&](int64_t begin, int64_t end, int) {
+            for (int64_t g = begin; g < end; ++g) {
+                if (g > 0 && splat(g) == splat(g - 1)) continue;  // of a splat that began before
+                int64_t last = g;
+                while (last + 1 < groups && splat(last + 1) == splat(g)) ++last;
+                const float key = splat_key(group_start[g], group_start[last + 1]);
+                std::fill(&splat_keys[g], &splat_keys[last] + 1, key);
+            }
+        });
+    }
+
+    float splat_key(int64_t first_face, int64_t end_face) const {
+        double sum[3] = {0, 0, 0};
+        for (const int32_t *corner = mesh.faces + 3 * first_face; corner < mesh.faces + 3 * end_face;
+             ++corner)
+            for (int i = 0; i < 3; ++i) sum[i] += mesh.vertices[3 * (int64_t)*corner + i];
+        const double corners = 3 * (double)(end_face - first_face);
+        return -(float)projection.depth(sum[0] / corners, sum[1] / corners, sum[2] / corners);
     }
 
     // The plane of a depth group is that of its largest triangle in world space.
@@ -209,6 +239,8 @@ struct Scene {
             items.insert(items.end(), part.begin(), part.end());
             std::vector<BinItem>().swap(part);
         }
+        // Of equal depths, the splat that comes later is in front, as where triangles are painted in order.
+        if (mesh.by_splat) std::reverse(items.begin(), items.end());
         sort_items(items);
     }
 
@@ -255,7 +287,8 @@ struct Scene {
         return bounds;
     }
 
-    // Fills the boxes of the triangles of a group, and its item; false if it covers no sample centre.
+    // Fills the boxes of the triangles of a group, and its item; false if it covers no sample centre. The key
+    // is that of the splat, or the largest 1 / depth in the group, so that no fragment of it is nearer.
     bool bound_group(int64_t group, BinItem &item) {
         double key = 0;
         int left = INT_MAX, right = -1, top = INT_MAX, bottom = -1;
@@ -271,11 +304,12 @@ struct Scene {
             boxes[i] = TileBox(x0, x1, y0, y1);
             left = std::min(left, x0), right = std::max(right, x1);
             top = std::min(top, y0), bottom = std::max(bottom, y1);
-            if (mesh.depth_group && mesh.depth_group[i] >= 0)
+            if (!planes.empty() && mesh.depth_group[i] >= 0)
                 bounds.nearest = std::max(bounds.nearest, (double)planes[mesh.depth_group[i]].q_max);
             key = std::max(key, bounds.nearest);
         }
         if (left > right) return false;
+        if (mesh.by_splat) key = splat_keys[group];
         item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]},
                 (uint16_t)left,
                 (uint16_t)right,

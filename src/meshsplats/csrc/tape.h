@@ -86,40 +86,87 @@ struct TileTape {
             steps[step_count++] = {entry, lanes};
         }
     };
-    Block blocks[BLOCKS];
+    Block blocks[MAX_BLOCKS];
 
     void clear() {
         for (Block &block : blocks) block.entry_count = block.step_count = 0;
     }
 };
 
-// A TileTape and its coverage masks, packed into one allocation that the caller owns.
+// A 32-bit index and a LaneMask in 6 bytes.
+struct IndexedLanes {
+    uint16_t low, high, lanes;
+
+    IndexedLanes() = default;
+    IndexedLanes(uint32_t index, LaneMask lanes)
+        : low((uint16_t)index), high((uint16_t)(index >> 16)), lanes((uint16_t)lanes) {
+        MS_ASSERT(lanes <= ALL_LANES);
+    }
+    uint32_t index() const { return low | (uint32_t)high << 16; }
+};
+
+// The tape of one tile in the order of the splats, where every entry is blended whole and at once: its masks
+// need no steps and are in their final form. Vectors only grow.
+struct SplatTape {
+    static constexpr uint32_t NO_INDEX = UINT32_MAX;
+    struct Block {
+        std::vector<IndexedLanes> masks;   // index: in faces
+        std::vector<uint8_t> mask_counts;  // of each entry
+        uint32_t mask_count = 0, entry_count = 0;
+        uint32_t room = 0;  // for masks, and for as many entries
+
+        // Makes room for some masks.
+        void reserve(uint32_t more) {
+            if (mask_count + more <= room) return;
+            room = 2 * (mask_count + more);
+            masks.resize(room);
+            mask_counts.resize(room);
+        }
+        void add_entry(uint32_t masks_of_entry) {
+            MS_ASSERT(entry_count < room && masks_of_entry >= 1 && masks_of_entry <= LANES);
+            mask_counts[entry_count++] = (uint8_t)masks_of_entry;
+        }
+    };
+    std::vector<int32_t> faces;  // in the order of their first masks
+    uint32_t face_count = 0;
+    Block blocks[MAX_BLOCKS];
+
+    // Makes room for some faces, and for one that add_mask writes in vain.
+    void reserve_faces(size_t more) {
+        if (faces.size() <= face_count + more) faces.resize(2 * (face_count + more) + 1);
+    }
+    // Appends the mask of a face with that index, which it gets if it has NO_INDEX. Branch-free, because that
+    // is unpredictable.
+    void add_mask(int block, int32_t face, uint32_t &index, LaneMask lanes) {
+        Block &b = blocks[block];
+        MS_ASSERT(lanes && b.mask_count < b.room && face_count < faces.size());
+        const bool is_new = index == NO_INDEX;
+        index = is_new ? face_count : index;
+        faces[face_count] = face;
+        face_count += is_new;
+        b.masks[b.mask_count++] = IndexedLanes(index, lanes);
+    }
+    void clear() {
+        face_count = 0;
+        for (Block &b : blocks) b.mask_count = b.entry_count = 0;
+    }
+};
+
+// A TileTape and its coverage masks, or a SplatTape, packed into one allocation that the caller owns.
 class PackedTape {
   public:
-    // A 32-bit index and a LaneMask in 6 bytes.
-    struct IndexedLanes {
-        uint16_t low, high, lanes;
-
-        IndexedLanes() = default;
-        IndexedLanes(uint32_t index, LaneMask lanes)
-            : low((uint16_t)index), high((uint16_t)(index >> 16)), lanes((uint16_t)lanes) {
-            MS_ASSERT(lanes <= ALL_LANES);
-        }
-        uint32_t index() const { return low | (uint32_t)high << 16; }
-    };
-
     // Packs into the memory that allocate(bytes) returns, aligned for int32_t; false if that is null. Masks
     // of entries that are not on the tape are left out. Sets packed_index of the triangles that are on it.
     template <class Allocate>
     bool pack(const TileTape &tape, TileCoverage &coverage, Allocate &&allocate) {
-        for (int i = 0; i < BLOCKS; ++i) {
+        for (int i = 0; i < MAX_BLOCKS; ++i) {
             const TileTape::Block &block = tape.blocks[i];
             Ends &end = ends_[i] = i ? ends_[i - 1] : Ends{};
             end.entries += block.entry_count;
             end.steps += block.step_count;
             for (uint32_t j = 0; j < block.entry_count; ++j) end.masks += block.entries[j].mask_count;
         }
-        const Ends &total = ends_[BLOCKS - 1];
+        const Ends &total = ends_[MAX_BLOCKS - 1];
         // One more than there can be, because pack_mask writes the slot behind the last face.
         const size_t max_faces = (size_t)std::min(total.masks, coverage.triangle_count) + 1;
         faces_ =
@@ -144,6 +191,33 @@ class PackedTape {
                 *step++ = IndexedLanes(block.steps[j].entry, block.steps[j].lanes);
         }
         MS_ASSERT(face_count_ < max_faces);
+        return true;
+    }
+
+    // Likewise; without steps.
+    template <class Allocate>
+    bool pack(const SplatTape &tape, Allocate &&allocate) {
+        for (int i = 0; i < MAX_BLOCKS; ++i) {
+            Ends &end = ends_[i] = i ? ends_[i - 1] : Ends{};
+            end.entries += tape.blocks[i].entry_count;
+            end.masks += tape.blocks[i].mask_count;
+        }
+        const Ends &total = ends_[MAX_BLOCKS - 1];
+        face_count_ = tape.face_count;
+        const size_t face_bytes = face_count_ * sizeof(int32_t),
+                     mask_bytes = total.masks * sizeof(IndexedLanes);
+        unsigned char *memory = (unsigned char *)allocate(face_bytes + mask_bytes + total.entries);
+        if (!memory) return false;
+        faces_ = (int32_t *)memory;
+        masks_ = steps_ = (IndexedLanes *)(memory + face_bytes);
+        mask_counts_ = memory + face_bytes + mask_bytes;
+        std::copy_n(tape.faces.data(), face_count_, faces_);
+        IndexedLanes *mask = masks_;
+        uint8_t *mask_count = mask_counts_;
+        for (const SplatTape::Block &block : tape.blocks) {
+            mask = std::copy_n(block.masks.data(), block.mask_count, mask);
+            mask_count = std::copy_n(block.mask_counts.data(), block.entry_count, mask_count);
+        }
         return true;
     }
 
@@ -174,7 +248,7 @@ class PackedTape {
         uint32_t entries = 0, steps = 0, masks = 0;
     };
     Ends begin_of(int block) const {
-        MS_ASSERT(block >= 0 && block < BLOCKS);
+        MS_ASSERT(block >= 0 && block < MAX_BLOCKS);
         return block ? ends_[block - 1] : Ends{};
     }
 
@@ -187,7 +261,7 @@ class PackedTape {
         return IndexedLanes(triangle.packed_index, mask.lanes);
     }
 
-    Ends ends_[BLOCKS];  // of each block in the arrays below
+    Ends ends_[MAX_BLOCKS];  // of each block in the arrays below
     uint32_t face_count_ = 0;
     int32_t *faces_ = nullptr;
     IndexedLanes *masks_ = nullptr, *steps_ = nullptr;
@@ -200,13 +274,14 @@ class Tape {
   public:
     Tape(int64_t tiles, int64_t budget) : tiles_(tiles), budget_left_(budget) {}
 
-    // After the first tape that exceeds the budget, nothing more is recorded.
-    void record(int64_t tile, const TileTape &tape, TileCoverage &coverage) {
+    // Takes pack(packed, allocate), which packs the tape of the tile. After the first tape that exceeds the
+    // budget, nothing more is recorded.
+    template <class Pack>
+    void record(int64_t tile, Pack &&pack) {
         MS_ASSERT(tile >= 0 && tile < (int64_t)tiles_.size() && !tiles_[tile]);
         if (budget_left_ < 0) return;
         auto packed = std::make_unique<PackedTape>();
-        if (packed->pack(tape, coverage, [&](size_t bytes) { return allocate(bytes); }))
-            tiles_[tile] = std::move(packed);
+        if (pack(*packed, [&](size_t bytes) { return allocate(bytes); })) tiles_[tile] = std::move(packed);
     }
     // Null if the tile has no tape.
     const PackedTape *find(int64_t tile) const {

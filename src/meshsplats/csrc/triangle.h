@@ -55,6 +55,7 @@ struct Projection {
         return {m[0] * x + m[1] * y + m[2] * z + m[3], m[4] * x + m[5] * y + m[6] * z + m[7],
                 m[8] * x + m[9] * y + m[10] * z + m[11]};
     }
+    double depth(double x, double y, double z) const { return m[8] * x + m[9] * y + m[10] * z + m[11]; }
     Projected project(const Vec3 &c) const {
         if (!(c.z >= near)) return {0, 0, 0};
         double w = 1 / c.z;

@@ -158,14 +158,14 @@ def reading_arrays() -> Iterator[None]:
 def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
     """The arrays of a mesh, by their names in a checkpoint."""
     arrays = mesh.arrays() | {"filter_px2": np.array(mesh.filter_px2)}
-    return {f"mesh.{name}": a for name, a in arrays.items() if name not in ("blending", "normals")}
+    return {f"mesh.{name}": a for name, a in arrays.items() if name not in ("blending", "order", "normals")}
 
 
-def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
+def stored_mesh(arrays: dict[str, np.ndarray], blending: str, order: str) -> SplatMesh:
     """The mesh in a checkpoint's arrays. FileFormatError if an array is missing or does not fit."""
     own = {name.removeprefix("mesh."): a for name, a in arrays.items() if name.startswith("mesh.")}
     try:
-        return SplatMesh.from_arrays(own | {"blending": np.array(blending)})
+        return SplatMesh.from_arrays(own | {"blending": np.array(blending), "order": np.array(order)})
     except KeyError as error:
         raise FileFormatError(f"the checkpoint lacks 'mesh.{error.args[0]}'") from None
     except (ValueError, TypeError) as error:
@@ -173,11 +173,13 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
 
 
 def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
-    """Hash of the positions, triangles, colours, binding, blending and filter of ``mesh``, and of the mask of
-    its ``frozen`` vertices."""
+    """Hash of the positions, triangles, colours, binding, blending, filter and order of ``mesh``, and of the
+    mask of its ``frozen`` vertices."""
     digest = hashlib.sha256(mesh.blending.encode())
     if mesh.filter_px2:
         digest.update(repr(mesh.filter_px2).encode())
+    if mesh.order != "fragment":
+        digest.update(mesh.order.encode())
     if mesh.origin.any():
         digest.update(mesh.origin.tobytes())
     arrays = [mesh.vertices, mesh.faces, mesh.colors]

@@ -102,6 +102,9 @@ class FinetuneConfig:
     blending: Literal["mesh", "display", "linear"] = "mesh"
     """Colour space in which triangles are blended. mesh: that of the mesh. display: display values. linear:
     linear light, for exports to engines that light or blend in linear light."""
+    order: Literal["mesh", "fragment", "splat"] = "mesh"
+    """Order in which triangles are blended. mesh: that of the mesh. fragment: exact at every sample, as ray
+    tracers draw. splat: whole splats by their centres, for programs that sort those; faster."""
     samples: Annotated[int | None, Range(1, 16)] = None
     """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
     photographs; 1 for images of a splat viewer (``Dataset.look``)."""
@@ -153,6 +156,8 @@ class FinetuneConfig:
         """ValueError for options that have no meaning, or were never tried, without blending."""
         if self.blending == "linear":
             raise ValueError("blending 'linear' is for opacity 'blended': opaque triangles are not blended")
+        if self.order == "splat":
+            raise ValueError("order 'splat' is for opacity 'blended': opaque triangles have a depth buffer")
         if self.expected_share and not self.l2_weight:
             raise ValueError("expected_share is a share of l2_weight, which is 0: set l2_weight, or it to 0")
         if self.opaque_share < 1 and self.anneal_share + self.settling > 1:
@@ -244,6 +249,7 @@ class FinetuneChanges(TypedDict, total=False):
     prune_epochs: float
     prune_opacity: float
     blending: Literal["mesh", "display", "linear"]
+    order: Literal["mesh", "fragment", "splat"]
     samples: int | None
     opacity: Literal["blended", "cutoff"]
     cutoff: float

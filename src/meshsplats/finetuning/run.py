@@ -33,7 +33,7 @@ from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.phases.choice import PHASE_ARRAYS, check_phases, first_phase
 from meshsplats.finetuning.phases.phase import Moment, Phase
 from meshsplats.finetuning.reports import Reports, scored_count
-from meshsplats.finetuning.state import State
+from meshsplats.finetuning.state import State, order_of
 from meshsplats.finetuning.step import make_step
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
@@ -253,7 +253,9 @@ def run_start(
 
     found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
-    state = State.resume(found.arrays, blending, views, config, options.threads, options.device)
+    state = State.resume(
+        found.arrays, blending, order_of(mesh, config), views, config, options.threads, options.device
+    )
     return RunStart(
         config,
         near,

@@ -20,6 +20,7 @@ from meshsplats.finetuning.config import FinetuneConfig, epsilons
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.loss import LossRates
 from meshsplats.mesh import SplatMesh, Triangles, solid_faces
+from meshsplats.order import Order, checked_order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.edges import corners_beyond
@@ -153,6 +154,7 @@ class State:
         device: Device = "cpu",
     ) -> State:
         """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
+        mesh = replace(mesh, order=order_of(mesh, config))
         engine(device, threads).check(mesh=mesh)
         mesh = replace(mesh, normals=None)  # positions change, normals would not
         if mesh.binding is not None:
@@ -193,13 +195,14 @@ class State:
         cls,
         arrays: dict[str, np.ndarray],
         blending: str,
+        order: str,
         views: int,
         config: FinetuneConfig,
         threads: int | None,
         device: Device = "cpu",
     ) -> State:
         """The state in a checkpoint's arrays. FileFormatError if they do not fit each other."""
-        mesh = stored_mesh(arrays, blending)
+        mesh = stored_mesh(arrays, blending, order)
         engine(device, threads).check(mesh=mesh)
         with reading_arrays():
             sizes = _checked_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
@@ -402,6 +405,13 @@ class State:
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}
         return found if self._exposures is None else found | {"exposure": self._exposures}
+
+
+def order_of(mesh: SplatMesh, config: FinetuneConfig) -> Order:
+    """The order in which the triangles of ``mesh`` are blended and optimised."""
+    if config.cuts:
+        return "fragment"
+    return mesh.order if config.order == "mesh" else checked_order(config.order, mesh.face_splat)
 
 
 def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

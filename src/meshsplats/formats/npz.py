@@ -3,8 +3,8 @@
 Arrays: ``vertices`` (v, 3) float32, ``faces`` (f, 3) int32, ``vertex_colors`` (v, 4) float32 straight RGBA;
 where the mesh has them ``normals``, ``face_splat``, ``depth_group`` and one ``attribute_NAME`` for each
 attribute; ``up`` (3,), ``blending`` (a text) and, if they are not 0, ``filter_px2`` and the float64
-``origin`` (3,) that positions are relative to; for a mesh prior its ``binding_base_vertices`` (n, 3),
-``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,),
+``origin`` (3,) that positions are relative to; ``order`` (a text), if it is that by the splat; for a mesh
+prior its ``binding_base_vertices`` (n, 3), ``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,),
 ``binding_weights`` (v, 3), ``binding_layers`` (v,) and ``binding_lift``, as ``Binding`` names them. The first
 three names are those of the published MeshSplats code, whose files are read as well.
 """
@@ -43,6 +43,9 @@ _DEFAULTS = {"up": np.array([0, -1, 0], np.float32), "blending": np.array("displ
 """For files of the published MeshSplats code, which lack them."""
 
 
+_TEXTS = ("blending", "order")
+
+
 def _stored(name: str) -> str:
     """The name in the file of one of the arrays of ``SplatMesh.arrays``."""
     return "vertex_colors" if name == "colors" else name.replace(".", "_", 1)
@@ -52,7 +55,7 @@ _NAMES = {
     _stored(name): name
     for name in (
         *(f.name for f in SplatMesh.FIELDS),
-        *("blending", "filter_px2", "origin", "binding.lift"),
+        *("blending", "order", "filter_px2", "origin", "binding.lift"),
         *(f"binding.{f.name}" for f in Binding.FIELDS),
     )
 }
@@ -167,9 +170,9 @@ def _parse_header(text: bytes, name: str, at: str) -> tuple[tuple[int, ...], np.
         raise FileFormatError(f"{at} has a broken header: {str(error)[:100]}") from None
     if isinstance(descr, str) and "O" in descr:
         raise FileFormatError(f"{at} holds pickled Python objects, which can run code; refused")
-    wanted = r"[<>=|]?U\d{1,2}" if name == "blending" else r"[<>=|]?(f[248]|[iu][1248])"
+    wanted = r"[<>=|]?U\d{1,2}" if name in _TEXTS else r"[<>=|]?(f[248]|[iu][1248])"
     if not isinstance(descr, str) or not re.fullmatch(wanted, descr, re.ASCII):
-        kind = "text" if name == "blending" else "numbers"
+        kind = "text" if name in _TEXTS else "numbers"
         raise FileFormatError(f"{at} must hold {kind}, got dtype {str(descr)[:60]}")
     if not isinstance(shape, tuple) or not all(type(s) is int and s >= 0 for s in shape):
         raise FileFormatError(f"{at} has a broken shape: {str(shape)[:60]}")
@@ -200,6 +203,7 @@ def _check_shapes(members: dict[str, _Member], path: Path) -> None:
     wanted: dict[str, tuple[tuple[int, ...], ...]] = {
         "vertex_colors": ((v, 4), (v, 3)),
         "blending": ((), (1,)),
+        "order": ((), (1,)),
         "filter_px2": ((),),
         "origin": ((3,),),
         "binding_lift": ((),),

@@ -12,6 +12,7 @@ from meshsplats._kinds import need
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
+from meshsplats.order import Order, checked_order
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Device, ImageOptions, check_device
@@ -62,16 +63,22 @@ def render(
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
     cutoff: float | None = None,
+    order: Order | None = None,
     threads: int | None = None,
     device: Device = "cpu",
 ) -> Rendering:
-    """The image of a mesh of translucent triangles, exact at every sample.
+    """The image of a mesh of translucent triangles.
 
-    All triangles that cover a sample are sorted by their depth there (equal depths by face index) and
-    blended front to back, ``C = sum_k T_k a_k c_k + T_end * background`` with ``T_k = prod_{j<k} (1 -
-    a_j)``; colour and opacity are interpolated with perspective-correct weights. A sample on an edge shared
-    by two triangles belongs to exactly one (top-left rule). Triangles are visible from both sides and are
-    clipped at the near plane.
+    With the ``order`` 'fragment' it is exact at every sample: all triangles that cover the sample are sorted
+    by their depth there (equal depths by face index) and blended front to back, ``C = sum_k T_k a_k c_k +
+    T_end * background`` with ``T_k = prod_{j<k} (1 - a_j)``; colour and opacity are interpolated with
+    perspective-correct weights. A sample on an edge shared by two triangles belongs to exactly one (top-left
+    rule). Triangles are visible from both sides and are clipped at the near plane.
+
+    With the order 'splat', whole splats are blended by the depth of their centres, as 3D Gaussian Splatting
+    does. A centre is the mean of the corners of the splat's triangles. Of splats at one depth the later is in
+    front, and so are the later triangles of a splat: the image of splats that are painted far to near, with
+    their triangles in their order. Depth groups have no effect. This takes less time.
 
     A mesh with a low-pass filter of s = ``filter_px2`` is drawn with the fan of each splat widened in screen
     space, as 3D Gaussian Splatting widens splats by 0.3 px^2 at any size of the image. With c and M the mean
@@ -99,6 +106,7 @@ def render(
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
         filter_px2: overrides ``mesh.filter_px2``; 0 draws the triangles as they are.
         cutoff: least opacity that is drawn, as opaque; 0 to 1. None: blended with the opacity.
+        order: 'fragment' or 'splat' (on the CPU), overrides ``mesh.order``. With a cutoff always 'fragment'.
         threads: at most this many, of the CPU; all processors by default. The result does not depend on it.
         device: 'cpu' or 'gpu'.
 
@@ -122,6 +130,7 @@ def render(
         raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
     if cutoff is not None:
         cutoff = checked_cutoff(cutoff)
+    order = resolved_order(mesh, order, cutoff)
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
     values, widths = None, {}
     if attributes:
@@ -152,6 +161,7 @@ def render(
         max_layers=int(max_layers or 0),
         min_transmittance=min_transmittance,
         filter_px2=px2,
+        order=order,
         cutoff=cutoff,
         depth=depth,
         normals=normals,
@@ -161,6 +171,21 @@ def render(
     return Rendering(
         drawn.color, drawn.alpha, drawn.depth, drawn.normals, named(drawn.values), drawn.fragments
     )
+
+
+def resolved_order(mesh: SplatMesh, order: Order | None, cutoff: float | None) -> Order:
+    """The order in which ``render`` blends: ``order``, else the mesh's; a depth buffer has that of fragments.
+
+    Raises ValueError for 'splat' with a mesh without splats, or asked for with a ``cutoff``.
+    """
+    if order == "splat" and cutoff is not None:
+        raise ValueError(
+            "order='splat' blends splats, and a cutoff leaves opaque triangles for a depth buffer: leave out"
+            " one of the two"
+        )
+    if cutoff is not None:
+        return "fragment"
+    return mesh.order if order is None else checked_order(order, mesh.face_splat)
 
 
 def render_splats(

@@ -11,6 +11,7 @@ from meshsplats._kinds import need_all
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.mesh import MIN_TRANSMITTANCE
+from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Device
@@ -43,6 +44,7 @@ def rasterize(
     face_splat: torch.Tensor | np.ndarray | None = None,
     depth_group: torch.Tensor | np.ndarray | None = None,
     filter_px2: float = 0.0,
+    order: Order = "fragment",
     min_transmittance: float = MIN_TRANSMITTANCE,
     threads: int | None = None,
     tape_bytes: int = TAPE_BYTES,
@@ -76,6 +78,7 @@ def rasterize(
         face_splat, depth_group: (f,) int32, as in ``SplatMesh``.
         filter_px2: variance in square pixels of the filter for splats, as in ``render``. Gradients go through
             the filter to positions and opacities.
+        order: 'fragment' or 'splat', as in ``render``; 'splat' needs ``face_splat``.
         min_transmittance: early termination of samples with less transmittance than this.
         threads: at most this many, of the CPU; all processors by default.
         tape_bytes: limit on the size of the tape of each image, on the CPU.
@@ -114,7 +117,7 @@ def rasterize(
         attributes,
         background,
         world_to_camera,
-        Scene(views, faces, face_splat, depth_group, filter_px2),
+        Scene(views, faces, face_splat, depth_group, filter_px2, order),
         TapeOptions(samples=samples, min_transmittance=min_transmittance),
         drawing,
         tape_bytes,

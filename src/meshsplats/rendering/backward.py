@@ -104,6 +104,11 @@ class TapedRendering:
         self._options = checked_options(keep, camera, options.background, options.samples, threads)
         self._options.min_transmittance = options.min_transmittance
         if ramp is not None:
+            if triangles.order == "splat":
+                raise ValueError(
+                    "a ramp stands in for a cutoff, and cut triangles are for a depth buffer: render with"
+                    " order='fragment'"
+                )
             self._options.cutoff, self._options.ramp_height = ramp.cutoff, ramp.height
             self._options.ramp_slope, self._options.ramp_leak = ramp.slope, ramp.leak
             self._options.ramp_width = ramp.width * options.samples

@@ -10,6 +10,7 @@ import numpy as np
 from meshsplats._core import library, structures
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.mesh import Triangles, checked_filter
+from meshsplats.order import checked_order
 
 MAX_SAMPLES = 16
 """Largest side of the grid of samples in each pixel."""
@@ -30,7 +31,7 @@ class Pointers:
 def mesh_struct(keep: Pointers, triangles: Triangles) -> structures.MeshStruct:
     """The core's structure of ``triangles``, whose arrays ``keep`` holds.
 
-    Raises ValueError for a filter that is out of range or has no splats.
+    Raises ValueError for a filter that is out of range, and for a filter or an order that has no splats.
     """
     values = triangles.values
     width = 0 if values is None else values.shape[1]
@@ -45,6 +46,7 @@ def mesh_struct(keep: Pointers, triangles: Triangles) -> structures.MeshStruct:
         normals=keep(triangles.normals),
         attributes=keep(values if width else None),
         attribute_count=width,
+        by_splat=checked_order(triangles.order, triangles.face_splat) == "splat",
         filter_px2=checked_filter(triangles.filter_px2, triangles.face_splat),
     )
 

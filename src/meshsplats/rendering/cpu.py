@@ -30,7 +30,9 @@ class CpuEngine:
         wanted.max_layers, wanted.min_transmittance = options.max_layers, options.min_transmittance
         if options.cutoff is not None:
             wanted.cutoff = options.cutoff
-        triangles = mesh.triangles._replace(values=options.values, filter_px2=options.filter_px2)
+        triangles = mesh.triangles._replace(
+            values=options.values, filter_px2=options.filter_px2, order=options.order
+        )
         h, w = camera.height, camera.width
         width = 0 if options.values is None else options.values.shape[1]
         drawn = Drawn(

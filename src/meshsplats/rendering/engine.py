@@ -14,6 +14,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, Triangles
+from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.webgpu.training import Parameters, Rates, Sums
 
@@ -44,6 +45,7 @@ class ImageOptions:
     """0: all."""
     min_transmittance: float = MIN_TRANSMITTANCE
     filter_px2: float = 0.0
+    order: Order = "fragment"
     cutoff: float | None = None
     depth: bool = False
     normals: bool = False

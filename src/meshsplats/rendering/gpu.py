@@ -12,6 +12,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, Triangles, checked_filter
+from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, checked_options
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
@@ -33,6 +34,12 @@ from here; so do those with images of more than ``MAX_PIXELS`` pixels. Meshes th
 ``gradients.check_limits``."""
 
 
+def _check_order(order: Order) -> None:
+    """ValueError for an order in which the GPU does not blend."""
+    if order == "splat":
+        raise ValueError("the GPU sorts fragments: order='splat' needs device='cpu'; else take 'fragment'")
+
+
 class GpuEngine:
     """Draws on the best GPU of this machine. The last mesh that was drawn stays there, and so do the last
     triangles with gradients."""
@@ -48,11 +55,14 @@ class GpuEngine:
         for need in needs:
             if need in CANNOT:
                 raise ValueError(CANNOT[need])
+        if mesh is not None:
+            _check_order(mesh.order)
         device = open_device()
         if mesh is not None:
             check_limits(device, mesh)
 
     def render(self, mesh: SplatMesh, camera: Camera, options: ImageOptions) -> Drawn:
+        _check_order(options.order)
         settings = DrawSettings(
             samples=options.samples,
             max_layers=options.max_layers,
@@ -88,6 +98,7 @@ class GpuEngine:
         Args:
             limit: of windows; by default that of all images of these triangles that have none.
         """
+        _check_order(triangles.order)
         return GpuRendering(self, triangles, camera, options or TapeOptions(), limit)
 
     def session(self, mesh: SplatMesh) -> GpuSession:

@@ -16,7 +16,8 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb
 from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
-from meshsplats.rendering.api import Rendering
+from meshsplats.order import Order
+from meshsplats.rendering.api import Rendering, resolved_order
 from meshsplats.rendering.reference_samples import (
     checked_background,
     pixel_means,
@@ -50,6 +51,7 @@ def render(
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
     cutoff: float | None = None,
+    order: Order | None = None,
 ) -> Rendering:
     """The image of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
 
@@ -61,7 +63,12 @@ def render(
 
     ``filter_px2``, by default the mesh's, widens the fan of each splat first (see :func:`filtered`).
 
-    With a ``cutoff``, in [0, 1], a becomes 1 where it is at least the cutoff, else 0.
+    ``order`` is by default the mesh's. With 'splat', not the depth at the sample counts, but that of the
+    splat's centre (see :func:`splat_depths`). Of splats at one depth the later is in front, and so are the
+    later triangles of a splat; depth groups have no effect.
+
+    With a ``cutoff``, in [0, 1], a becomes 1 where it is at least the cutoff, else 0. The order is then
+    'fragment', that of a depth buffer.
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
 
@@ -75,7 +82,7 @@ def render(
         raise ValueError(f"the mesh has no attribute {unknown[0]!r}; it has {present}")
     x, y = sample_positions(camera, samples)
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
-    sheet = fragments_of(mesh, camera, x, y, px2)
+    sheet = fragments_of(mesh, camera, x, y, px2, resolved_order(mesh, order, cutoff))
     corners = mesh.faces[sheet.face]
 
     def interpolated(values: np.ndarray) -> np.ndarray:
@@ -222,7 +229,12 @@ def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) ->
 
 
 def fragments_of(
-    mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray, filter_px2: float = 0.0
+    mesh: SplatMesh,
+    camera: Camera,
+    x: np.ndarray,
+    y: np.ndarray,
+    filter_px2: float = 0.0,
+    order: Order = "fragment",
 ) -> Fragments:
     points = to_camera(mesh.vertices, camera)
     if filter_px2:
@@ -240,11 +252,22 @@ def fragments_of(
         return Fragments(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
     sample, depth, weights = (np.concatenate(parts) for parts in zip(*covers, strict=True))
     face = np.repeat(np.arange(len(covers)), [len(cover[0]) for cover in covers])
-    nearness = 1 / depth
-    if mesh.depth_group is not None:
-        _share_depths(mesh, homogeneous, near, sample, face, nearness, x, y)
-    order = np.lexsort((face, -nearness, sample))
-    return Fragments(sample[order], face[order], depth[order], weights[order])
+    if order == "splat":
+        ranks = np.lexsort((-face, splat_depths(mesh, camera)[face], sample))
+    else:
+        nearness = 1 / depth
+        if mesh.depth_group is not None:
+            _share_depths(mesh, homogeneous, near, sample, face, nearness, x, y)
+        ranks = np.lexsort((face, -nearness, sample))
+    return Fragments(sample[ranks], face[ranks], depth[ranks], weights[ranks])
+
+
+def splat_depths(mesh: SplatMesh, camera: Camera) -> np.ndarray:
+    """(f,) float32: of every triangle, the depth z of its splat's centre, the mean of the corners of the
+    splat's triangles. A corner of several triangles counts as often."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces].sum(axis=1)
+    centers = mesh.splats.sums(corners) / (3 * mesh.splats.counts[:, None])
+    return to_camera(centers, camera)[mesh.splats.of_face, 2].astype(np.float32)
 
 
 def _edge_functions(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
 from meshsplats.mesh import SplatMesh, Triangles
+from meshsplats.order import Order
 from meshsplats.rendering import reference
 
 try:
@@ -42,6 +43,7 @@ def rasterize(
     depth_group: np.ndarray | None = None,
     filter_px2: float = 0.0,
     ramp: OpacityRamp | None = None,
+    order: Order = "fragment",
 ) -> Raster:
     """The result of ``autograd.rasterize`` in float64, without early termination.
 
@@ -62,12 +64,13 @@ def rasterize(
             depth_group=depth_group,
             filter_px2=filter_px2,
             ramp=ramp,
+            order=order,
         )
         return Raster(*(part[0] for part in batch))
     backdrop = torch.as_tensor(background).double()
     images = []
     triangles = _detached(vertices, faces, attributes)._replace(
-        face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2
+        face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2, order=order
     )
     for i, camera in enumerate(cameras):
         pose = (
@@ -178,7 +181,7 @@ def _image(
     mesh = SplatMesh(
         triangles.vertices, faces, triangles.colors, face_splat=face_splat, depth_group=triangles.depth_group
     )
-    sheet = reference.fragments_of(mesh, posed, x, y, px2)
+    sheet = reference.fragments_of(mesh, posed, x, y, px2, triangles.order)
     sample, face = torch.from_numpy(sheet.sample), torch.from_numpy(sheet.face)
 
     corner = torch.from_numpy(np.asarray(faces, np.int64))[face]

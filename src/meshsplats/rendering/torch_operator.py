@@ -12,6 +12,7 @@ from meshsplats._kinds import described
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.mesh import Triangles
+from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.engine import Engine, Taped
 
@@ -33,6 +34,7 @@ class Scene(NamedTuple):
     face_splat: torch.Tensor | np.ndarray | None
     depth_group: torch.Tensor | np.ndarray | None
     filter_px2: float
+    order: Order
 
 
 _NOTHING = np.zeros((0, 0), np.float32)
@@ -92,6 +94,7 @@ def images_of(
             face_splat=_per_face("face_splat", scene.face_splat, len(faces)),
             depth_group=_per_face("depth_group", scene.depth_group, len(faces)),
             filter_px2=scene.filter_px2,
+            order=scene.order,
         ),
         options,
         engine,

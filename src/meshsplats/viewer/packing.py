@@ -94,6 +94,7 @@ def pack_in_order(mesh: SplatMesh, order: np.ndarray, precision: Precision, radi
         "alpha": 2**precision.alpha - 1,
         "blending": mesh.blending,
         "filter": mesh.filter_px2,
+        **({} if mesh.order == "fragment" else {"order": mesh.order}),
         "up": rounded(mesh.up),
     }
     if fans is None:

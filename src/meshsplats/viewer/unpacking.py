@@ -41,6 +41,7 @@ def unpack_mesh(data: bytes) -> SplatMesh:
         up=header["up"],
         blending=header["blending"],
         filter_px2=header["filter"],
+        order=header.get("order", "fragment"),
     )
 
 

@@ -255,6 +255,11 @@ def _restore(
             result["filter_px2"] = variance
         else:
             lost.append("the filter of its splats")
+    if "order" in note:
+        if "face_splat" in result:
+            result["order"] = note["order"]
+        else:
+            lost.append("the order of its splats")
     if "binding" in note:
         result["binding"] = _binding(document, dict_or_empty(note["binding"]), v)
         if result["binding"] is None:

@@ -149,6 +149,8 @@ def _document(
         with_extras = False
     if mesh.filter_px2 and with_extras:
         extras["filter_px2"] = mesh.filter_px2
+    if mesh.order != "fragment" and with_extras:
+        extras["order"] = mesh.order
     if mesh.normals is not None:
         _check_unit(mesh.normals)
     elif lit:
@@ -190,7 +192,8 @@ def _document(
 def _lowest_first(mesh: SplatMesh) -> SplatMesh:
     """``mesh`` with its triangles in the order of their heights."""
     heights = (mesh.vertices @ mesh.up)[mesh.faces].sum(axis=1)
-    return replace(mesh, face_splat=None, depth_group=None).take(np.argsort(heights, kind="stable"))
+    plain = replace(mesh, face_splat=None, depth_group=None, order="fragment")
+    return plain.take(np.argsort(heights, kind="stable"))
 
 
 def _primitive(buffer: _Buffer, mesh: SplatMesh, color_type: ColorType, material: int) -> dict[str, Any]:

@@ -116,6 +116,8 @@ class _Layout:
         self.origin = mesh.origin
         if mesh.filter_px2:
             self._head.append(f"comment meshsplats filter_px2 {mesh.filter_px2!r}")
+        if mesh.order != "fragment":
+            self._head.append(f"comment meshsplats order {mesh.order}")
         self._names = [*(_LOCAL if mesh.origin.any() else POSITION)]
         if mesh.normals is not None:
             self._names += ["nx", "ny", "nz"]
@@ -260,13 +262,18 @@ def _read(
             arrays["colors"][:, i] /= np.float32(255)
     of_faces = tuple(field.name for field in SplatMesh.EXTRAS if field.per == "face")
     faces, numbers = read_faces(file, header, face, of_faces, budget, path)
-    if settings.get("filter_px2") and "face_splat" not in numbers:
-        del settings["filter_px2"]
-        warnings.warn(
-            f"{path}: another program has altered the file, left out: the filter of its splats",
-            DataWarning,
-            stacklevel=3,
-        )
+    if "face_splat" not in numbers:
+        lost = [
+            what
+            for name, what in (("filter_px2", "the filter of its splats"), ("order", "their order"))
+            if settings.pop(name, None)
+        ]
+        if lost:
+            warnings.warn(
+                f"{path}: another program has altered the file, left out: {', '.join(lost)}",
+                DataWarning,
+                stacklevel=3,
+            )
     return checked(
         path,
         SplatMesh,
@@ -312,6 +319,8 @@ def _notes(
                     ) from None
             case ["blending", space]:
                 settings["blending"] = space
+            case ["order", order]:
+                settings["order"] = order
             case ["filter_px2", variance]:
                 try:
                     settings["filter_px2"] = float(variance)

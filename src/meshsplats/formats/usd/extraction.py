@@ -347,6 +347,11 @@ def _restored(
             report["filter_px2"] = float(variance)
         else:
             lost.append("the filter of its splats")
+    if "order" in note:
+        if "face_splat" in restored:
+            report["order"] = str(note["order"])[:60]
+        else:
+            lost.append("the order of its splats")
     for name, plain, columns in _attributes_of(note):
         wide = abs(columns)
         values = stored(plain, np.float32) if wide else np.empty(0, np.float32)

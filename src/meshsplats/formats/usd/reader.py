@@ -69,6 +69,7 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         origin=report["origin"],
         blending=report["blending"],
         filter_px2=report.get("filter_px2", 0.0),
+        order=report.get("order", "fragment"),
         attributes=attributes,
         **arrays,
     )

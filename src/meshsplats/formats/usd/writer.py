@@ -83,6 +83,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         note["normals"] = "computed"
     if mesh.filter_px2:
         note["filter_px2"] = mesh.filter_px2
+    if mesh.order != "fragment":
+        note["order"] = mesh.order
     taken = {"displayColor", "displayOpacity", "normals", *(field.name for field in mesh.EXTRAS)}
     stored: list[tuple[str, str, int]] = []
     for name, values in mesh.attributes.items():
