@@ -14,6 +14,7 @@
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
 #include "merging.h"
+#include "ordering.h"
 #include "viewer.h"
 #endif
 #include "mesh_tile.h"
@@ -217,7 +218,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 9; }
+MS_EXPORT int ms_interface_version() { return 10; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -313,6 +314,10 @@ MS_EXPORT int ms_merge_pairs(MsMerging *merging, char *message, int message_size
 
 MS_EXPORT int ms_viewer_images(const MsViewer *viewer, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::ViewerPass(*viewer).run(); });
+}
+
+MS_EXPORT int ms_order_triangles(MsOrdering *ordering, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::Ordering(*ordering).run(); });
 }
 #endif
 
