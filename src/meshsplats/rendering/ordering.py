@@ -52,7 +52,7 @@ class Pieces(NamedTuple):
     """(p,) int64, counted from 0."""
 
 
-def _pieces(mesh: SplatMesh) -> Pieces:
+def pieces_of(mesh: SplatMesh) -> Pieces:
     """The planar pieces of the splats of ``mesh``: triangles that face one way, or the opposite one, as the
     first triangle does that is in no piece yet."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -120,7 +120,9 @@ def drawing_order(
         raise ValueError(f"nodes must be a number from 1 to {MAX_NODES}, got {nodes!r}")
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
         raise ValueError(f"threads must be at least 1, got {threads!r}")
-    pieces = _pieces(mesh)
+    if cameras is not None and not len(cameras):
+        raise ValueError("cameras must hold a camera, or be None for views from all around")
+    pieces = pieces_of(mesh)
     node = _nodes(mesh, pieces, int(nodes))
     rank = _outward(mesh, pieces, node)
     if not quick:
