@@ -65,6 +65,16 @@ def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         return _read(GltfDocument(path), origin)
 
 
+def listed_nodes(path: Path) -> int:
+    """The number of nodes of a file that lists triangles in an order of blending, each with both windings,
+    for viewers that cull; 0 for any other.
+
+    Raises FileFormatError for a broken file.
+    """
+    meshes = [place.mesh for place in placed_meshes(GltfDocument(path))]
+    return copies.counts(_our_note(meshes[0]).get("copies")) if meshes else 0
+
+
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     path = document.path
     placed = list(placed_meshes(document))
