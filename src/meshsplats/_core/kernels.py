@@ -194,9 +194,7 @@ def edge_gradients(image: OpaqueImage, gradient: np.ndarray, threads: int | None
 
 
 def viewer_images(
-    vertices: np.ndarray,
-    colors: np.ndarray,
-    faces: np.ndarray,
+    triangles: tuple[np.ndarray, np.ndarray, np.ndarray],
     camera: CameraStruct,
     background: np.ndarray,
     cutoffs: np.ndarray,
@@ -210,12 +208,13 @@ def viewer_images(
     The result has the same bits with any number of ``threads`` (all processors by default).
 
     Args:
-        vertices, colors, faces: (v, 3) float32, (v, 4) float32 display values, (f, 3) int32.
+        triangles: vertices (v, 3) float32, colours (v, 4) float32 display values, faces (f, 3) int32.
         background: (3,) float32.
         cutoffs: (k,) float32 of the alpha test; negative: blend.
         multisample: four samples of coverage to a pixel.
         culled: without triangles that show their backs.
     """
+    vertices, colors, faces = triangles
     result = np.empty((len(cutoffs), camera.height, camera.width, 3), np.float32)
     struct = ViewerStruct(
         camera=camera,

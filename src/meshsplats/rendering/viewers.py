@@ -45,9 +45,7 @@ def viewer_images(
     """
     backdrop = _checked_backdrop(camera, background, threads)
     return kernels.viewer_images(
-        mesh.vertices,
-        _display_colors(mesh),
-        mesh.faces,
+        (mesh.vertices, _display_colors(mesh), mesh.faces),
         camera_struct(camera.with_near_plane(mesh.vertices)),
         backdrop,
         np.array([-1 if c is None else checked_cutoff(c) for c in cutoffs], np.float32),
@@ -75,10 +73,9 @@ def ordered_image(
     corners = [mesh.vertices[part.reshape(-1)].astype(np.float64) for part in parts]
     middles = np.array([(points.min(axis=0) + points.max(axis=0)) / 2 for points in corners])
     depths = middles @ camera.world_to_camera[2, :3]
+    faces = np.concatenate([parts[k] for k in np.argsort(-depths, kind="stable")])
     return kernels.viewer_images(
-        mesh.vertices,
-        _display_colors(mesh),
-        np.concatenate([parts[k] for k in np.argsort(-depths, kind="stable")]),
+        (mesh.vertices, _display_colors(mesh), faces),
         camera_struct(camera.with_near_plane(mesh.vertices)),
         backdrop,
         np.array([-1], np.float32),
