@@ -314,7 +314,9 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "mask, hybrid or ordered, --compression and --set color_type are for .glb" in capsys.readouterr().err
+    assert (
+        "mask, hybrid or ordered, --compression and --set color_type are for .glb" in capsys.readouterr().err
+    )
 
 
 def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):

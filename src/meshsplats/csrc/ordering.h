@@ -32,9 +32,9 @@ struct MsOrdering {
     const MsCamera *cameras;     // (camera_count,)
     int32_t camera_count, sweeps, threads;
     int64_t max_pairs;  // the heaviest ones are kept
-    int32_t *rank;      // (2 piece_count,) places of the units 2 piece + back: at the start, and the best found
-    int64_t pairs;      // out: pairs that were kept
-    double weight;      // out: of all of them
+    int32_t *rank;  // (2 piece_count,) places of the units 2 piece + back: at the start, and the best found
+    int64_t pairs;  // out: pairs that were kept
+    double weight;  // out: of all of them
     double before, after;  // out: of those in the wrong order
 };
 
@@ -112,8 +112,8 @@ class PairTable {
     }
 };
 
-// The pairs of one view. Pieces are drawn front to back. Every fragment is paired with a few of those in front
-// of it, drawn at random by their shares of the pixel: these pairs stand for those with all of them.
+// The pairs of one view. Pieces are drawn front to back. Every fragment is paired with a few of those in
+// front of it, drawn at random by their shares of the pixel: these pairs stand for those with all of them.
 class ViewPairs {
   public:
     ViewPairs(const MsOrdering &ordering, int ranges) : in_(ordering), ranges_(ranges), cache_(CACHE) {}
@@ -148,8 +148,8 @@ class ViewPairs {
     }
 
   private:
-    static constexpr int LAYERS = 48;          // of a pixel that are remembered
-    static constexpr int DRAWS = 2;            // pairs of a fragment
+    static constexpr int LAYERS = 48;  // of a pixel that are remembered
+    static constexpr int DRAWS = 2;    // pairs of a fragment
     static constexpr size_t CACHE = 1 << 14;
     static constexpr float FAINT = 1.f / 64;   // fragments of less opacity do not count
     static constexpr float HIDDEN = 1.f / 50;  // nor are fragments behind this transmittance seen
@@ -325,9 +325,8 @@ class Ordering {
                 }
             });
         }
-        parallel_blocks(io_.threads, RANGES, 1, [&](int64_t range, int64_t, int) {
-            tables_[range].forget(most);
-        });
+        parallel_blocks(io_.threads, RANGES, 1,
+                        [&](int64_t range, int64_t, int) { tables_[range].forget(most); });
     }
 
     // The pairs as a list of neighbours of every unit.
@@ -361,9 +360,8 @@ class Ordering {
     // Spreads the keys evenly in their order.
     void number() {
         for (int64_t i = 0; i < units_; ++i) order_[i] = (int32_t)i;
-        std::sort(order_.begin(), order_.end(), [&](int32_t a, int32_t b) {
-            return key_[a] != key_[b] ? key_[a] < key_[b] : a < b;
-        });
+        std::sort(order_.begin(), order_.end(),
+                  [&](int32_t a, int32_t b) { return key_[a] != key_[b] ? key_[a] < key_[b] : a < b; });
         for (int64_t i = 0; i < units_; ++i) key_[order_[i]] = (int32_t)i * spacing_;
     }
 
@@ -388,7 +386,8 @@ class Ordering {
     void move(int sweep, int round) {
         parallel_blocks(io_.threads, units_, BLOCK, [&](int64_t begin, int64_t end, int) {
             std::vector<std::pair<int32_t, float>> near;
-            for (int64_t i = begin; i < end; ++i) moved_[i] = turn(i, sweep) == round ? best(i, near) : key_[i];
+            for (int64_t i = begin; i < end; ++i)
+                moved_[i] = turn(i, sweep) == round ? best(i, near) : key_[i];
         });
         std::swap(key_, moved_);
     }
@@ -412,7 +411,8 @@ class Ordering {
         }
         if (near.empty() || most <= now + 1e-9) return key_[unit];
         const int64_t low = place ? near[place - 1].first : near[0].first - 2 * (int64_t)spacing_;
-        const int64_t high = place < near.size() ? near[place].first : near.back().first + 2 * (int64_t)spacing_;
+        const int64_t high =
+            place < near.size() ? near[place].first : near.back().first + 2 * (int64_t)spacing_;
         return (int32_t)((low + high) / 2);
     }
 };

@@ -14,7 +14,7 @@ from meshsplats.cameras.trajectories import dome, orbit
 from meshsplats.draw_order import DrawOrder
 from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import camera_struct
+from meshsplats.rendering.core_arguments import camera_struct
 
 VIEWS = 96
 """Largest number of views that an order is solved for."""
