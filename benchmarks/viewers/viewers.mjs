@@ -112,6 +112,7 @@ window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
     const matrix = back.multiply(BABYLON.Matrix.FromArray(view(k)));
     camera.getViewMatrix = () => matrix;
     camera._computedViewMatrix = matrix;
+    camera._globalPosition = matrix.clone().invert().getTranslation();  // by which meshes are sorted
     camera.freezeProjectionMatrix(BABYLON.Matrix.FromArray(projection(k, near, far)));
     scene.render();
     images.push(canvas.toDataURL('image/png'));

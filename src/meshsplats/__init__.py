@@ -52,6 +52,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering import Rendering, render, render_splats
     from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
+    from meshsplats.rendering.ordering import drawing_order
     from meshsplats.rendering.samples import needed_samples
     from meshsplats.tiles.building import build_tiles
     from meshsplats.tiles.drawing import render_tiles, tiles_mesh
@@ -99,6 +100,7 @@ _HOME = {
     "meshsplats.prior.bind": ("bind",),
     "meshsplats.rendering": ("Rendering", "render", "render_splats"),
     "meshsplats.rendering.autograd": ("rasterize",),
+    "meshsplats.rendering.ordering": ("drawing_order",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
     "meshsplats.tiles.building": ("build_tiles",),
@@ -147,6 +149,7 @@ __all__ = [
     "cut_mesh",
     "dome",
     "draw_splats",
+    "drawing_order",
     "evaluate",
     "find_background",
     "finetune",

@@ -21,6 +21,7 @@ from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.datasets.layouts import Layout, find_layout
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import format_of, load_gaussians, moving_splats
+from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_paths import splat_file
@@ -58,6 +59,9 @@ def describe(path: Path, reading: Mapping[str, Any] | None = None) -> dict[str, 
         mesh = load_mesh(path)
         warn_of_strays_in(mesh)
         found |= _mesh(mesh)
+        if path.suffix.lower() in (".glb", ".gltf") and (nodes := listed_nodes(path)):
+            listed = "1 node" if nodes == 1 else f"{nodes} nodes"
+            found["order"] = f"for viewers that cull: every triangle twice, in {listed}"
     else:
         found |= _world_cameras(load_cameras(path))
         if is_camera_path(read_json(path)):

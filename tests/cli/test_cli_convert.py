@@ -314,7 +314,9 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "mask or hybrid, --compression and --set color_type are for .glb" in capsys.readouterr().err
+    assert (
+        "mask, hybrid or ordered, --compression and --set color_type are for .glb" in capsys.readouterr().err
+    )
 
 
 def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):
@@ -388,6 +390,54 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     assert run(tmp_path / "folder", "-o", tmp_path / "all", "--no-preview") == 0
     assert "balls.glb (" in (line := capsys.readouterr().out)
     assert ", alpha blend" in line
+
+
+def test_an_order_for_viewers_that_cull(tmp_path, capsys):
+    """Solved for views all around, or for those given; the mesh comes back as it was."""
+    source, out, plain = tmp_path / "balls.ply", tmp_path / "m.glb", tmp_path / "plain.npz"
+    save_gaussians(nested_balls(0.95), source)
+    mesh = convert(nested_balls(0.95))
+    save_mesh(mesh, plain)
+    for name, count in (("three", 3), ("two", 2)):
+        save_cameras(orbit(mesh, count, width=64, height=64), tmp_path / f"{name}.json")
+    options = ("--alpha", "ordered", "--no-sidecar", "--force", "-o", out)
+    three = ("--cameras", tmp_path / "three.json")
+    assert run(source, *options, *three, "--set", "nodes=3") == 0
+    assert ", solved the order " in capsys.readouterr().out
+    assert not material(out)["doubleSided"]
+    assert main(["info", str(out)]) == 0
+    assert "for viewers that cull: every triangle twice, in 3 nodes" in capsys.readouterr().out
+    solved = load_mesh(out)
+    np.testing.assert_array_equal(
+        solved.faces, convert(nested_balls(0.95), cameras=load_cameras(three[1])).faces
+    )
+    made = []
+    for views in (three, three, ("--cameras", tmp_path / "two.json"), ("--set", "quick=True")):
+        assert run(plain, *options, *views, "--set", "nodes=1") == 0
+        made.append(out.read_bytes())
+    assert made[0] == made[1]
+    assert len(set(made)) == 3
+    capsys.readouterr()
+    assert main(["info", str(out)]) == 0
+    assert "every triangle twice, in 1 node" in capsys.readouterr().out
+    save_mesh(mesh, tmp_path / "plain.glb")
+    assert main(["info", str(tmp_path / "plain.glb")]) == 0
+    assert "cull" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--set", "nodes=2"), "nodes and quick are for --alpha ordered"),
+        (("--alpha", "ordered", "--lit"), "neither --lit nor --compression"),
+        (("--alpha", "ordered", "--set", "nodes=0"), "nodes must be a number from 1 to 256, got 0"),
+    ],
+)
+def test_what_an_order_does_not_go_with(tmp_path, capsys, options, message):
+    save_gaussians(nested_balls(0.95), tmp_path / "balls.ply")
+    assert run(tmp_path / "balls.ply", "-o", tmp_path / "m.glb", *options) != 0
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "m.glb").exists()
 
 
 def test_other_commands_choose_alpha_too(tmp_path):

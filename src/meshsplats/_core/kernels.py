@@ -6,6 +6,8 @@ Callers have checked their arrays: C-contiguous, of the types and shapes named h
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from meshsplats._core.structures import (
     ComparisonStruct,
     EdgesStruct,
     FansStruct,
+    OrderingStruct,
     ViewerStruct,
 )
 
@@ -191,14 +194,13 @@ def edge_gradients(image: OpaqueImage, gradient: np.ndarray, threads: int | None
 
 
 def viewer_images(
-    vertices: np.ndarray,
-    colors: np.ndarray,
-    faces: np.ndarray,
+    triangles: tuple[np.ndarray, np.ndarray, np.ndarray],
     camera: CameraStruct,
     background: np.ndarray,
     cutoffs: np.ndarray,
     *,
     multisample: bool,
+    culled: bool = False,
     threads: int | None = None,
 ) -> np.ndarray:
     """(k, h, w, 3) float32 images of triangles in their order: see ``viewer_images`` in rendering/viewers.py.
@@ -206,11 +208,13 @@ def viewer_images(
     The result has the same bits with any number of ``threads`` (all processors by default).
 
     Args:
-        vertices, colors, faces: (v, 3) float32, (v, 4) float32 display values, (f, 3) int32.
+        triangles: vertices (v, 3) float32, colours (v, 4) float32 display values, faces (f, 3) int32.
         background: (3,) float32.
         cutoffs: (k,) float32 of the alpha test; negative: blend.
         multisample: four samples of coverage to a pixel.
+        culled: without triangles that show their backs.
     """
+    vertices, colors, faces = triangles
     result = np.empty((len(cutoffs), camera.height, camera.width, 3), np.float32)
     struct = ViewerStruct(
         camera=camera,
@@ -224,7 +228,78 @@ def viewer_images(
         color=pointer(result),
         image_count=len(cutoffs),
         multisample=multisample,
+        culled=culled,
         threads=min(threads or processors(), 256),
     )
     run("ms_viewer_images", struct)
     return result
+
+
+class Pieces(NamedTuple):
+    """Triangles of a mesh by the planar pieces of splats that they form."""
+
+    vertices: np.ndarray
+    """(v, 3) float32"""
+    colors: np.ndarray
+    """(v, 4) float32"""
+    faces: np.ndarray
+    """(f, 3) int32, those of a piece side by side."""
+    turned: np.ndarray
+    """(f,) bool: the winding shows the back of the piece."""
+    start: np.ndarray
+    """(p + 1,) int64 first triangle of each piece."""
+    centers: np.ndarray
+    """(p, 3) float64"""
+    splat: np.ndarray
+    """(p,) int32"""
+    node: np.ndarray
+    """(p,) int32"""
+
+
+class Ordered(NamedTuple):
+    """Places of units in an order of blending, and the weight of the pairs of units that are out of order."""
+
+    rank: np.ndarray
+    """(2 p,) int32 place of each unit."""
+    pairs: int
+    weight: float
+    """Of all pairs."""
+    before: float
+    after: float
+
+
+def order_triangles(
+    pieces: Pieces,
+    rank: np.ndarray,
+    cameras: Sequence[CameraStruct],
+    *,
+    sweeps: int,
+    max_pairs: int,
+    threads: int | None = None,
+) -> Ordered:
+    """The order of blending of triangles that suits all ``cameras`` best, from that of ``rank``: see
+    csrc/ordering.h. The result has the same bits with any number of ``threads`` (all processors by default).
+    """
+    result = rank.astype(np.int32)
+    views = (CameraStruct * len(cameras))(*cameras)
+    struct = OrderingStruct(
+        vertex_count=len(pieces.vertices),
+        face_count=len(pieces.faces),
+        piece_count=len(pieces.centers),
+        vertices=pointer(pieces.vertices),
+        colors=pointer(pieces.colors),
+        faces=pointer(pieces.faces),
+        turned=pointer(pieces.turned),
+        piece_start=pointer(pieces.start),
+        centers=pointer(pieces.centers),
+        splat=pointer(pieces.splat),
+        node=pointer(pieces.node),
+        cameras=ctypes.addressof(views),
+        camera_count=len(cameras),
+        sweeps=sweeps,
+        threads=min(threads or processors(), 256),
+        max_pairs=max_pairs,
+        rank=pointer(result),
+    )
+    run("ms_order_triangles", struct)
+    return Ordered(result, struct.pairs, struct.weight, struct.before, struct.after)

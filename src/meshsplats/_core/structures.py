@@ -182,7 +182,34 @@ class ViewerStruct(CoreStruct):
         ("color", c_void_p),
         ("image_count", c_int32),
         ("multisample", c_int32),
+        ("culled", c_int32),
         ("threads", c_int32),
+    ]
+
+
+class OrderingStruct(CoreStruct):
+    _fields_ = [
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("piece_count", c_int64),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("turned", c_void_p),
+        ("piece_start", c_void_p),
+        ("centers", c_void_p),
+        ("splat", c_void_p),
+        ("node", c_void_p),
+        ("cameras", c_void_p),
+        ("camera_count", c_int32),
+        ("sweeps", c_int32),
+        ("threads", c_int32),
+        ("max_pairs", c_int64),
+        ("rank", c_void_p),
+        ("pairs", c_int64),
+        ("weight", c_double),
+        ("before", c_double),
+        ("after", c_double),
     ]
 
 

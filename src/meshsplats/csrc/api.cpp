@@ -14,6 +14,7 @@
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
 #include "merging.h"
+#include "ordering.h"
 #include "viewer.h"
 #endif
 #include "mesh_tile.h"
@@ -339,6 +340,10 @@ MS_EXPORT int ms_merge_pairs(MsMerging *merging, char *message, int message_size
 
 MS_EXPORT int ms_viewer_images(const MsViewer *viewer, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::ViewerPass(*viewer).run(); });
+}
+
+MS_EXPORT int ms_order_triangles(MsOrdering *ordering, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::Ordering(*ordering).run(); });
 }
 #endif
 

@@ -10,6 +10,7 @@
 #include "fans.h"
 #ifndef MS_WIDE_ONLY
 #include "merging.h"
+#include "ordering.h"
 #include "viewer.h"
 #endif
 #include "ssim.h"
@@ -192,7 +193,30 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsViewer, color),
     MS_FIELD(MsViewer, image_count),
     MS_FIELD(MsViewer, multisample),
+    MS_FIELD(MsViewer, culled),
     MS_FIELD(MsViewer, threads),
+    MS_WHOLE(MsOrdering),
+    MS_FIELD(MsOrdering, vertex_count),
+    MS_FIELD(MsOrdering, face_count),
+    MS_FIELD(MsOrdering, piece_count),
+    MS_FIELD(MsOrdering, vertices),
+    MS_FIELD(MsOrdering, colors),
+    MS_FIELD(MsOrdering, faces),
+    MS_FIELD(MsOrdering, turned),
+    MS_FIELD(MsOrdering, piece_start),
+    MS_FIELD(MsOrdering, centers),
+    MS_FIELD(MsOrdering, splat),
+    MS_FIELD(MsOrdering, node),
+    MS_FIELD(MsOrdering, cameras),
+    MS_FIELD(MsOrdering, camera_count),
+    MS_FIELD(MsOrdering, sweeps),
+    MS_FIELD(MsOrdering, threads),
+    MS_FIELD(MsOrdering, max_pairs),
+    MS_FIELD(MsOrdering, rank),
+    MS_FIELD(MsOrdering, pairs),
+    MS_FIELD(MsOrdering, weight),
+    MS_FIELD(MsOrdering, before),
+    MS_FIELD(MsOrdering, after),
 #endif
 };
 

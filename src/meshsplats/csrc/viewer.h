@@ -23,6 +23,7 @@ struct MsViewer {
     float *color;             // (image_count, height, width, 3) out
     int32_t image_count;      // images that are drawn together
     int32_t multisample;      // four samples of coverage to a pixel, one of colour; 0: one of both
+    int32_t culled;           // triangles that show their backs are left out
     int32_t threads;
 };
 
@@ -151,7 +152,7 @@ class ViewerPass {
         for (int64_t p = 0; p < pixels * in.image_count; ++p)
             for (int plane = 0; plane < PLANES; ++plane)
                 buffer[p * PLANES + plane] = set4(plane < 3 ? 255 * in.background[plane] : 0);
-        for (int pass = 0; pass < 2; ++pass)
+        for (int pass = in.culled ? 1 : 0; pass < 2; ++pass)
             for (int64_t i = 0; i < in.face_count; ++i) {
                 const Rows &r = rows[i];
                 if (r.last >= begin && r.first < end && r.back == (pass == 0)) draw(i, begin, end, buffer);

@@ -9,12 +9,14 @@ from typing import Any, Literal
 
 from meshsplats.camera import Camera
 from meshsplats.conversion.normals import shading_normals
+from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.ordering import NODES, drawing_order
 
-GLB_ALPHA = ("mask", "hybrid")
+GLB_ALPHA = ("mask", "hybrid", "ordered")
 """Values of ``alpha`` that only .glb files have."""
 
 
@@ -22,8 +24,9 @@ GLB_ALPHA = ("mask", "hybrid")
 class MeshFileOptions:
     """How a mesh is saved, in one or several formats. What a format does not have does not count there."""
 
-    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid"] = "auto"
-    """'auto': for a .glb, measured (``choose_alpha``); 'opaque': cut to solid triangles before."""
+    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid", "ordered"] = "auto"
+    """'auto': for a .glb, measured (``choose_alpha``); 'opaque': cut to solid triangles before; 'ordered': in
+    an order of blending for viewers that cull (``drawing_order``)."""
     cutoff: float | None = None
     """Least opacity that is drawn, of 'mask' and 'opaque'; None: ``CUTOFF``."""
     lit: bool = False
@@ -34,6 +37,10 @@ class MeshFileOptions:
     """.glb."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb."""
+    nodes: int = NODES
+    """Of 'ordered'."""
+    quick: bool = False
+    """Of 'ordered': an order by a formula."""
 
     def prepared(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
         """``mesh`` cut and with normals, where that is asked for. ``cameras``: where it is seen from."""
@@ -48,12 +55,28 @@ class MeshFileOptions:
         measured = self.alpha == "auto" and len(mesh.faces) and any(map(_is_glb, paths))
         return choose_alpha(mesh, cameras) if measured else None
 
-    def save(self, mesh: SplatMesh, paths: Sequence[Path], choice: AlphaChoice | None = None) -> None:
-        """Saves a ``prepared`` mesh with the alpha mode of the ``choice``."""
-        own = {
-            "alpha": self.alpha if self.alpha in GLB_ALPHA else None,  # or cut already
-            "cutoff": self.cutoff if self.alpha == "mask" else None,
-        }
+    def order(
+        self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
+    ) -> DrawOrder | None:
+        """The order of blending of the .glb among ``paths``, where it is to have one."""
+        if self.alpha != "ordered" or not any(map(_is_glb, paths)):
+            return None
+        return drawing_order(mesh, cameras or None, nodes=self.nodes, quick=self.quick)
+
+    def save(
+        self,
+        mesh: SplatMesh,
+        paths: Sequence[Path],
+        choice: AlphaChoice | None = None,
+        order: DrawOrder | None = None,
+    ) -> None:
+        """Saves a ``prepared`` mesh with the alpha mode of the ``choice``, or in an ``order``."""
+        own: dict[str, Any] = {"order": order}
+        if order is None:
+            own = {
+                "alpha": self.alpha if self.alpha in GLB_ALPHA else None,  # or cut already
+                "cutoff": self.cutoff if self.alpha == "mask" else None,
+            }
         for path in paths:
             glb = _is_glb(path)
             more: dict[str, Any] = {}

@@ -14,6 +14,7 @@ from meshsplats._arrays import checked_array
 from meshsplats._files.atomic import atomic_path
 from meshsplats._foreign import foreign, foreign_archive
 from meshsplats._kinds import each, need, need_path
+from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
@@ -41,7 +42,13 @@ BOUND_SUFFIXES = (".npz", ".glb")
 """Formats that keep the binding of a mesh prior."""
 _UNFILTERED = (*_GLB, *_USD, ".obj")
 """Formats of programs that render triangles without a low-pass filter."""
-_OPTION_SUFFIXES = {"lit": (*_GLB, *_USD), "color_type": _GLB, "alpha": _GLB, "compression": _GLB}
+_OPTION_SUFFIXES = {
+    "lit": (*_GLB, *_USD),
+    "color_type": _GLB,
+    "alpha": _GLB,
+    "compression": _GLB,
+    "order": _GLB,
+}
 
 MESH_SUFFIXES = tuple(_WRITERS)
 """Suffixes that ``save_mesh`` knows."""
@@ -123,6 +130,7 @@ def save_mesh(
     alpha: Alpha | None = None,
     cutoff: float | None = None,
     compression: Compression | None = None,
+    order: DrawOrder | None = None,
 ) -> None:
     """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all.
 
@@ -160,6 +168,10 @@ def save_mesh(
             gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
             order of triangles changes a little; splat indices and attributes are left out. Such files are for
             viewers; ``load_mesh`` does not read them.
+        order: (`.glb`) that of ``drawing_order``, for web viewers and engines, which blend triangles as they
+            are listed: each is written twice, with both windings and a single-sided material, in this order.
+            Not for ray tracers, Blender and CesiumJS, which do not cull translucent triangles and draw both.
+            ``load_mesh`` returns the mesh as it was. Without lit, compression, and alpha but 'blend'.
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh.
@@ -176,7 +188,13 @@ def save_mesh(
     if writer is None:
         known = ", ".join(_WRITERS)
         raise ValueError(f"{target.name!r} does not name a mesh format; choose a name that ends in {known}")
-    chosen = {"lit": lit, "color_type": color_type, "alpha": alpha, "compression": compression}
+    chosen = {
+        "lit": lit,
+        "color_type": color_type,
+        "alpha": alpha,
+        "compression": compression,
+        "order": order,
+    }
     options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
     if cutoff is not None:
         if alpha not in ("opaque", "mask"):
@@ -197,7 +215,13 @@ def save_mesh(
         mesh = cut_mesh(mesh, CUTOFF if cutoff is None else cutoff)
         if suffix not in _GLB:
             del options["alpha"]
-    elif alpha is None and suffix in _GLB and len(mesh.colors) and (mesh.colors[:, 3] == 1).all():
+    elif (
+        alpha is None
+        and order is None
+        and suffix in _GLB
+        and len(mesh.colors)
+        and (mesh.colors[:, 3] == 1).all()
+    ):
         options["alpha"] = "opaque"
     elif cutoff is not None:
         options["cutoff"] = cutoff
@@ -210,10 +234,11 @@ def save_mesh(
             stacklevel=2,
         )
     if "compression" in options:
+        if order is not None:
+            raise ValueError("compression changes the order of triangles: leave out order or compression")
         writer = write_compressed_glb
-    with atomic_path(
-        target, needs=expected_bytes(mesh, suffix, compressed="compression" in options)
-    ) as temporary:
+    size = expected_bytes(mesh, suffix, compressed="compression" in options, copies=order is not None)
+    with atomic_path(target, needs=size) as temporary:
         writer(mesh, temporary, **options)
 
 
@@ -244,9 +269,10 @@ def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -
         return write_mesh_blocks(parts, temporary)
 
 
-def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False) -> int:
-    """Estimated size of the file of ``mesh`` with this ``suffix``: within a few kilobytes for `.npz` and
-    `.ply`, within 15 % for `.glb` with colours of 16 bits, rough for the others."""
+def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False, copies: bool = False) -> int:
+    """Estimated size of the file of ``mesh`` with this ``suffix``, with ``copies`` of all triangles: within a
+    few kilobytes for `.npz` and `.ply`, within 15 % for `.glb` with colours of 16 bits, rough for the
+    others."""
     v, f = len(mesh.vertices), len(mesh.faces)
     bound = suffix in BOUND_SUFFIXES
     arrays = {n: a for n, a in mesh.arrays().items() if a.ndim and (bound or not n.startswith("binding."))}
@@ -258,7 +284,7 @@ def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False) ->
     if suffix == ".ply":
         return (52 if mesh.origin.any() else 28) * v + 13 * f + held
     if suffix == ".glb":
-        whole = 20 * v + (12 if v > 0xFFFF else 6) * f + held
+        whole = 20 * v + (1 + copies) * (12 if v > 0xFFFF else 6) * f + held
         return whole // 5 if compressed else whole
     if suffix in _USD:
         return 28 * v + 6 * f + held

@@ -9,6 +9,7 @@ import numpy as np
 from meshsplats._core import kernels
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb
+from meshsplats.draw_order import DrawOrder
 from meshsplats.mesh import SplatMesh, checked_cutoff
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
 
@@ -42,20 +43,60 @@ def viewer_images(
 
     Raises ValueError for an option out of its range.
     """
-    backdrop = np.ascontiguousarray(background, np.float32)
-    if backdrop.shape != (3,):
-        raise ValueError(f"background must have shape (3,), got {backdrop.shape}")
-    checked_options(Pointers(), camera, backdrop, 1, threads)
-    colors = mesh.colors
-    if mesh.blending == "linear":
-        colors = np.concatenate([linear_to_srgb(colors[:, :3]), colors[:, 3:]], axis=1)
+    backdrop = _checked_backdrop(camera, background, threads)
     return kernels.viewer_images(
-        mesh.vertices,
-        np.ascontiguousarray(colors, np.float32),
-        mesh.faces,
+        (mesh.vertices, _display_colors(mesh), mesh.faces),
         camera_struct(camera.with_near_plane(mesh.vertices)),
         backdrop,
         np.array([-1 if c is None else checked_cutoff(c) for c in cutoffs], np.float32),
         multisample=multisample,
         threads=threads,
     )
+
+
+def ordered_image(
+    mesh: SplatMesh,
+    order: DrawOrder,
+    camera: Camera,
+    *,
+    multisample: bool = True,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    threads: int | None = None,
+) -> np.ndarray:
+    """(h, w, 3) float32: the image of ``mesh`` as three.js draws a `.glb` that lists its triangles in
+    ``order``: the nodes by the depths of the middles of their bounds, farthest first, and of each the
+    triangles that face the camera, blended as they come. The arguments are those of ``viewer_images``.
+    """
+    backdrop = _checked_backdrop(camera, background, threads)
+    listed = order.listed(mesh.faces)
+    parts = [listed[a:b] for a, b in zip(order.starts[:-1], order.starts[1:], strict=True)]
+    corners = [mesh.vertices[part.reshape(-1)].astype(np.float64) for part in parts]
+    middles = np.array([(points.min(axis=0) + points.max(axis=0)) / 2 for points in corners])
+    depths = middles @ camera.world_to_camera[2, :3]
+    faces = np.concatenate([parts[k] for k in np.argsort(-depths, kind="stable")])
+    return kernels.viewer_images(
+        (mesh.vertices, _display_colors(mesh), faces),
+        camera_struct(camera.with_near_plane(mesh.vertices)),
+        backdrop,
+        np.array([-1], np.float32),
+        multisample=multisample,
+        culled=True,
+        threads=threads,
+    )[0]
+
+
+def _checked_backdrop(
+    camera: Camera, background: Sequence[float] | np.ndarray, threads: int | None
+) -> np.ndarray:
+    backdrop = np.ascontiguousarray(background, np.float32)
+    if backdrop.shape != (3,):
+        raise ValueError(f"background must have shape (3,), got {backdrop.shape}")
+    checked_options(Pointers(), camera, backdrop, 1, threads)
+    return backdrop
+
+
+def _display_colors(mesh: SplatMesh) -> np.ndarray:
+    colors = mesh.colors
+    if mesh.blending == "linear":
+        colors = np.concatenate([linear_to_srgb(colors[:, :3]), colors[:, 3:]], axis=1)
+    return np.ascontiguousarray(colors, np.float32)

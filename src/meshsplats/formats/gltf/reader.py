@@ -17,6 +17,7 @@ from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
 from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
+from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, Skinning, placed_meshes, rotation_matrix
 from meshsplats.formats.gltf.writer import camel_case, up_quaternion
@@ -64,19 +65,32 @@ def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         return _read(GltfDocument(path), origin)
 
 
+def listed_nodes(path: Path) -> int:
+    """The number of nodes of a file that lists triangles in an order of blending, each with both windings,
+    for viewers that cull; 0 for any other.
+
+    Raises FileFormatError for a broken file.
+    """
+    meshes = [place.mesh for place in placed_meshes(GltfDocument(path))]
+    return copies.counts(_our_note(meshes[0]).get("copies")) if meshes else 0
+
+
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     path = document.path
     placed = list(placed_meshes(document))
     pieces, skipped, textured = [], 0, 0
-    own = placed[0].mesh if len(placed) == 1 else {}
-    note = _our_note(own)
+    note = _our_note(placed[0].mesh) if placed else {}
+    if len(placed) != max(1, copies.counts(note.get("copies"))):
+        note = {}
+    own = placed[0].mesh if note else {}
     named: np.ndarray | None = None
+    kept = bool(note) and all(_is_own_placement(place.matrix, note) for place in placed)
+    if kept:
+        placed = [place._replace(matrix=np.eye(4)) for place in placed]
+        named = _origin_of(note)
+    elif note:  # another program has moved the mesh in the scene
+        note["up"] = [0.0, 1.0, 0.0]
     for place in placed:
-        if note and _is_own_placement(place.matrix, note):
-            place = place._replace(matrix=np.eye(4))
-            named = _origin_of(note)
-        elif note:  # another program has moved the mesh in the scene
-            note["up"] = [0.0, 1.0, 0.0]
         for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
             mode = primitive.get("mode", _TRIANGLES)
             if mode in POINTS_TO_LINES:
@@ -186,6 +200,13 @@ def _join(
     if note.get("normals") == "computed":
         arrays.pop("normals", None)
     arrays |= {"colors": colors, "up": (0, 1, 0), "origin": origin}
+    if "copies" in note:
+        faces, place = _own_triangles(document, note["copies"], arrays["faces"], len(colors))
+        arrays["faces"] = faces
+        if place is not None:
+            rows = [name for name in ("vertices", "colors", "normals") if arrays.get(name) is not None]
+            arrays |= {name: arrays[name][place] for name in rows}
+            colors = arrays["colors"]
     if note:
         arrays |= {"up": note["up"], "blending": note["blending"]}
     if note and len(own["primitives"]) == 1:
@@ -301,6 +322,35 @@ def _matches(binding: Binding, vertices: np.ndarray) -> bool:
     """Whether the vertices are where the binding puts them, up to rounding."""
     size = float(np.abs(binding.base_vertices).max(initial=0))
     return bool((np.abs(binding.positions() - vertices) <= 1e-4 * size).all())
+
+
+def _own_triangles(
+    document: GltfDocument, entry: Any, faces: np.ndarray, v: int
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The triangles of the mesh among ``faces``, which hold both windings of each, and the places of its
+    vertices among the v ones; None for the places of all. FileFormatError if they do not."""
+    entry = dict_or_empty(entry)
+    half = len(faces) // 2
+    turned = _raw(document, dict_or_empty(entry.get("turned")), np.uint8, ((half + 7) // 8,))
+    stored = dict_or_empty(entry.get("offset"))
+    offset = _raw(document, stored, np.int8 if stored.get("bytes") == 1 else np.int32, (half,))
+    vertices = None
+    good = True
+    if copies.counts(entry) > 1:
+        vertex = _raw(document, dict_or_empty(entry.get("vertex")), np.int32, (v,))
+        vertices = None if vertex is None else copies.joined_vertices(vertex)
+        good &= vertices is not None
+        if vertex is not None:
+            faces = vertex[faces]
+    found = None
+    if good and turned is not None and offset is not None:
+        found = copies.without_copies(faces, copies.Own(turned, offset))
+    if found is None:
+        raise document.error(
+            "its note says that each triangle is there twice, once with each winding, but another program has"
+            " altered them; take the file that meshsplats wrote"
+        )
+    return found, vertices
 
 
 def _attribute(

@@ -21,8 +21,10 @@ import numpy as np
 from meshsplats._geometry import rotation_rows, vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
+from meshsplats.draw_order import DrawOrder
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
+from meshsplats.formats.gltf import copies
 from meshsplats.mesh import SplatMesh, solid_faces
 
 ColorType = Literal["uint16", "float32"]
@@ -44,6 +46,7 @@ def write_glb(
     alpha: Alpha = "blend",
     cutoff: float = CUTOFF,
     extras: bool = True,
+    order: DrawOrder | None = None,
 ) -> None:
     """Writes ``mesh`` to ``path``.
 
@@ -64,10 +67,13 @@ def write_glb(
             reads. docs/viewers.md compares them.
         cutoff: least opacity that 'mask' renders.
         extras: False leaves out the arrays that only this project reads.
+        order: with 'blend', unlit: every triangle is written twice, with both windings and a single-sided
+            material, in this order.
 
     Raises:
         ValueError: the mesh has no triangles (glTF has no empty arrays), its normals are not of unit
-            length, or it needs more than the 4 GiB that the format can hold.
+            length, ``order`` is that of another mesh or goes with another mode, or the file needs more than
+            the 4 GiB that the format can hold.
     """
     if alpha not in get_args(Alpha):
         raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
@@ -76,7 +82,12 @@ def write_glb(
     if not len(mesh.faces):
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
     check_attribute_names(mesh)
-    document, parts = _document(mesh, lit, color_type, alpha, cutoff, extras)
+    if order is None:
+        document, parts = _document(mesh, lit, color_type, alpha, cutoff, extras)
+    elif lit or alpha != "blend":
+        raise ValueError("an order of triangles is for alpha='blend' and an unlit material")
+    else:
+        document, parts = _ordered_document(mesh, order, color_type)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     binary = document["buffers"][0]["byteLength"]
@@ -133,18 +144,7 @@ def _document(
     mesh: SplatMesh, lit: bool, color_type: ColorType, alpha: Alpha, cutoff: float, with_extras: bool
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The JSON part, and the arrays of the binary part."""
-    from meshsplats import __version__
-
-    buffer = _Buffer()
-    extras: dict[str, Any] = {
-        "version": 1,
-        "blending": mesh.blending,
-        "up": [float(u) for u in mesh.up],
-    }
-    node: dict[str, Any] = {"name": "splats", "mesh": 0, "rotation": up_quaternion(mesh.up)}
-    if mesh.origin.any():
-        extras["origin"] = mesh.origin.tolist()
-        node["translation"] = turned_origin(mesh).tolist()
+    buffer, extras = _Buffer(), _note(mesh)
     if alpha == "hybrid":
         with_extras = False
     if mesh.filter_px2 and with_extras:
@@ -167,26 +167,81 @@ def _document(
     primitives = [_primitive(buffer, part, color_type, k) for k, (part, _) in enumerate(parts)]
     if with_extras:
         _add_own_arrays(buffer, mesh, primitives[0]["attributes"], extras)
+    meshes = [{"name": "splats", "primitives": primitives, "extras": {"meshsplats": extras}}]
+    materials = [_material(mode, lit, cutoff) for _, mode in parts]
+    return _scene(buffer, mesh, meshes, materials), buffer.parts
+
+
+def _ordered_document(
+    mesh: SplatMesh, order: DrawOrder, color_type: ColorType
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """As ``_document``, with both windings of all triangles in ``order``."""
+    buffer, extras = _Buffer(), _note(mesh)
+    if mesh.filter_px2:
+        extras["filter_px2"] = mesh.filter_px2
+    if mesh.normals is not None:
+        _check_unit(mesh.normals)
+    meshes: list[dict[str, Any]] = []
+    listed = []
+    for part in copies.parts(mesh, order):
+        piece = SplatMesh(
+            mesh.vertices[part.vertices],
+            part.faces,
+            mesh.colors[part.vertices],
+            normals=None if mesh.normals is None else mesh.normals[part.vertices],
+            blending=mesh.blending,
+        )
+        listed.append(part.vertices)
+        primitive = _primitive(buffer, piece, color_type, 0)
+        meshes.append({"name": "splats", "primitives": [primitive]})
+    own = copies.own_triangles(mesh.faces)
+    extras["copies"] = note = {"nodes": len(meshes), "turned": _raw(buffer, own.turned)}
+    note["offset"] = _raw(buffer, own.offset) | {"bytes": own.offset.itemsize}
+    if len(meshes) > 1:
+        note["vertex"] = _raw(buffer, np.concatenate(listed))
+    attributes = primitive["attributes"] if len(meshes) == 1 else None
+    _add_own_arrays(buffer, mesh, attributes, extras)
+    meshes[0]["extras"] = {"meshsplats": extras}
+    material = _material("blend", False, CUTOFF) | {"doubleSided": False}
+    return _scene(buffer, mesh, meshes, [material]), buffer.parts
+
+
+def _note(mesh: SplatMesh) -> dict[str, Any]:
+    """What our note about ``mesh`` begins with."""
+    note = {"version": 1, "blending": mesh.blending, "up": [float(u) for u in mesh.up]}
+    return note | ({"origin": mesh.origin.tolist()} if mesh.origin.any() else {})
+
+
+def _scene(
+    buffer: _Buffer, mesh: SplatMesh, meshes: list[dict[str, Any]], materials: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """The JSON part of a file of ``meshes``, which hold ``mesh``; several are below one node that places
+    them."""
+    from meshsplats import __version__
+
+    node: dict[str, Any] = {"name": "splats", "rotation": up_quaternion(mesh.up)}
+    if mesh.origin.any():
+        node["translation"] = turned_origin(mesh).tolist()
+    nodes = [node]
+    if len(meshes) == 1:
+        node["mesh"] = 0
+    else:
+        nodes += [{"name": f"splats {k + 1}", "mesh": k} for k in range(len(meshes))]
+        node["children"] = list(range(1, len(nodes)))
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [
-            {
-                "name": "splats",
-                "primitives": primitives,
-                "extras": {"meshsplats": extras},
-            }
-        ],
-        "materials": [_material(mode, lit, cutoff) for _, mode in parts],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": materials,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": buffer.length}],
     }
-    if not lit:
+    if any("extensions" in material for material in materials):
         document["extensionsUsed"] = ["KHR_materials_unlit"]
-    return document, buffer.parts
+    return document
 
 
 def _lowest_first(mesh: SplatMesh) -> SplatMesh:
@@ -257,18 +312,19 @@ def change_alpha(path: Path, alpha: Alpha, cutoff: float = CUTOFF) -> None:
 
 
 def _add_own_arrays(
-    buffer: _Buffer, mesh: SplatMesh, attributes: dict[str, int], extras: dict[str, Any]
+    buffer: _Buffer, mesh: SplatMesh, attributes: dict[str, int] | None, extras: dict[str, Any]
 ) -> None:
-    """Stores the arrays that only this project reads, and notes in ``extras`` where they are."""
+    """Stores the arrays that only this project reads, and notes in ``extras`` where they are: those of
+    vertices among the ``attributes`` of a primitive that has all vertices, if there is one."""
     extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
     for name, values in mesh.attributes.items():
         columns = None if values.ndim == 1 else values.shape[1]
         entry: dict[str, Any] = {"name": name, "columns": columns}
-        if columns is None or 1 <= columns <= 4:
+        if attributes is not None and (columns is None or 1 <= columns <= 4):
             semantic = _semantic(name, attributes)
             attributes[semantic] = buffer.accessor(values, _FLOAT, _ARRAY_BUFFER)
             entry["semantic"] = semantic
-        elif columns:
+        elif columns != 0:
             entry |= _raw(buffer, values)
         extras.setdefault("attributes", []).append(entry)
     if mesh.binding is not None:
