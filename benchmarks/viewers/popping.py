@@ -4,8 +4,8 @@
 
 Images of 400 pixels with MSAA as three.js draws files without an order (blend) and with one: `ordered_image`.
 Of their errors against the sorted images at 2 x 2 samples, the change from each frame to the next: root mean
-square, and the largest mean of a block of 8 x 8 pixels, both of 255. A sudden change of order shows as a large
-block.
+square, and the largest mean of a block of 8 x 8 pixels, both of 255. A sudden change of order shows as a
+large block.
 """
 
 from __future__ import annotations
