@@ -163,7 +163,7 @@ def test_the_table_in_the_readme_is_that_of_the_formats():
         [kind.description for kind in FORMATS]
         + [f"the only {listed(tuple(f'`{s}`' for s in zipped_suffixes()))} in a zip archive", "model folders"]
     )
-    assert table("README.md", "splats")["splats"] == read
+    assert table("docs/files.md", "splats")["splats"] == read
 
 
 def test_the_documents_say_what_is_in_memory():

@@ -26,7 +26,7 @@ class SplatFormat:
     module: str
     """The module below ``meshsplats.formats`` that holds its ``READER``."""
     description: str
-    """For the table in README.md."""
+    """For the table in docs/files.md."""
     in_memory: str
     """What of a file is in memory while it is read in blocks; for the table in docs/tiles.md."""
     zipped: tuple[str, ...] = ()
