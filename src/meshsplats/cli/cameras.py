@@ -11,19 +11,18 @@ import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
+from meshsplats.cameras.files import cameras_beside
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     Output,
     SplatOptions,
     Text,
-    cameras_beside,
-    check_outputs,
     load_scene,
     parse_up,
 )
 from meshsplats.cli.messages import UsageError, command_line, say
-from meshsplats.cli.records import PREVIEW, beside
+from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 from meshsplats.viewpoints.sheet import contact_sheet

@@ -106,8 +106,7 @@ def find_cameras(
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     given = unit_up(up) if up is not None else None if cloud.up is None else guess_up(cloud)
     first_up = guess_up(cloud) if given is None else given
-    sample = Sample(cloud, first_up, threads)
-    kind, confidence = kind_from_outside(sample, first_up)
+    kind, confidence = kind_from_outside(cloud, first_up, threads)
     if kind == "object" and not anywhere:
         cameras = outside_cameras(
             cloud,
@@ -123,6 +122,7 @@ def find_cameras(
         return FoundCameras(
             kind, confidence, first_up, float(given is not None), ground, extent, tuple(cameras)
         )
+    sample = Sample(cloud, first_up, threads)
     places = find_places(sample)
     upright = find_upright(sample, places, first_up)
     found_up, sure = (upright.up, upright.confidence) if given is None else (given, 1.0)

@@ -9,7 +9,7 @@ import numpy as np
 from meshsplats.cameras.framing import weighted_quantile
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.viewpoints.sample import COARSE, Sample
+from meshsplats.viewpoints.sample import COARSE, AllSplats, Sample
 from meshsplats.viewpoints.search import Places
 
 Kind = Literal["object", "ring", "place", "aerial"]
@@ -20,6 +20,8 @@ USUAL = 30_000
 """Splats of scenes that are coarser because they have fewer count as if there were so many."""
 OUTSIDE_VIEWS = 10
 OUTSIDE_SIDE = 48
+OUTSIDE_SPLATS = 400_000
+"""Number of splats, at most, that the dome is judged by."""
 FINE = 0.908
 """Share of opaque pixels with fine splats, seen from the dome, from which on a scene is an object."""
 FLAT = 0.2
@@ -32,27 +34,34 @@ MOST_SURE = 0.45
 """How sure it is at most whether a scene is a ring or a place: they look much alike."""
 
 
-def fineness_outside(sample: Sample, up: np.ndarray) -> float:
+def fineness_outside(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> float:
     """Share of fine splats in what the dome around the scene shows, 0 to 1."""
-    coarse = COARSE * max(1.0, (USUAL / len(sample.whole)) ** 0.5)
+    coarse = COARSE * max(1.0, (USUAL / len(cloud)) ** 0.5)
+    splats = AllSplats(subsample_of(cloud), threads)
     fine = []
-    for camera in outside_cameras(
-        sample.whole, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE
-    ):
-        log_angle, alpha, _ = sample.look(camera, OUTSIDE_SIDE)
+    for camera in outside_cameras(cloud, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE):
+        log_angle, alpha, _ = splats.look(camera, OUTSIDE_SIDE)
         fine.append((alpha / (1 + (np.exp(log_angle) / coarse) ** 2)).sum() / max(alpha.sum(), 1e-3))
     return float(np.mean(fine))
 
 
-def kind_from_outside(sample: Sample, up: np.ndarray) -> tuple[Kind | None, float]:
+def subsample_of(cloud: GaussianCloud) -> GaussianCloud:
+    """The splats, or every so many of them, evenly spread, at most ``OUTSIDE_SPLATS``."""
+    step = -(-len(cloud) // OUTSIDE_SPLATS)
+    return cloud if step == 1 else cloud.take(np.arange(0, len(cloud), step))
+
+
+def kind_from_outside(
+    cloud: GaussianCloud, up: np.ndarray, threads: int | None = None
+) -> tuple[Kind | None, float]:
     """'object' or 'aerial' if the scene is to be seen from outside, else None; and how sure, 0 to 1."""
-    if len(sample.whole) < FEWEST:
+    if len(cloud) < FEWEST:
         return "object", 1.0
-    fine = fineness_outside(sample, up)
+    fine = fineness_outside(cloud, up, threads)
     if fine < FINE:
         return None, float(np.clip(0.3 + 2 * (FINE - fine), 0, 1))
     sure = float(np.clip(0.3 + (fine - FINE) / (1 - FINE), 0, 1))
-    if len(sample.whole) >= LANDSCAPE and flatness(sample.thin, up) < FLAT:
+    if len(cloud) >= LANDSCAPE and flatness(subsample_of(cloud), up) < FLAT:
         return "aerial", sure
     return "object", sure
 

@@ -66,23 +66,76 @@ def angle_as_color(angle: np.ndarray) -> np.ndarray:
     return np.clip((np.log(np.maximum(angle, 1e-9)) + 9) / 9, 0, 1)
 
 
+class AllSplats:
+    """All splats of a scene: a sample hides holes."""
+
+    def __init__(self, cloud: GaussianCloud, threads: int | None) -> None:
+        self.cloud, self.threads = cloud, threads
+        self.sizes = sizes_of(cloud.scales)
+        self.reach = 4 * cloud.scales.max(axis=1)
+
+    def look(self, camera: Camera, sharp_side: int = CHECK_SIDE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What ``camera`` sees.
+
+        Args:
+            camera: view, of a small image.
+            sharp_side: side in pixels of the image whose low-pass filter the splats have.
+
+        Returns:
+            (h, w) logarithm of the angle, alpha, and standard deviation of the logarithm of the depth within
+            a pixel: large in fog, small on surfaces.
+        """
+        matrix = camera.world_to_camera.astype(np.float32)
+        slope = np.float32(0.5 * camera.width / camera.fx)
+        rows = []
+        for start in range(0, len(self.cloud), BLOCK):
+            x = self.cloud.means[start : start + BLOCK] @ matrix[:3, :3].T + matrix[:3, 3]
+            beside = np.maximum(np.abs(x[:, 0]), np.abs(x[:, 1])) - self.reach[start : start + BLOCK]
+            rows.append(start + np.flatnonzero((x[:, 2] > 0) & (beside < slope * x[:, 2])))
+        chosen = np.concatenate(rows)
+        if not len(chosen):
+            return np.full((camera.height, camera.width), -9.0), *np.zeros((2, camera.height, camera.width))
+        whole = self.cloud
+        means = np.take(whole.means, chosen, axis=0)
+        away = np.linalg.norm(means - camera.center, axis=1) + np.finfo(np.float32).tiny
+        deep = np.clip(np.log(away / np.median(away)) / 8 + 0.5, 0, 1)
+        angle = angle_as_color(self.sizes[chosen] / away)
+        cloud = GaussianCloud(
+            means,
+            np.take(whole.quaternions, chosen, axis=0),
+            np.take(whole.scales, chosen, axis=0),
+            np.take(whole.opacities, chosen),
+            coded(np.stack([angle, deep, deep * deep], axis=1)),
+            whole.kernel,
+        )
+        image = render_splats(
+            cloud,
+            camera,
+            background=(0, 0, 0),
+            threads=self.threads,
+            dilation=0.3 * (camera.width / sharp_side) ** 2,
+        )
+        alpha = image.alpha.astype(np.float64)
+        mean = image.color / np.maximum(alpha, 1e-6)[..., None]
+        spread = 8 * np.sqrt(np.maximum(mean[..., 2] - mean[..., 1] ** 2, 0))
+        return mean[..., 0] * 9 - 9, alpha, spread
+
+
 class Sample:
     """Splats of a scene, in its frame, and a frame of directions that moves with the scene."""
 
     def __init__(self, cloud: GaussianCloud, up: np.ndarray | None, threads: int | None) -> None:
-        self.whole, self.threads = cloud, threads
+        self.whole, self.threads = AllSplats(cloud, threads), threads
         n = len(cloud)
         thin, wider = replace(cloud, sh=cloud.sh[:, :1]), 1.0
         if n > SAMPLE:
             rows = np.sort(np.random.default_rng(0).choice(n, SAMPLE, replace=False))
-            thin = cloud.select(rows)
+            thin = cloud.take(rows)
             wider = min((n / SAMPLE) ** 0.5, WIDEST)
             thin = replace(thin, scales=thin.scales * np.float32(wider), sh=thin.sh[:, :1])
         self.thin = thin
         self.means = thin.means.astype(np.float64)
         self.size = sizes_of(thin.scales).astype(np.float64) / wider
-        self.sizes_of_whole = sizes_of(cloud.scales)
-        self.reach_of_whole = 4 * cloud.scales.max(axis=1)
         self.normals = _normals(thin)
         self.center = np.median(self.means, axis=0)
         self.radius = float(np.median(np.linalg.norm(self.means - self.center, axis=1))) or 1.0
@@ -167,52 +220,6 @@ class Sample:
         x, y = (np.einsum("kj,kj->k", rotations[face, axis], toward) / ahead for axis in (0, 1))
         column, row = (np.clip(((v + 1) / 2 * SIDE).astype(int), 0, SIDE - 1) for v in (x, y))
         return away <= 1.2 * depth[face * SIDE * SIDE + row * SIDE + column] + 2 * self.size[rows], toward
-
-    def look(self, camera: Camera, sharp_side: int = CHECK_SIDE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What ``camera`` sees of all splats, as a sample hides holes.
-
-        Args:
-            camera: view, of a small image.
-            sharp_side: side in pixels of the image whose low-pass filter the splats have.
-
-        Returns:
-            (h, w) logarithm of the angle, alpha, and standard deviation of the logarithm of the depth within
-            a pixel: large in fog, small on surfaces.
-        """
-        matrix = camera.world_to_camera.astype(np.float32)
-        slope = np.float32(0.5 * camera.width / camera.fx)
-        rows = []
-        for start in range(0, len(self.whole), BLOCK):
-            x = self.whole.means[start : start + BLOCK] @ matrix[:3, :3].T + matrix[:3, 3]
-            beside = np.maximum(np.abs(x[:, 0]), np.abs(x[:, 1])) - self.reach_of_whole[start : start + BLOCK]
-            rows.append(start + np.flatnonzero((x[:, 2] > 0) & (beside < slope * x[:, 2])))
-        chosen = np.concatenate(rows)
-        if not len(chosen):
-            return np.full((camera.height, camera.width), -9.0), *np.zeros((2, camera.height, camera.width))
-        whole = self.whole
-        means = np.take(whole.means, chosen, axis=0)
-        away = np.linalg.norm(means - camera.center, axis=1) + 1e-9 * self.radius
-        deep = np.clip(np.log(away / np.median(away)) / 8 + 0.5, 0, 1)
-        angle = angle_as_color(self.sizes_of_whole[chosen] / away)
-        cloud = GaussianCloud(
-            means,
-            np.take(whole.quaternions, chosen, axis=0),
-            np.take(whole.scales, chosen, axis=0),
-            np.take(whole.opacities, chosen),
-            coded(np.stack([angle, deep, deep * deep], axis=1)),
-            whole.kernel,
-        )
-        image = render_splats(
-            cloud,
-            camera,
-            background=(0, 0, 0),
-            threads=self.threads,
-            dilation=0.3 * (camera.width / sharp_side) ** 2,
-        )
-        alpha = image.alpha.astype(np.float64)
-        mean = image.color / np.maximum(alpha, 1e-6)[..., None]
-        spread = 8 * np.sqrt(np.maximum(mean[..., 2] - mean[..., 1] ** 2, 0))
-        return mean[..., 0] * 9 - 9, alpha, spread
 
 
 def merit(log_angle: np.ndarray, natural: float, finer: float) -> np.ndarray:

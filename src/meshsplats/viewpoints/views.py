@@ -29,6 +29,8 @@ STEPS = 8
 """Steps in which the merit of a splat in a view is counted."""
 RICH = 0.3
 """Least number of splats that a view shows, as a share of what good views show: noise has few."""
+UNCOMMON = 0.4
+"""Least weight of a splat that few of the best places show."""
 NEARBY = 0.35
 """Distance, in spreads of the places and units of direction, within which views show much the same."""
 SIDE = 56
@@ -41,6 +43,8 @@ MAX_POOR = 0.2
 """Greatest share of poor pixels in a view."""
 POOL = 24
 """Views whose fog tells what is usual in the scene."""
+PATIENCE = 40
+"""So many views in a row that are no good pictures, and no more are looked for."""
 NEAR_SHARE = 0.02
 """Near plane as a share of the mean depth of the view."""
 
@@ -83,7 +87,7 @@ def check(
         fov=WIDEST,
         near=NEAR_SHARE * depth,
     )
-    log_angle, alpha, spread = sample.look(camera)
+    log_angle, alpha, spread = sample.whole.look(camera)
     poor = (alpha < 0.9) | (merit(log_angle, natural, FINER) < POOR)
     half = SIDE // 2
     cuts = np.arange(int(half * (1 - np.tan(np.radians(NARROWEST / 2)) / np.tan(np.radians(WIDEST / 2)))) + 1)
@@ -122,7 +126,7 @@ class Chooser:
         common = np.zeros(self.shown.shape[1])
         for k in np.unique(self.place[self.place < BEST]):
             common += (self.shown[self.place == k] > 0.25 * STEPS).any(axis=0)
-        self.weight = np.minimum(common / max(float(np.quantile(common, 0.8)), 1.0), 1)
+        self.weight = np.clip(common / max(float(np.quantile(common, 0.8)), 1.0), UNCOMMON, 1)
         total = self.shown @ np.round(LEVELS * self.weight).astype(np.float32)
         self.rich = total >= RICH * np.quantile(total, 0.9)
         self._checked: dict[int, Checked] = {}
@@ -166,8 +170,8 @@ class Chooser:
         count_shown = np.zeros(self.shown.shape[1])
         open_ones = self.rich.copy()
         nearest = np.full(len(self.place), np.inf)
-        tries = 3 * count + POOL
-        while len(chosen) < count and open_ones.any() and tries > 0:
+        failed = 0  # in a row: what is chosen does not depend on how many are wanted
+        while len(chosen) < count and open_ones.any() and failed < PATIENCE:
             if first is not None and not chosen:
                 k = first
             else:
@@ -175,13 +179,14 @@ class Chooser:
                 gain *= 1 - np.exp(-nearest / NEARBY**2)
                 k = int(np.argmax(np.where(open_ones, gain, -1)))
             open_ones[k] = False
-            tries -= 1
             if np.isfinite(limit) and self.checked(k).widest(limit) is None:
                 # What lies close by is as bad, likely.
                 apart = ((self.spots - self.spots[k]) ** 2).sum(axis=1)
                 open_ones &= apart > (NEARBY / 3) ** 2
+                failed += 1
                 continue
             chosen.append(k)
+            failed = 0
             count_shown += self.shown[k] / STEPS
             need = np.round(LEVELS * self.weight / (1 + count_shown)).astype(np.float32)
             nearest = np.minimum(nearest, ((self.spots - self.spots[k]) ** 2).sum(axis=1))
