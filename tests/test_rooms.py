@@ -9,7 +9,7 @@ from pathlib import Path
 import meshsplats
 
 ROOT = Path(meshsplats.__file__).parent
-LONGEST_CHAIN = 12
+LONGEST_CHAIN = 13
 LOWEST = (
     *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options", "_origin"),
     *("_toml", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
@@ -20,6 +20,7 @@ FLOORS = (
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),
+    ("viewpoints",),
     ("conversion", "datasets"),
     ("evaluation",),
     ("finetuning", "viewer"),

@@ -132,6 +132,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
         ("save_image", {"path": "x", "image": IMAGE}, {"path": "path", "image": "array"}),
         ("save_mesh", {"mesh": MESH, "path": "x"}, {"mesh": "mesh", "path": "path"}),
         ("simplify", {"cloud": CLOUD, "count": 9}, {"cloud": "cloud", "cameras": "optional cameras"}),
+        ("find_cameras", {"cloud": CLOUD}, {"cloud": "cloud"}),
         ("splat_dataset", {"cloud": CLOUD}, {"cloud": "cloud", "cameras": "optional cameras"}),
         (
             "starting_mesh",
@@ -152,7 +153,7 @@ ELSEWHERE = {
     "gaussians_from_tensors",  # tests/formats/test_tensors.py
     *("ConversionOptions", "FinetuneConfig", "TrainConfig", "TileOptions", "PageOptions"),  # plain values
     *("make_config", "train_config"),
-    *("Comparison", "Interrupted", "Progress", "Rendering", "Report", "Workers"),  # results
+    *("Comparison", "FoundCameras", "Interrupted", "Progress", "Rendering", "Report", "Workers"),  # results
     *("DataWarning", "DivergenceError", "FileFormatError", "MissingDependencyError", "__version__"),
 }
 

@@ -60,6 +60,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.tiles.tileset import Tileset
     from meshsplats.training import TrainConfig, train, train_config
     from meshsplats.viewer.page import PageOptions, make_page
+    from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
 try:
     __version__ = version("meshsplats")
@@ -109,6 +110,7 @@ _HOME = {
     "meshsplats.tiles.tileset": ("Tileset",),
     "meshsplats.training": ("TrainConfig", "train", "train_config"),
     "meshsplats.viewer.page": ("PageOptions", "make_page"),
+    "meshsplats.viewpoints.finding": ("FoundCameras", "find_cameras"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
@@ -122,6 +124,7 @@ __all__ = [
     "DivergenceError",
     "FileFormatError",
     "FinetuneConfig",
+    "FoundCameras",
     "GaussianCloud",
     "Interrupted",
     "MeshPrior",
@@ -152,6 +155,7 @@ __all__ = [
     "drawing_order",
     "evaluate",
     "find_background",
+    "find_cameras",
     "finetune",
     "gaussians_from_tensors",
     "gaussians_to_tensors",

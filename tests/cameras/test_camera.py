@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.framing import front_axes, guess_up, scene_bounds, weighted_quantile
+from meshsplats.cameras.placing import inside_cameras, outside_cameras
 from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
-from meshsplats.datasets.splat_targets import inside_cameras, outside_cameras
 from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh

@@ -16,16 +16,11 @@ from PIL import Image
 import meshsplats as ms
 from meshsplats import draw_splats
 from meshsplats.cameras.framing import scene_bounds
+from meshsplats.cameras.placing import has_surroundings, inside_cameras, outside_cameras
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.splat_targets import (
-    has_surroundings,
-    inside_cameras,
-    outside_cameras,
-    splat_dataset,
-    splat_views,
-)
+from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError

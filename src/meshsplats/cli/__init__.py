@@ -42,6 +42,7 @@ COMMANDS = {
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, images side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),
     "train": ("meshsplats.cli.train:Train", "photographs to a mesh, without splats"),
+    "cameras": ("meshsplats.cli.cameras:Cameras", "from where a scene is to be seen, found from its splats"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
     "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
     "tiles": ("meshsplats.cli.tiles:Tiles", "a 3D Tiles tileset of splats of any number"),

@@ -194,6 +194,13 @@ class ViewOptions:
         """Whether the views make a turntable."""
         return self.cameras is None and self.data is None and self.dome is None
 
+    @property
+    def _placed(self) -> bool:
+        """Whether an option says where cameras stand or what lens they have."""
+        placing = ("orbit", "dome", "elevation", "azimuth", "distance", "look_at", "fov", "focal_length")
+        defaults = {f.name: f.default for f in fields(self)}
+        return any(getattr(self, name) != defaults[name] for name in placing)
+
     def photographs(self, origin: np.ndarray) -> Dataset | None:
         """The data set of --data, relative to ``origin``, or None."""
         if self.data is None:
@@ -241,6 +248,10 @@ class ViewOptions:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
             lens["fov"] = 75.0 if fov is None else fov
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
+        if not self._placed and cameras_beside(source, scene.origin) is None:
+            told = None if self.up is None else lens["up"]
+            if views := views_of_a_place(scene, count, lens | {"up": told}):
+                return views
         lens["fov"] = 45.0 if fov is None else fov
         target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
         lens |= {"distance": self.distance, "target": target}
@@ -407,6 +418,22 @@ def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> G
     mesh = load_mesh(path)
     warn_of_strays_in(mesh)
     return mesh
+
+
+def views_of_a_place(
+    scene: GaussianCloud | SplatMesh, count: int, lens: dict[str, Any]
+) -> list[Camera] | None:
+    """``count`` views of splats that are no object, as ``find_cameras`` finds them; says what was found.
+    ``lens``: width, height, and up or None."""
+    from meshsplats.viewpoints.finding import find_cameras
+
+    if not isinstance(scene, GaussianCloud) or not len(scene):
+        return None
+    found = find_cameras(scene, count, **lens)
+    if found.kind == "object":
+        return None
+    say(f"{found.in_words()}: seen from views that were found")
+    return list(found.cameras)
 
 
 def parse_up(text: str) -> np.ndarray:

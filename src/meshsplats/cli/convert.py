@@ -38,6 +38,7 @@ from meshsplats.cli.common import (
     say_origin,
     size_of,
     track,
+    views_of_a_place,
     warnings_kept,
     written,
 )
@@ -75,6 +76,8 @@ _FOR_SPLATS = (
     *("conversion", "reading", "origin", "json", "force", "skip_existing"),
 )
 """Options of the command that have one."""
+FOUND_VIEWS = 48
+"""Views of a place that fans are sized by, where no cameras are known."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
 ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
@@ -368,6 +371,10 @@ class Convert(Command):
         cameras = _seen_from(cameras, job.source, cloud.origin)
         read = time.perf_counter()
         up = None if self.up is None else parse_up(self.up)
+        opening = None
+        if not cameras and self._free:
+            cameras = views_of_a_place(cloud, FOUND_VIEWS, {"width": 800, "height": 800, "up": up}) or []
+            opening = cameras[0] if cameras else None
         mesh = convert(cloud, self.conversion, preset=self.preset, cameras=cameras, up=up)
         mesh = self._files.prepared(mesh, cameras)
         times = {"read": read - start, "convert": time.perf_counter() - read}
@@ -375,9 +382,15 @@ class Convert(Command):
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
             "merged": self._merges(),
-            **self._finish(mesh, job, cameras, times),
+            **self._finish(mesh, job, cameras, times, opening),
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
+
+    @property
+    def _free(self) -> bool:
+        """Whether nothing says from where the mesh will be seen."""
+        options = self.conversion
+        return self.preset == "default" and options.footprint is None and options.viewing_distance is None
 
     def _check_stream(self, kinds: Sequence[str]) -> None:
         """UsageError or ValueError for what needs the whole scene in memory."""
@@ -485,7 +498,12 @@ class Convert(Command):
         return fidelity(cloud, mesh, cameras, self.fidelity, self._look)
 
     def _finish(
-        self, mesh: SplatMesh, job: Job, cameras: Sequence[Camera], times: dict[str, float]
+        self,
+        mesh: SplatMesh,
+        job: Job,
+        cameras: Sequence[Camera],
+        times: dict[str, float],
+        opening: Camera | None = None,
     ) -> dict[str, Any]:
         """Writes ``mesh``, which is prepared, and its preview. Its part of the result; ``times``: of what was
         done before, in seconds."""
@@ -499,7 +517,7 @@ class Convert(Command):
         comparing = "choose alpha" if order is None else "solve order"
         times |= {comparing: chosen - start, "save": time.perf_counter() - chosen}
         if job.preview:
-            draw_preview(mesh, job.preview)
+            draw_preview(mesh, job.preview, opening)
         return {
             "triangles": len(mesh.faces),
             "vertices": len(mesh.vertices),

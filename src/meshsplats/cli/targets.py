@@ -45,9 +45,10 @@ class TargetOptions:
     distance: tyro.conf.Fixed[tuple[float, float]] = (0.9, 1.1)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
     sphere with 90 % of the splats' opacity just fits the image."""
-    placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
-    """Without --data: cameras all around an object, above the ground around an object in its surroundings, or
-    inside a room."""
+    placement: Literal["auto", "object", "surrounded", "inside", "found"] = "auto"
+    """Without --data: cameras all around an object, above the ground around an object in its surroundings,
+    in free places inside a room, or found from the splats as 'meshsplats cameras' does. auto: found, except
+    for objects."""
     cameras: File = None
     """Without --data: cameras, a JSON list or a cameras.json of a 3DGS trainer. Default: those of a model
     folder, else placed ones (--placement)."""

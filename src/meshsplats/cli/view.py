@@ -27,6 +27,7 @@ from meshsplats.cli.common import (
     parse_up,
     plural,
     size_of,
+    views_of_a_place,
 )
 from meshsplats.cli.messages import UsageError, say, shown_path
 from meshsplats.cli.records import write_configuration
@@ -40,6 +41,8 @@ from meshsplats.viewer.content import Content
 
 if TYPE_CHECKING:
     from meshsplats.viewer.page import Page
+FOUND_VIEWS = 12
+"""Viewpoints of a place, where the input has none."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class View(Command):
             check_outputs(outputs, self.force, inputs=inputs)
         scene = self._scene()
         photographs = self._photographs(scene.origin)
-        cameras = self._cameras(photographs, scene.origin)
+        cameras = self._cameras(photographs, scene)
         shown = self._content(scene, cameras)
         del scene  # large, and partly copied
         self._announce(shown)
@@ -166,12 +169,16 @@ class View(Command):
 
         return load_dataset(self.data, missing=self.missing, origin=origin)
 
-    def _cameras(self, photographs: Dataset | None, origin: np.ndarray) -> list[Camera]:
+    def _cameras(self, photographs: Dataset | None, scene: GaussianCloud | SplatMesh) -> list[Camera]:
         if photographs is not None:
             return [view.camera for view in photographs.views]
         if self.cameras is not None:
-            return load_cameras(self.cameras, origin=origin)
-        return cameras_beside(self.input, origin) or []
+            return load_cameras(self.cameras, origin=scene.origin)
+        beside = cameras_beside(self.input, scene.origin)
+        if beside is not None:
+            return beside
+        lens = {"width": 800, "height": 800, "up": None if self.up is None else parse_up(self.up)}
+        return views_of_a_place(scene, FOUND_VIEWS, lens) or []
 
     def _announce(self, shown: Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""

@@ -4,43 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import MAX_SIDE, Camera
-from meshsplats.cameras.framing import (
-    SAMPLE,
-    SURROUNDINGS,
-    front_axes,
-    guess_up,
-    scene_bounds,
-    unit_up,
-    weighted_quantile,
+from meshsplats.cameras.placing import (
+    DISTANCES,
+    OBJECT_ELEVATIONS,
+    STEPS,
+    SURROUNDED_ELEVATIONS,
+    has_surroundings,
+    inside_cameras,
+    outside_cameras,
 )
-from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.looks import Look, check_look, draw_splats
+from meshsplats.viewpoints.finding import find_cameras
 
-Placement = Literal["auto", "object", "surrounded", "inside"]
+Placement = Literal["auto", "object", "surrounded", "inside", "found"]
 
-STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
-"""Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube
-evenly in every run of successive points. The first two are powers of the inverse of the plastic number, the
-most even pair known: directions matter most."""
-OBJECT_ELEVATIONS = (0.0, 60.0)
-SURROUNDED_ELEVATIONS = (3.0, 60.0)
-"""Degrees above the horizon. Few captures show anything from below, and flat ground seen from the side is so
-hard to match that such views make the others worse."""
-INSIDE_ELEVATIONS = (-35.0, 35.0)
-DISTANCES = (0.9, 1.1)
-"""Multiples of the distance at which the subject just fits."""
-SURROUNDINGS_SHARE = 0.01
-"""A subject has surroundings if more than this share of the opacity lies beyond it."""
-STANDS = 12
-"""Largest number of places for cameras inside a scene."""
 HELD_OUT = 8
 """Least number of views that are never trained on, used or not: a mesh can be evaluated on them later,
 however it was trained."""
@@ -54,10 +39,6 @@ TRAINING_SAMPLES = 2
 WINDOW_CENTERS = 4096
 """Number of splats around which windows are cut out. Windows that are spread over the image show little but
 background where the subject is slim."""
-CANDIDATES = 512
-"""Number of points that are tried as such places."""
-ROOMY = 0.4
-"""Least clearance of a place as a share of the largest one."""
 
 
 def splat_dataset(
@@ -87,8 +68,9 @@ def splat_dataset(
         placement: 'object': cameras on all sides, from the horizon up. 'surrounded': an object in its
             surroundings, seen from all around; cameras a little above the ground. 'inside': cameras in free
             places between the splats that look outwards, for rooms and other scenes captured from inside.
-            'auto': 'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object';
-            never 'inside', as splats of a room and of a hollow object look alike.
+            'found': from where the splats look as they do in photographs (``find_cameras``). 'auto': 'found'
+            unless the scene is an object; for objects 'surrounded' if more than 1 % of the opacity lies far
+            beyond the subject, else 'object'. 'auto' with a ``distance`` or ``fov`` is never 'found'.
         cameras: cameras that the scene was trained from, as in the cameras.json of a model folder, instead of
             a placement. ``train`` and ``test`` of them are used (at most every eighth for testing), evenly
             spread and scaled to ``width``; ``height``, ``fov``, ``distance`` and ``up`` have no effect.
@@ -115,8 +97,8 @@ def splat_dataset(
     need_all(Camera, cameras=cameras, optional=True)
     if len(cloud) == 0:
         raise ValueError("the scene is empty: there is nothing to make images of")
-    if placement not in ("auto", "object", "surrounded", "inside"):
-        raise ValueError(f"placement must be auto, object, surrounded or inside, got {placement!r}")
+    if placement not in get_args(Placement):
+        raise ValueError(f"placement must be one of {', '.join(get_args(Placement))}, got {placement!r}")
     if train < 1 or test < 0:
         raise ValueError(f"there must be at least 1 training view and 0 test views, got {train} and {test}")
     if not 1 <= width <= MAX_SIDE or not (height is None or 1 <= height <= MAX_SIDE):
@@ -124,6 +106,7 @@ def splat_dataset(
     if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
     first = max(test, HELD_OUT)  # of the training views
+    free = fov is None and tuple(distance) == DISTANCES
     if cameras is not None:
         cameras = [camera.with_near_plane(cloud.means) for camera in cameras]
         placed, first = _given(cameras, train, test, width)
@@ -131,6 +114,8 @@ def splat_dataset(
         placed = inside_cameras(
             cloud, first + train, up=up, width=width, height=height or width, fov=75.0 if fov is None else fov
         )
+    elif found := _found(cloud, placement, first + train, up, width, height, free, threads):
+        placed = found
     else:
         if placement == "auto":
             placement = "surrounded" if has_surroundings(cloud) else "object"
@@ -172,138 +157,23 @@ def splat_dataset(
     return Dataset(learned, held_out, "splats", look, cloud.origin)
 
 
-def has_surroundings(cloud: GaussianCloud) -> bool:
-    """Whether more than ``SURROUNDINGS_SHARE`` of the opacity lies far outside the subject, as
-    ``framing.scene_bounds`` has it."""
-    center = scene_bounds(cloud).center
-    distance = np.linalg.norm(cloud.means - center, axis=1)
-    weights = cloud.opacities.astype(np.float64)
-    if weights.sum() == 0:
-        return False
-    far = distance > SURROUNDINGS * weighted_quantile(distance, weights, 0.5)
-    return bool(weights[far].sum() > SURROUNDINGS_SHARE * weights.sum())
-
-
-def outside_cameras(
+def _found(
     cloud: GaussianCloud,
+    placement: Placement,
     count: int,
-    *,
-    elevations: tuple[float, float] = OBJECT_ELEVATIONS,
-    distance: tuple[float, float] = DISTANCES,
-    up: Sequence[float] | np.ndarray | None = None,
-    width: int = 400,
-    height: int = 400,
-    fov: float = 50.0,
-) -> list[Camera]:
-    """``count`` cameras that look at the subject's middle, evenly spread over directions and distances.
-
-    Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
-    Every run of successive cameras is evenly spread, too. The other arguments are those of ``splat_dataset``.
-    """
-    axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
-    bounds = scene_bounds(cloud)  # refuses an empty cloud
-    # Surroundings may have most of the opacity; then only the subject has to fit.
-    reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max(initial=0))
-    fit = (min(bounds.radius, reach) or bounds.radius) / np.sin(np.radians(fov / 2))
-    turns, heights, share = _sequence(count)
-    low, high = np.sin(np.radians(elevations))
-    away = fit * distance[0] * (distance[1] / distance[0]) ** share
-    return [
-        look_at(
-            bounds.center + away[i] * _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i]),
-            bounds.center,
-            up=axes[1],
-            width=width,
-            height=height,
-            fov=fov,
-            near=away[i] * NEAR_SHARE,
-            name=f"view_{i:04d}",
-        )
-        for i in range(count)
-    ]
-
-
-def _sequence(count: int) -> np.ndarray:
-    """(3, count) numbers in [0, 1)."""
-    return (0.5 + np.outer(STEPS, np.arange(count))) % 1
-
-
-def _towards(axes: np.ndarray, turn: float, height: float) -> np.ndarray:
-    """(3,) unit direction ``turn`` radians around the up axis; ``height``: the sine of its elevation."""
-    right, upward, forward = axes
-    level = np.sqrt(1 - height * height)
-    return level * (np.sin(turn) * right + np.cos(turn) * forward) + height * upward
-
-
-def inside_cameras(
-    cloud: GaussianCloud,
-    count: int,
-    *,
-    up: Sequence[float] | np.ndarray | None = None,
-    width: int = 400,
-    height: int = 400,
-    fov: float = 75.0,
-) -> list[Camera]:
-    """``count`` cameras inside the scene that look outwards, in all directions near the horizon.
-
-    They stand in up to ``STANDS`` places, far from each other, in the middle parts of the scene where the
-    nearest splat is farthest away; the cameras in each place look in all directions.
-    """
-    axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
-    places, clearances = _free_places(cloud, axes, max(1, min(STANDS, count // 6)))
-    low, high = np.sin(np.radians(INSIDE_ELEVATIONS))
-    turns, heights, _ = _sequence(count)
-    cameras = []
-    for i in range(count):
-        stand = i % len(places)
-        direction = _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i])
-        cameras.append(
-            look_at(
-                places[stand],
-                places[stand] + clearances[stand] * direction,
-                up=axes[1],
-                width=width,
-                height=height,
-                fov=fov,
-                near=clearances[stand] * 0.05,
-                name=f"view_{i:04d}",
-            )
-        )
-    return cameras
-
-
-def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Up to ``count`` points (k, 3) between the splats, and (k,) how far the nearest splat is from each."""
-    bounds = scene_bounds(cloud)  # refuses an empty cloud
-    solid = np.flatnonzero(cloud.opacities > 0.1)
-    rows = (solid if len(solid) else np.arange(len(cloud)))[:: -(-max(len(solid), 1) // SAMPLE)]
-    points = cloud.means[rows].astype(np.float64)
-    reach = 2 * np.median(cloud.scales[rows].astype(np.float64), axis=1)
-    along = bounds.points @ axes.T
-    low, high = (
-        np.array([weighted_quantile(along[:, k], bounds.weights, q) for k in range(3)]) for q in (0.02, 0.98)
-    )
-    # The middle three quarters across and the middle half in height: people do not crawl.
-    middle, half = (low + high) / 2, (high - low) / 2 * [0.75, 0.5, 0.75]
-    # Kronecker's sequence of the plastic number's powers fills a cube evenly.
-    steps = 1.2207440846057596 ** -np.arange(1, 4)
-    inner = 2 * ((0.5 + np.arange(CANDIDATES)[:, None] * steps) % 1) - 1
-    tried = (middle + half * inner) @ axes
-    clearance = np.empty(CANDIDATES)
-    square = (points**2).sum(axis=1)
-    for start in range(0, CANDIDATES, 64):
-        some = tried[start : start + 64]
-        apart = np.maximum((some**2).sum(axis=1)[:, None] - 2 * some @ points.T + square, 0)
-        clearance[start : start + 64] = (np.sqrt(apart) - reach).min(axis=1)
-    best = clearance.max()
-    if best <= 0:
-        raise ValueError("no free place was found inside the scene; is it an object (placement 'object')?")
-    roomy = np.flatnonzero(clearance >= ROOMY * best)
-    chosen = [int(roomy[clearance[roomy].argmax()])]
-    while len(chosen) < min(count, len(roomy)):
-        away = np.linalg.norm(tried[roomy][:, None] - tried[chosen], axis=2).min(axis=1)
-        chosen.append(int(roomy[away.argmax()]))
-    return tried[chosen], clearance[chosen]
+    up: Sequence[float] | np.ndarray | None,
+    width: int,
+    height: int | None,
+    free: bool,
+    threads: int | None,
+) -> list[Camera] | None:
+    """The views of placement 'found', None if the scene is to be seen from a dome; ``free``: no option of
+    domes was given."""
+    if placement != "found" and not (placement == "auto" and free):
+        return None
+    options: dict[str, Any] = {"up": up, "width": width, "height": height, "threads": threads}
+    found = find_cameras(cloud, count, anywhere=placement == "found", **options)
+    return None if found.kind == "object" and placement == "auto" else list(found.cameras)
 
 
 def window_centers(cloud: GaussianCloud) -> np.ndarray:

@@ -1,0 +1,102 @@
+"""``meshsplats cameras``: from where a scene is to be seen, found from its splats."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from meshsplats._files.atomic import together
+from meshsplats.cameras.files import cameras_beside
+from meshsplats.cli.arguments import Command
+from meshsplats.cli.common import (
+    Count,
+    Output,
+    SplatOptions,
+    Text,
+    load_scene,
+    parse_up,
+)
+from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.viewpoints.finding import FoundCameras, find_cameras
+from meshsplats.viewpoints.sheet import contact_sheet
+
+
+@dataclass(frozen=True)
+class Cameras(Command):
+    """Finds cameras that see a scene as its photographs did, from the splats alone.
+
+    An object is seen from all around; a room, a garden or a town from where its splats look sharp and leave
+    no holes. The first camera is the view to open with. NAME.preview.png beside the result NAME shows them.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splats."""
+    output: Output
+    """The cameras, for --cameras of other commands: .json."""
+    count: int = 24
+    """Number of views."""
+    up: Text = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the file, else found."""
+    width: int = 800
+    """Image width in pixels."""
+    height: Count = None
+    """Image height in pixels. Default: the width."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """Maximum number of threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def execute(self) -> None:
+        from meshsplats.cameras.files import save_cameras
+        from meshsplats.images.writing import save_image
+
+        start = time.perf_counter()
+        if self.output.suffix.lower() != ".json":
+            raise UsageError(f"cameras are written as .json, got {self.output.name!r}")
+        preview = beside(self.output, PREVIEW)
+        check_outputs([self.output, preview], self.force, inputs=[self.input])
+        scene = load_scene(self.input, self.reading, up=self.up)
+        if not isinstance(scene, GaussianCloud):
+            raise UsageError(f"{self.input} is a mesh: cameras are found from the splats it was made of")
+        up = None if self.up is None else parse_up(self.up)
+        given = cameras_beside(self.input, scene.origin)
+        if given is not None:
+            say(f"{self.input} has {len(given)} cameras of its own, which --cameras {self.input} takes")
+        found = find_cameras(
+            scene, self.count, up=up, width=self.width, height=self.height, threads=self.threads
+        )
+        with together():
+            save_cameras(found.cameras, self.output, origin=scene.origin)
+            save_image(preview, contact_sheet(scene, found.cameras, threads=self.threads))
+        self._print_result(found, scene.origin, preview, time.perf_counter() - start)
+
+    def _print_result(self, found: FoundCameras, origin: np.ndarray, preview: Path, seconds: float) -> None:
+        if self.json:
+            facts = {
+                "output": str(self.output),
+                "preview": str(preview),
+                "kind": found.kind,
+                "confidence": round(found.confidence, 2),
+                "up": [round(float(v), 4) for v in found.up],
+                "up_confidence": round(found.up_confidence, 2),
+                "ground": found.ground + float(origin @ found.up),
+                "extent": found.extent,
+                "cameras": len(found.cameras),
+                "seconds": round(seconds, 2),
+            }
+            print(json.dumps(facts, indent=1))
+            return
+        print(found.in_words())
+        print(f"{self.output} ({len(found.cameras)} cameras) in {seconds:.1f} s; {preview} shows them")
+        words = ["meshsplats", "render", self.input, "--as-splats", "--cameras", self.output, "-o", "views/"]
+        print(f"next: {command_line(words)}")

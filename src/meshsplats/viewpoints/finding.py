@@ -1,0 +1,164 @@
+"""find_cameras: the kind of a scene, which way is up, and views of it, from its splats alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshsplats._kinds import need
+from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
+from meshsplats.cameras.placing import (
+    OBJECT_ELEVATIONS,
+    STEPS,
+    SURROUNDED_ELEVATIONS,
+    has_surroundings,
+    outside_cameras,
+)
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.viewpoints.kind import Kind, kind_from_inside, kind_from_outside
+from meshsplats.viewpoints.sample import Sample
+from meshsplats.viewpoints.search import find_places
+from meshsplats.viewpoints.upright import find_upright
+from meshsplats.viewpoints.views import NEAR_SHARE, choose_views
+
+MOST = 96
+"""Views that are looked for, each checked with all splats; more are variations of these."""
+SHIFT = 0.1
+"""Greatest shift of a variation, as a share of the mean depth of the view."""
+TURN = 8.0
+"""Greatest turn of a variation, degrees."""
+WIDE = 85.0
+"""Degrees of every third variation, for what is around the subject."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCameras:
+    """What ``find_cameras`` found, in the frame of the splats."""
+
+    kind: Kind
+    """'object': seen from all around, against nothing. 'ring': a subject in its surroundings, photographed
+    from a ring of cameras or part of one. 'place': seen from within. 'aerial': a landscape from above."""
+    confidence: float
+    """How sure the kind is, 0 to 1."""
+    up: np.ndarray
+    """(3,) unit direction."""
+    up_confidence: float
+    """How sure ``up`` is: 1 where it was given, by the caller or the file, or a large floor shows it; 0 where
+    it is the default of the format."""
+    ground: float
+    """Height of the ground along ``up``: ``point @ up`` of points on it."""
+    extent: float
+    """Mean depth of the views, scene units: about how far one sees."""
+    cameras: tuple[Camera, ...]
+    """The first is the view to open with; those up to any other are evenly spread."""
+
+    def in_words(self) -> str:
+        """One line: the kind, which way is up, how far one sees."""
+        sure = "sure" if self.confidence >= 0.6 else "likely" if self.confidence >= 0.4 else "perhaps"
+        told = "sure" if self.up_confidence >= 0.6 else "likely" if self.up_confidence > 0 else "the default"
+        what = {
+            "object": "an object",
+            "ring": "a subject in its surroundings",
+            "place": "a place, seen from within",
+            "aerial": "a landscape from above",
+        }[self.kind]
+        x, y, z = (f"{v:.2f}" for v in self.up + 0.0)
+        return f"{what} ({sure}); up {x} {y} {z} ({told}); views {self.extent:.3g} units deep"
+
+
+def find_cameras(
+    cloud: GaussianCloud,
+    count: int = 24,
+    *,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 400,
+    height: int | None = None,
+    anywhere: bool = False,
+    threads: int | None = None,
+) -> FoundCameras:
+    """Cameras that see a scene as photographs did, found from its splats alone.
+
+    An object is seen from a dome around it. In any other scene the dome shows walls from behind and the noise
+    that no photograph saw, so views are looked for from where splats look small and leave no holes. The
+    result has the same bits on every run, with any number of threads.
+
+    Args:
+        cloud: the splats.
+        count: number of views. More than ``MOST`` are variations of those; in a small or poor scene fewer
+            than that are found.
+        up: (3,) direction; None: found, where the cloud does not name it.
+        width, height: of the images, pixels; ``height`` None: as ``width``.
+        anywhere: look for views also where the scene is an object.
+        threads: at most this many; all processors by default.
+
+    Raises ValueError for an empty cloud or a value out of its range.
+    """
+    need(GaussianCloud, cloud=cloud)
+    if len(cloud) == 0:
+        raise ValueError("the scene is empty: there is nothing to look at")
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    height = width if height is None else height
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
+    given = unit_up(up) if up is not None else None if cloud.up is None else guess_up(cloud)
+    first_up = guess_up(cloud) if given is None else given
+    kind, confidence = kind_from_outside(cloud, first_up, threads)
+    if kind == "object" and not anywhere:
+        cameras = outside_cameras(
+            cloud,
+            count,
+            elevations=SURROUNDED_ELEVATIONS if has_surroundings(cloud) else OBJECT_ELEVATIONS,
+            up=first_up,
+            width=width,
+            height=height,
+        )
+        bounds = scene_bounds(cloud)
+        ground = float((bounds.points @ first_up).min())
+        extent = float(np.linalg.norm(cameras[0].center - bounds.center))
+        return FoundCameras(
+            kind, confidence, first_up, float(given is not None), ground, extent, tuple(cameras)
+        )
+    sample = Sample(cloud, first_up, threads)
+    places = find_places(sample)
+    upright = find_upright(sample, places, first_up)
+    found_up, sure = (upright.up, upright.confidence) if given is None else (given, 1.0)
+    if kind is None:
+        kind, confidence = kind_from_inside(sample, places, found_up)
+    views = choose_views(sample, places, found_up, min(count, MOST), width, height)
+    extent = float(np.median([_depth(camera) for camera in views]))
+    cameras = [replace(camera, name=f"view_{i:04d}") for i, camera in enumerate(varied(views, count))]
+    return FoundCameras(kind, confidence, found_up, sure, upright.ground, extent, tuple(cameras))
+
+
+def _depth(camera: Camera) -> float:
+    assert camera.near is not None
+    return camera.near / NEAR_SHARE
+
+
+def varied(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """``count`` cameras: the given ones, then variations of them from nearby; every third one is wide."""
+    views = list(cameras[:count])
+    for i in range(len(views), count):
+        camera = cameras[i % len(cameras)]
+        depth = _depth(camera)
+        x, y, z = 2 * ((0.5 + np.array([*STEPS]) * i) % 1) - 1
+        matrix = np.eye(4)
+        matrix[:3, :3] = _turned(np.radians(TURN) * x, np.radians(TURN) * y)
+        matrix[:3, 3] = SHIFT * depth * np.array([y, 0.5 * z, x])
+        focal = camera.fx
+        if i % 3 == 2:
+            focal = min(focal, min(camera.width, camera.height) / 2 / np.tan(np.radians(WIDE) / 2))
+        views.append(replace(camera, world_to_camera=matrix @ camera.world_to_camera, fx=focal, fy=focal))
+    return views
+
+
+def _turned(right: float, down: float) -> np.ndarray:
+    """(3, 3) rotation in the frame of a camera."""
+    a, b, c, d = np.cos(right), np.sin(right), np.cos(down), np.sin(down)
+    level = np.array([[a, 0, -b], [0, 1, 0], [b, 0, a]])
+    tilt = np.array([[1, 0, 0], [0, c, -d], [0, d, c]])
+    return tilt @ level

@@ -1,0 +1,113 @@
+"""Which way is up, and where the ground is, from floors, walls and the views that were found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshsplats.viewpoints.sample import COARSE, Sample, fibonacci
+from meshsplats.viewpoints.search import Places
+
+PEAKS = 1200
+"""Directions among which the normals of large planes are found."""
+PLANE = 0.96
+"""Cosine between a plane's normal and those of its splats, at least."""
+FLOOR, SURE = 0.1, 0.2
+"""Shares of the picture with one normal from which on it is a floor, perhaps and surely."""
+LEVEL = 0.3
+"""Greatest ratio of the two smaller second moments of the directions of gaze that tells what is level."""
+LEANS = 0.8
+"""Least cosine between the normal of a plane and the axis of those directions that it makes exact."""
+SEEN_FROM = 24
+"""Number of the best places from which planes are looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """Which way is up."""
+
+    up: np.ndarray
+    """(3,) unit direction."""
+    ground: float
+    """Height of the ground along ``up``."""
+    confidence: float
+    """0: the format's default, as the splats do not tell; 1: a large floor was found."""
+
+
+def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright:
+    """Up from the largest plane in the best views, or from their being level; else ``default`` (3,)."""
+    best = places.best()
+    area = _area_in_pictures(sample, best)
+    scales = np.sort(sample.thin.scales, axis=1)
+    flat = (scales[:, 0] < 0.5 * scales[:, 1]) & (area > 0)
+    good = np.maximum(best.worth - 0.6 * best.worth.max(), 0)
+    gaze = np.einsum("kd,dj->j", good, sample.gaze, optimize=False) / good.sum()
+    peaks = _planes(sample.normals[flat], area[flat], sample.axes)
+    up, confidence = default, 0.0
+    if peaks and peaks[0][0] > FLOOR:
+        share, up = peaks[0]
+        confidence = float(np.clip((share - FLOOR) / (SURE - FLOOR), 0, 1))
+    else:
+        moments = np.einsum("kd,di,dj->ij", good, sample.gaze, sample.gaze, optimize=False) / good.sum()
+        values, axes = np.linalg.eigh(moments)
+        if values[0] < LEVEL * values[1]:
+            up, confidence = axes[:, 0], 0.3
+            near = [normal for _, normal in peaks if abs(normal @ up) > LEANS]
+            up = near[0] if near else up
+    if confidence > 0:
+        up = up * _sign(up, gaze, default, confidence)
+        agrees = float(up @ default)
+        if agrees < -0.2 or (agrees < 0.3 and confidence < 0.5):  # a wall, likely
+            up, confidence = default, 0.0
+    height = sample.means @ up
+    facing = area * (np.abs(sample.normals @ up) > 0.9)
+    return Upright(up, _ground(height, facing if facing.any() else area), confidence)
+
+
+def _sign(axis: np.ndarray, gaze: np.ndarray, default: np.ndarray, confidence: float) -> float:
+    """People look down on floors; where they look level, the default tells top from bottom."""
+    tilt = float(axis @ gaze)
+    return -1.0 if tilt - 0.5 * float(axis @ default) > 0 else 1.0
+
+
+def _area_in_pictures(sample: Sample, best: Places) -> np.ndarray:
+    """(n,) share of each splat of the sample in pictures from the best places."""
+    rows = np.arange(len(sample.means))
+    area = np.zeros(len(rows))
+    worth = np.maximum(best.worth - 0.5 * best.worth.max(), 0)
+    directions = sample.gaze.T.astype(np.float32)
+    for k in range(min(SEEN_FROM, len(best.places))):
+        seen, toward = sample.seen_at(best.depth[k], best.places[k], rows)
+        away = np.linalg.norm(sample.means - best.places[k], axis=1) + 1e-9 * sample.radius
+        nearest = (toward.astype(np.float32) @ directions).argmax(axis=1)
+        area += seen * worth[k][nearest] * np.minimum(sample.size / away, COARSE) ** 2
+    area *= sample.thin.opacities
+    total = area.sum()
+    return area / total if total > 0 else np.full(len(rows), 1 / max(len(rows), 1))
+
+
+def _planes(normals: np.ndarray, area: np.ndarray, axes: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Shares of the area that face one way, and the mean normal of each, largest first."""
+    grid = fibonacci(2 * PEAKS)[:PEAKS] @ axes  # one of each pair of opposites
+    cosine = np.abs(normals.astype(np.float32) @ grid.T.astype(np.float32))
+    share = np.einsum("ng,n->g", cosine > PLANE, area, optimize=False)
+    found = []
+    for k in np.argsort(-share, kind="stable")[:200]:
+        if share[k] >= share[np.abs(grid @ grid[k]) > 0.9].max():
+            normal = grid[k]
+            for _ in range(4):
+                along = normals @ normal
+                on = np.abs(along) > PLANE
+                mean = (normals[on] * (np.sign(along[on]) * area[on])[:, None]).sum(axis=0)
+                normal = mean / max(float(np.linalg.norm(mean)), 1e-30) if on.any() else normal
+            found.append((float(share[k]), normal))
+    return found[:5]
+
+
+def _ground(height: np.ndarray, weight: np.ndarray) -> float:
+    """The height in the lower part at which most of the ``weight`` lies."""
+    low, high = np.quantile(height[weight > 0], [0.01, 0.99])
+    cells = np.clip((height - low) / (high - low + 1e-12) * 100, 0, 99).astype(int)
+    mass = np.convolve(np.bincount(cells, weight, minlength=100), [1, 1, 1], "same")
+    return float(low + (int(mass[:60].argmax()) + 0.5) / 100 * (high - low))

@@ -1,0 +1,211 @@
+"""Cameras found from splats alone: laws, a room whose inside is known, and real scenes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import shared_data
+
+from meshsplats._geometry import quaternions_of
+from meshsplats.cameras.files import load_cameras, save_cameras
+from meshsplats.cameras.placing import outside_cameras
+from meshsplats.cli import main
+from meshsplats.datasets.splat_targets import splat_dataset
+from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.viewpoints.finding import FoundCameras, find_cameras
+from meshsplats.viewpoints.views import Checked
+
+HALF = np.array([2.0, 1.3, 3.0])
+"""Half the width, height and length of the room; y points down."""
+COUNT = 12
+
+
+def room(count: int = 20_000, noise: int = 8000) -> GaussianCloud:
+    """A room with a table in it, closed and sharp from within, in a cloud of large splats."""
+    rng = np.random.default_rng(3)
+    area = np.repeat([HALF[1] * HALF[2], HALF[0] * HALF[2], HALF[0] * HALF[1]], 2)
+    wall = rng.choice(6, count, p=area / area.sum())
+    axis, side = wall // 2, np.where(wall % 2, 1.0, -1.0)
+    points = rng.uniform(-1, 1, (count, 3)) * HALF
+    points[np.arange(count), axis] = side * HALF[axis]
+    table = slice(0, count // 12)
+    points[table] = np.array([0.9, 0.9, -1.4]) + rng.uniform(-0.4, 0.4, (count // 12, 3))
+    points[table, 1] = 0.5
+    axis[table] = 1
+    scales = np.full((count, 3), 0.045)
+    scales[np.arange(count), axis] = 0.002
+    shell = rng.normal(size=(noise, 3))
+    shell = shell / np.abs(shell).max(axis=1, keepdims=True) * rng.uniform(1.3, 2.2, (noise, 1)) * HALF
+    turns = np.zeros((count + noise, 4))
+    turns[:, 0] = 1
+    return GaussianCloud(
+        np.concatenate([points, shell]),
+        turns,
+        np.concatenate([scales, rng.uniform(0.2, 0.5, (noise, 3))]),
+        np.concatenate([np.full(count, 0.97), rng.uniform(0.1, 0.9, noise)]),
+        rng.uniform(-1, 1, (count + noise, 1, 3)) * 0.5 / SH_C0,
+    )
+
+
+def moved(cloud: GaussianCloud, scale: float, turn: np.ndarray, shift: np.ndarray) -> GaussianCloud:
+    rotations = np.einsum("ij,njk->nik", turn, cloud.rotations.astype(np.float64))
+    return replace(
+        cloud,
+        means=scale * cloud.means @ turn.T + shift,
+        quaternions=quaternions_of(rotations),
+        scales=cloud.scales * np.float32(scale),
+    )
+
+
+@pytest.fixture(scope="module")
+def found() -> FoundCameras:
+    return find_cameras(room(), COUNT, threads=2)
+
+
+def gazes(cameras: tuple) -> np.ndarray:
+    return np.array([camera.world_to_camera[2, :3] for camera in cameras])
+
+
+def centers(cameras: tuple) -> np.ndarray:
+    return np.array([camera.center for camera in cameras])
+
+
+def test_a_room_is_seen_from_inside_and_upright(found):
+    assert found.kind in ("place", "ring")
+    assert len(found.cameras) == COUNT
+    inside = (np.abs(centers(found.cameras)) < HALF).all(axis=1)
+    assert inside.all()
+    assert found.up @ [0, -1, 0] > np.cos(np.radians(3))
+    assert found.up_confidence > 0.5
+    assert abs(found.ground + HALF[1]) < 0.1  # along up: the floor is at y = +1.3
+    upright = np.array([camera.up for camera in found.cameras])
+    assert (upright @ found.up > 0.4).all()
+
+
+def test_the_dome_stands_outside_of_the_same_room():
+    cameras = outside_cameras(room(), COUNT)
+    assert not (np.abs(centers(tuple(cameras))) < HALF).all(axis=1).any()
+
+
+def test_views_of_a_room_look_in_several_directions_from_the_start(found):
+    first = gazes(found.cameras[: COUNT // 2])
+    assert np.linalg.norm(first.mean(axis=0)) < 0.85
+    assert np.linalg.norm(gazes(found.cameras).mean(axis=0)) < 0.8
+
+
+def test_threads_do_not_change_a_bit(found):
+    again = find_cameras(room(), COUNT, threads=1)
+    for a, b in zip(found.cameras, again.cameras, strict=True):
+        assert np.array_equal(a.world_to_camera, b.world_to_camera)
+        assert (a.fx, a.near) == (b.fx, b.near)
+    assert np.array_equal(found.up, again.up)
+    assert found.ground == again.ground
+
+
+def test_fewer_views_are_the_first_of_more(found):
+    fewer = find_cameras(room(), 5, threads=2)
+    for a, b in zip(fewer.cameras, found.cameras[:5], strict=True):
+        assert np.array_equal(a.world_to_camera, b.world_to_camera)
+
+
+def test_cameras_move_with_the_scene(found):
+    # A quarter turn around the vertical (the default of up stays) and a power of two round nothing.
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    there = find_cameras(moved(room(), 4, turn, np.zeros(3)), COUNT, threads=2)
+    assert there.kind == found.kind
+    assert there.extent == pytest.approx(4 * found.extent, rel=1e-3)
+    assert np.abs(4 * centers(found.cameras) @ turn.T - centers(there.cameras)).max() < 0.01
+    assert np.abs(gazes(found.cameras) @ turn.T - gazes(there.cameras)).max() < 0.001
+
+
+def test_a_given_up_is_kept(found):
+    tilted = np.array([0.0, -1, 0.2]) / np.linalg.norm([0, 1, 0.2])
+    answer = find_cameras(replace(room(4000), up=tilted), 2, threads=2)
+    assert answer.up @ tilted > 1 - 1e-6
+    assert answer.up_confidence == 1
+
+
+def test_more_views_than_can_be_found_are_variations(found):
+    from meshsplats.viewpoints.finding import varied
+
+    many = varied(found.cameras, 40)
+    assert len(many) == 40
+    assert many[:COUNT] == list(found.cameras)
+    assert len({camera.world_to_camera.tobytes() for camera in many}) == 40
+    for i, camera in enumerate(many):
+        parent = found.cameras[i % COUNT]
+        assert np.linalg.norm(camera.center - parent.center) < 0.2 * parent.near / 0.02
+        assert camera.world_to_camera[2, :3] @ parent.world_to_camera[2, :3] > np.cos(np.radians(12))
+
+
+def test_the_widest_lens_of_a_good_picture(found):
+    view = Checked(found.cameras[0], np.array([1, 1.5, 2]), np.array([0.5, 0.1, 0]), np.array([0.1, 2, 0.1]))
+    assert view.widest(3) == 1
+    assert view.widest(1) == 2
+    assert view.widest(0.01) is None
+    assert view.with_lens(2, 800, 600).fx == pytest.approx(found.cameras[0].fx * 2 * 600 / 400)
+
+
+def test_targets_of_a_room_are_its_inside():
+    auto = splat_dataset(room(), train=4, test=2, width=32, threads=2)
+    for view in (*auto.train, *auto.test):
+        assert (np.abs(view.camera.center) < HALF).all()
+    dome = splat_dataset(room(), train=4, test=2, width=32, placement="object")
+    assert not any((np.abs(view.camera.center) < HALF).all() for view in dome.train)
+    with pytest.raises(ValueError, match="placement must be one of auto, object"):
+        splat_dataset(room(2000, 10), placement="outside")
+
+
+def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys):
+    pytest.importorskip("PIL")
+    save_gaussians(room(4000, 600), tmp_path / "room.ply")
+    out = tmp_path / "cameras.json"
+    options = ["--count", "3", "--width", "64", "--height", "48", "--threads", "2"]
+    assert main(["cameras", str(tmp_path / "room.ply"), "-o", str(out), *options]) == 0
+    assert "up " in capsys.readouterr().out
+    assert [(c.width, c.height) for c in load_cameras(out)] == [(64, 48)] * 3
+    assert (tmp_path / "cameras.json.preview.png").exists()
+    assert main(["cameras", str(tmp_path / "room.ply"), "-o", str(out), *options]) == 3
+    assert main(["cameras", str(tmp_path / "room.ply"), "-o", str(out), *options, "--force", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["cameras"] == 3
+    assert main(["cameras", str(tmp_path / "room.ply"), "-o", str(tmp_path / "c.txt")]) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds"),
+    [
+        ("splats/guitar.compressed.ply", {"object"}),
+        ("splats/playbot_lod6_2k_sh2.ply", {"object"}),
+        ("splats/tt_truck_sh0.ply", {"object"}),
+        ("splats/trained/lego_60k_sh3.ply", {"object"}),
+        ("splats/trained/miku_58k_sh0.ply", {"ring", "place"}),
+    ],
+)
+def test_kinds_of_real_scenes(name, kinds, tmp_path):
+    cloud = load_gaussians(shared_data(name))
+    found = find_cameras(cloud, 4, threads=2)
+    assert found.kind in kinds
+    if found.kind == "object":
+        train = splat_dataset(cloud, train=1, test=4, width=16, threads=2)
+        assert [v.camera.name for v in train.test] == [f"view_{i:04d}" for i in range(4)]
+        for view, camera in zip(train.test, found.cameras, strict=True):
+            same = view.camera.world_to_camera == camera.world_to_camera
+            assert same.all()
+    save_cameras(found.cameras, tmp_path / "cameras.json")
+    assert len(load_cameras(tmp_path / "cameras.json")) == 4
+
+
+def test_an_empty_scene_and_wrong_values_are_refused():
+    nothing = GaussianCloud(
+        np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3))
+    )
+    with pytest.raises(ValueError, match="the scene is empty"):
+        find_cameras(nothing)
+    with pytest.raises(ValueError, match="count must be at least 1"):
+        find_cameras(room(100, 10), 0)
+    with pytest.raises(ValueError, match="width and height"):
+        find_cameras(room(100, 10), width=0)
