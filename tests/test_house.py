@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 LONGEST_FILE = 450
 LONGEST_LINE = 110
 MOST_PARAMETERS = 8
-MOST_LINES_OF_THE_COMMAND_LINE = 6100
+MOST_LINES_OF_THE_COMMAND_LINE = 6300
 KINDS = {".py", ".h", ".cpp", ".js", ".wgsl", ".html", ".css"}
 
 LONGER = {
