@@ -132,7 +132,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
         ("save_image", {"path": "x", "image": IMAGE}, {"path": "path", "image": "array"}),
         ("save_mesh", {"mesh": MESH, "path": "x"}, {"mesh": "mesh", "path": "path"}),
         ("simplify", {"cloud": CLOUD, "count": 9}, {"cloud": "cloud", "cameras": "optional cameras"}),
-        ("drawing_order", {"mesh": MESH, "cameras": CAMERAS}, {"mesh": "mesh", "cameras": "optional cameras"}),
+        (
+            "drawing_order",
+            {"mesh": MESH, "cameras": CAMERAS},
+            {"mesh": "mesh", "cameras": "optional cameras"},
+        ),
         ("find_cameras", {"cloud": CLOUD}, {"cloud": "cloud"}),
         ("splat_dataset", {"cloud": CLOUD}, {"cloud": "cloud", "cameras": "optional cameras"}),
         (

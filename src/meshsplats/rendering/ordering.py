@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._core import kernels
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import dome, orbit
 from meshsplats.draw_order import DrawOrder
@@ -114,6 +115,8 @@ def drawing_order(
 
     Raises ValueError for a mesh without triangles and a value out of range.
     """
+    need(SplatMesh, mesh=mesh)
+    need_all(Camera, optional=True, cameras=cameras)
     if not len(mesh.faces):
         raise ValueError("a mesh without triangles has no order")
     if not (isinstance(nodes, (int, np.integer)) and 1 <= nodes <= MAX_NODES):
