@@ -307,7 +307,10 @@ class DrawOptions:
     max_layers: Count = None
     """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default:
     all."""
-    order: Literal["fragment", "splat"] | None = None
+    order: Annotated[
+        Literal["fragment", "splat"] | None,
+        tyro.conf.arg(metavar="{fragment,splat}", help_behavior_hint=""),
+    ] = None
     """Order in which the triangles of a mesh are blended: exact at every sample, or whole splats by their
     centres. Default: that of the mesh."""
     threads: Count = None

@@ -76,8 +76,6 @@ _FOR_SPLATS = (
     *("conversion", "reading", "origin", "json", "force", "skip_existing"),
 )
 """Options of the command that have one."""
-FOUND_VIEWS = 48
-"""Views of a place that fans are sized by, where no cameras are known."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
 ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
@@ -371,10 +369,6 @@ class Convert(Command):
         cameras = _seen_from(cameras, job.source, cloud.origin)
         read = time.perf_counter()
         up = None if self.up is None else parse_up(self.up)
-        opening = None
-        if not cameras and self._free:
-            cameras = views_of_a_place(cloud, FOUND_VIEWS, {"width": 800, "height": 800, "up": up}) or []
-            opening = cameras[0] if cameras else None
         mesh = convert(cloud, self.conversion, preset=self.preset, cameras=cameras, up=up)
         mesh = self._files.prepared(mesh, cameras)
         times = {"read": read - start, "convert": time.perf_counter() - read}
@@ -382,15 +376,17 @@ class Convert(Command):
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
             "merged": self._merges(),
-            **self._finish(mesh, job, cameras, times, opening),
+            **self._finish(mesh, job, cameras, times, self._opening(cloud, cameras, job)),
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
 
-    @property
-    def _free(self) -> bool:
-        """Whether nothing says from where the mesh will be seen."""
-        options = self.conversion
-        return self.preset == "default" and options.footprint is None and options.viewing_distance is None
+    def _opening(self, cloud: GaussianCloud, cameras: Sequence[Camera], job: Job) -> Camera | None:
+        """The camera of the preview of a place, from which the splats look right; None: one in front."""
+        if cameras or not job.preview:
+            return None
+        up = None if self.up is None else parse_up(self.up)
+        found = views_of_a_place(cloud, 1, {"width": 800, "height": 800, "up": up})
+        return found[0] if found else None
 
     def _check_stream(self, kinds: Sequence[str]) -> None:
         """UsageError or ValueError for what needs the whole scene in memory."""

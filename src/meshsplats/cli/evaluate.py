@@ -116,7 +116,10 @@ class Evaluate(Command):
     samples: Count = None
     """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
     with --look splats."""
-    order: Literal["fragment", "splat"] | None = None
+    order: Annotated[
+        Literal["fragment", "splat"] | None,
+        tyro.conf.arg(metavar="{fragment,splat}", help_behavior_hint=""),
+    ] = None
     """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
     centres. Default: that of each mesh."""
     background: Text = None

@@ -173,7 +173,7 @@ class SplatTuning:
         pixels = dataset.train[0].camera.width * dataset.train[0].camera.height
         limited = chosen.max_splats is not None or chosen.max_triangles is not None
         own = any(value is not None for value in (chosen.mode, chosen.detail, chosen.sides, chosen.rings))
-        may_be_brief = config.opacity == "blended" and dataset.look == "area" and not own
+        may_be_brief = not config.cuts and dataset.look == "area" and not own
         steps: float | None = config.total_steps(len(dataset.train))
         count, seconds = len(run.cloud), self._setup.seconds
         timed = seconds is not None and count >= TIMED_SPLATS
