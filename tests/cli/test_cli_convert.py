@@ -372,6 +372,7 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     assert better.startswith("better there: meshsplats finetune ")
     words = words_of(better.partition(": meshsplats ")[2].rpartition(" (")[0])
     assert words[-4:] == ["--opacity", "cutoff", "--soft-share", "0.05"]
+    assert "--alpha ordered" in lines[lines.index(better) + 1]
     # A mesh gets the same choice, and what was asked for counts.
     assert run(source, "-o", tmp_path / "m.npz", "--json", "--no-preview") == 0
     assert json.loads(capsys.readouterr().out)["alpha"] is None

@@ -80,6 +80,8 @@ _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
 ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 """What meshes for a depth buffer gain in three.js with MSAA: docs/viewers.md."""
+ORDER_GAIN = "7 to 10 dB in three.js and Babylon.js in half a minute; not for ray tracers and CesiumJS"
+"""What a solved order gains there: benchmarks/results/viewers_ordered.md."""
 
 
 if TYPE_CHECKING:
@@ -590,6 +592,7 @@ class Convert(Command):
                 print(line)
                 if "splats" in result and job.shown != "-" and self.conversion.crop is None:
                     print(f"better there: {self._for_depth_buffers()}")
+                    print(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
         if result["preview"]:
             print(f"preview: {result['preview']}")
         if result.get("converted") is not None and self.compression == "none":
