@@ -428,10 +428,14 @@ def views_of_a_place(
 ) -> list[Camera] | None:
     """``count`` views of splats that are no object, as ``find_cameras`` finds them; says what was found.
     ``lens``: width, height, and up or None."""
+    from meshsplats.rendering.layers import fragments
+    from meshsplats.rendering.previews import FRAGMENTS, preview_camera
     from meshsplats.viewpoints.finding import find_cameras
 
     if not isinstance(scene, GaussianCloud) or not len(scene):
         return None
+    if fragments(scene, preview_camera(scene), 1) > FRAGMENTS:
+        return None  # splats as large as the scene: there is nothing to find, and it would take long
     found = find_cameras(scene, count, **lens)
     if found.kind == "object":
         return None
