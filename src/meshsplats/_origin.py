@@ -41,7 +41,7 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
     if found is None:
         return zero_origin()
     center, extent, farthest = found
-    if extent == 0 or farthest <= REACH * extent:
+    if farthest <= REACH * extent or extent <= 2.0**-52 * farthest:
         return zero_origin()
     unit = 10.0 ** math.floor(math.log10(extent)) if extent >= 1 else 2.0 ** math.floor(math.log2(extent))
     return np.round(center / unit) * unit + 0.0

@@ -89,6 +89,13 @@ def test_the_distance_in_extents_decides():
     assert choose_origin(10_000 * points + FAR).any()
 
 
+def test_an_extent_below_the_rounding_of_doubles_is_none():
+    """Found by the fuzzer: the unit of the origin was 0."""
+    points = np.array([[0, 0, 1.0], [0, 0, 1.0], [5e-324, 0, 1.0], [1e-310, 0, 1.0]])
+    assert not choose_origin(points).any()
+    assert choose_origin(np.array([[1e9, 0, 0], [1e9 + 1e-5, 0, 0]])).any()
+
+
 def test_positions_beyond_float32_have_none():
     """Differences of the largest doubles overflow; found by the fuzzer, in a data set's camera."""
     assert not choose_origin(np.array([[0, 0, 1.7e308], [0, 0, -1.7e308], [np.nan, 0, 0]])).any()
