@@ -6,10 +6,8 @@ import ast
 import re
 from pathlib import Path
 
-import meshsplats
-
-SOURCE = Path(meshsplats.__file__).parent
 ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "meshsplats"
 LONGEST_FILE = 450
 LONGEST_LINE = 110
 MOST_PARAMETERS = 8
