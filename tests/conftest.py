@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -29,6 +31,20 @@ def shared_data(path: str) -> Path:
     if not found.exists():
         pytest.skip(f"real data not here: {found} (set MESHSPLATS_SHARED_DATA to its folder)")
     return found
+
+
+def script(place: str) -> ModuleType:
+    """The module of a script of the repository, which is no part of the package; skips without it."""
+    path = Path(__file__).parents[1] / place
+    if not path.exists():
+        pytest.skip(f"not here: {place}", allow_module_level=True)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module  # dataclasses look there for their module
+    spec.loader.exec_module(module)
+    return module
 
 
 def words_of(command: str) -> list[str]:

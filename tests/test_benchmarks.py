@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import re
 import runpy
 import sys
@@ -11,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from conftest import script
 
 pytest.importorskip("resource", reason="the benchmarks measure memory as POSIX systems count it")
 
@@ -20,12 +20,7 @@ SCRIPTS = sorted(path for path in FOLDER.rglob("*.py") if not path.name.startswi
 if not SCRIPTS:
     pytest.skip("the benchmarks are not here", allow_module_level=True)
 
-spec = importlib.util.spec_from_file_location("_common", FOLDER / "_common.py")
-assert spec is not None
-assert spec.loader is not None
-common = importlib.util.module_from_spec(spec)
-sys.modules["_common"] = common
-spec.loader.exec_module(common)
+common = script("benchmarks/_common.py")
 
 ASKED = argparse.Namespace(save=True)
 

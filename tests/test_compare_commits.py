@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import pytest
+from conftest import script
 
-TOOL = Path(__file__).parents[1] / "tools" / "compare_commits.py"
-if not TOOL.exists():
-    pytest.skip("the tools are no part of a wheel", allow_module_level=True)
-_spec = importlib.util.spec_from_file_location("compare_commits", TOOL)
-assert _spec is not None
-assert _spec.loader is not None
-tool = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tool)
+tool = script("tools/compare_commits.py")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import re
 from dataclasses import dataclass, fields, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
+from conftest import script
 
 from meshsplats._options import Advanced, Fixed, Range, With, check_options, docstrings, reachable, settings
 from meshsplats.blender.options import LightOptions, SceneOptions
@@ -125,9 +125,5 @@ def test_values_beyond_every_range_are_refused(kind):
 
 def test_the_page_of_options_is_that_of_the_source():
     pytest.importorskip("tyro")
-    found = importlib.util.spec_from_file_location("options_page", ROOT / "tools" / "options_page.py")
-    assert found is not None
-    assert found.loader is not None
-    module = importlib.util.module_from_spec(found)
-    found.loader.exec_module(module)
+    module = script("tools/options_page.py")
     assert module.PAGE.read_text(encoding="utf-8") == module.page(), "run tools/options_page.py"

@@ -4,7 +4,6 @@ conversion, the image, and its removal."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -20,7 +19,7 @@ from meshsplats.formats.splat_formats import splat_suffixes
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import ball_splats, random_mesh
-from conftest import SHARED
+from conftest import SHARED, script
 
 from meshsplats import convert, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
@@ -70,9 +69,7 @@ def test_package_holds_the_wheels_of_one_platform(packed):
 
 
 def test_platform_names():
-    spec = importlib.util.spec_from_file_location("build", ROOT / "blender_extension" / "build.py")
-    build = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build)
+    build = script("blender_extension/build.py")
     assert build.platform_of("meshsplats-0.1.0-py3-none-manylinux_2_28_x86_64.whl") == "linux-x64"
     assert build.platform_of("meshsplats-0.1.0-py3-none-macosx_11_0_arm64.whl") == "macos-arm64"
     assert build.platform_of("meshsplats-0.1.0-py3-none-win_arm64.whl") == "windows-arm64"

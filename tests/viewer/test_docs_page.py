@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
 from _pages import cloud_fixture, mesh_fixture  # noqa: F401
+from conftest import script
 
 from meshsplats.viewer.page import make_page
 
-TOOL = Path(__file__).parents[2] / "tools" / "docs_site.py"
-if not TOOL.exists():
-    pytest.skip("the tools are no part of a wheel", allow_module_level=True)
-_spec = importlib.util.spec_from_file_location("docs_site", TOOL)
-assert _spec is not None
-assert _spec.loader is not None
-docs_site = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(docs_site)
+docs_site = script("tools/docs_site.py")
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -53,5 +45,5 @@ def test_the_scene_is_drawn_within_the_site(browser, site):
 
 
 def test_the_readme_says_where_it_goes():
-    text = (TOOL.parents[1] / "README.md").read_text(encoding="utf-8")
+    text = (docs_site.ROOT / "README.md").read_text(encoding="utf-8")
     assert text.count(docs_site.PLACE_OF_SCENE) == 1

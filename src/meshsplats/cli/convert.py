@@ -378,15 +378,16 @@ class Convert(Command):
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
             "merged": self._merges(),
-            **self._finish(mesh, job, cameras, times, self._opening(cloud, cameras, job)),
+            **self._finish(mesh, job, cameras, times, self._opening(cloud, cameras, job, up)),
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
 
-    def _opening(self, cloud: GaussianCloud, cameras: Sequence[Camera], job: Job) -> Camera | None:
+    def _opening(
+        self, cloud: GaussianCloud, cameras: Sequence[Camera], job: Job, up: np.ndarray | None
+    ) -> Camera | None:
         """The camera of the preview of a place, from which the splats look right; None: one in front."""
         if cameras or not job.preview:
             return None
-        up = None if self.up is None else parse_up(self.up)
         found = views_of_a_place(cloud, 1, {"width": 800, "height": 800, "up": up})
         return found[0] if found else None
 
