@@ -22,7 +22,7 @@ ROWS: dict[str, dict] = {
     "default, no cameras": dict(),
     "default, 8 cameras": dict(cameras=8),
     "default, 100 cameras": dict(cameras=100),
-    "default, 8 cameras, mean colours of SH degree 3": dict(cameras=8, colors="cameras"),
+    "default, 8 cameras, mean colours of SH degree 3": dict(cameras=8, colors="mean"),
     "default, 8 cameras, the 100,000 most important": dict(cameras=8, max_splats=100_000, budget="drop"),
 }
 

@@ -25,14 +25,16 @@ class ArrayField(NamedTuple):
     per: Literal["vertex", "face", "splat", "mesh", "base vertex", "base face"]
     """The element that each row belongs to. "splat": row i belongs to splat i of ``SplatMesh.splats``, which
     have no gaps; declare it behind ``face_splat``. "mesh": the array has no rows."""
-    columns: int | None = None
-    """Length of a row; None for a single number."""
+    columns: int | tuple[int | None, ...] | None = None
+    """Length of a row, or its shape, where None is any number; None for a single number."""
     optional: bool = False
 
     def shape(self, counts: Mapping[str, int]) -> tuple[Any, ...]:
         """Shape with ``counts`` rows by ``per``; None (any number) where that count is missing."""
         rows = () if self.per == "mesh" else (counts.get(self.per),)
-        return rows if self.columns is None else (*rows, self.columns)
+        if self.columns is None:
+            return rows
+        return (*rows, *self.columns) if isinstance(self.columns, tuple) else (*rows, self.columns)
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,6 +100,12 @@ class GaussianCloud:
         """Degree of the stored spherical harmonics, 0 to 3."""
         return int(self.sh.shape[1] ** 0.5) - 1
 
+    def of_degree(self, degree: int) -> GaussianCloud:
+        """The splats with their harmonics up to ``degree``, 0 to 3."""
+        if not 0 <= degree <= 3:
+            raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
+        return replace(self, sh=self.sh[:, : (degree + 1) ** 2]) if degree < self.sh_degree else self
+
     @property
     def colors(self) -> np.ndarray:
         """(n, 3) display RGB of degree 0 in [0, 1]: ``clip(0.5 + C0 * sh[:, 0])``."""

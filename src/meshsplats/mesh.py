@@ -14,11 +14,15 @@ from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
 from meshsplats.order import Order, checked_order
+from meshsplats.spherical_harmonics import turned_harmonics
 
 Blending = Literal["display", "linear"]
 
 MAX_FILTER_PX2 = 100.0
 """Largest ``filter_px2``."""
+
+MAX_COLOR = 16
+"""Largest display colour of a vertex. White is 1."""
 
 MIN_TRANSMITTANCE = 1e-6
 """Early termination: a sample stops once its transmittance is below this. The error stays below it, too."""
@@ -42,6 +46,8 @@ class Triangles(NamedTuple):
     """(f,) int32"""
     depth_group: np.ndarray | None = None
     """(f,) int32"""
+    harmonics: np.ndarray | None = None
+    """(s, k, 3) float32"""
     filter_px2: float = 0.0
     order: Order = "fragment"
 
@@ -59,7 +65,8 @@ class SplatMesh:
     faces: np.ndarray
     """(f, 3) int32 vertex indices. Triangles are visible from both sides."""
     colors: np.ndarray
-    """(v, 4) float32 straight RGBA in [0, 1]."""
+    """(v, 4) float32 straight RGBA, opacity in [0, 1]. RGB is at least 0 and may be above 1: what is brighter
+    than white shows through faint layers."""
     face_splat: np.ndarray | None = None
     """(f,) int32 index of the splat that each triangle was made from, ascending; None for a mesh of other
     origin."""
@@ -68,6 +75,11 @@ class SplatMesh:
     depth_group: np.ndarray | None = None
     """(f,) int32: triangles with the same value >= 0 are coplanar layers that share one depth, that of their
     common plane, and are ordered by face index; -1 keeps a triangle's own depth."""
+    harmonics: np.ndarray | None = None
+    """(s, k, 3) float32 spherical harmonics of each splat, which make its colour depend on the view: k is 3, 8
+    or 15, for degree 1, 2 or 3. Row i belongs to splat i of ``splats``, whose vertices have the colour
+    ``max(0, colors[:, :3] + sh_basis(d, degree)[:, 1:] @ harmonics[i])`` along the direction d from the
+    camera. None: colours are the same from everywhere."""
     up: np.ndarray = field(default_factory=lambda: np.array([0, -1, 0], np.float32))
     """(3,) float32 direction that points up in the world frame, normalised by the constructor; splats trained
     from COLMAP cameras have y down."""
@@ -94,10 +106,11 @@ class SplatMesh:
         ArrayField("normals", np.float32, "vertex", 3, optional=True),
         ArrayField("face_splat", np.int32, "face", optional=True),
         ArrayField("depth_group", np.int32, "face", optional=True),
+        ArrayField("harmonics", np.float32, "splat", (None, 3), optional=True),
     )
     EXTRAS: ClassVar[tuple[ArrayField, ...]] = tuple(f for f in FIELDS if f.optional and f.name != "normals")
-    """The optional arrays that formats of other programs have no place for. Those of vertices are float32,
-    those of faces single integers."""
+    """The optional arrays that formats of other programs have no place for. Those of vertices and splats are
+    float32, those of faces single integers."""
 
     def __post_init__(self) -> None:
         counts = check_fields(self)
@@ -106,9 +119,13 @@ class SplatMesh:
             raise ValueError(
                 f"faces must be vertex indices from 0 to {v - 1}, got {faces.min()} to {faces.max()}"
             )
-        if v and (self.colors.min() < 0 or self.colors.max() > 1):
+        if v and (self.colors.min() < 0 or self.colors.max() > MAX_COLOR):
             low, high = self.colors.min(), self.colors.max()
-            raise ValueError(f"colors must lie in [0, 1], got {low:.4g} to {high:.4g}")
+            raise ValueError(f"colors must lie in [0, {MAX_COLOR}], got {low:.4g} to {high:.4g}")
+        if v and (opacity := self.colors[:, 3].max()) > 1:
+            raise ValueError(f"opacities, the last column of colors, must lie in [0, 1], got {opacity:.4g}")
+        if self.harmonics is not None:
+            self._check_harmonics(self.harmonics)
 
         def set_(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
@@ -145,11 +162,28 @@ class SplatMesh:
             if (face != face[:, :1]).any():
                 raise ValueError("all corners of a triangle must be bound to one face of the base")
 
+    def _check_harmonics(self, harmonics: np.ndarray) -> None:
+        if harmonics.shape[1] not in (3, 8, 15):
+            raise ValueError(
+                "harmonics must have 3, 8 or 15 coefficients for degree 1, 2 or 3, without the constant one,"
+                f" got shape {harmonics.shape}"
+            )
+        if self.blending != "display":
+            raise ValueError(
+                "harmonics are display colours, but the mesh is blended in linear light: give harmonics=None"
+            )
+        if self.splats.share_vertices:
+            raise ValueError(
+                "harmonics are of splats, but two splats share a vertex: give every splat its own vertices, or"
+                " harmonics=None"
+            )
+
     def __repr__(self) -> str:
         parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} triangles"]
         if self.splat_count is not None:
             parts.append(f"{self.splat_count:,} splats")
         parts += [f"blending {self.blending!r}", *(f"attribute {name!r}" for name in self.attributes)]
+        parts += [f"colours of degree {self.sh_degree}"] if self.sh_degree else []
         parts += ["normals"] if self.normals is not None else []
         parts += ["bound to a base"] if self.binding is not None else []
         parts += [f"order {self.order!r}"] if self.order != "fragment" else []
@@ -166,6 +200,7 @@ class SplatMesh:
             normals=self.normals,
             face_splat=self.face_splat,
             depth_group=self.depth_group,
+            harmonics=self.harmonics,
             filter_px2=self.filter_px2,
             order=self.order,
         )
@@ -221,6 +256,22 @@ class SplatMesh:
         if self.face_splat is None:
             return None
         return len(self.splats)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of ``harmonics``, 1 to 3; 0: colours are the same from everywhere."""
+        return 0 if self.harmonics is None else int((self.harmonics.shape[1] + 1) ** 0.5) - 1
+
+    def of_degree(self, degree: int) -> SplatMesh:
+        """The mesh with its harmonics up to ``degree``, 0 to 3. Without any, colours are limited to 1, as those
+        of splats are."""
+        if not 0 <= degree <= 3:
+            raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
+        if self.harmonics is None or degree >= self.sh_degree:
+            return self
+        if degree:
+            return replace(self, harmonics=self.harmonics[:, : (degree + 1) ** 2 - 1])
+        return replace(self, harmonics=None, colors=np.minimum(self.colors, 1))
 
     @property
     def splats(self) -> FaceSplats:
@@ -363,8 +414,8 @@ class SplatMesh:
     ) -> SplatMesh:
         """The mesh with its vertices at (v, 3) ``vertices``, as after an edit, a pose or a simulation.
 
-        What has a direction turns with the splats (without ``face_splat``, with the triangles): normals, by
-        the rotation that fits best how the corners of a splat have moved.
+        What has a direction turns with the splats (without ``face_splat``, with the triangles): normals and
+        harmonics, by the rotation that fits best how the corners of a splat have moved.
 
         Args:
             vertices: the new positions, relative to ``origin``.
@@ -374,16 +425,21 @@ class SplatMesh:
         Raises ValueError for another number of vertices, or positions that are not finite.
         """
         vertices = checked_array("vertices", vertices, np.float32, (len(self.vertices), 3))
-        if normals is None and self.normals is not None:
-            normals = self._turned(self.normals, vertices)
-        return replace(self, vertices=vertices, normals=normals, binding=binding)
+        wanted = normals is None and self.normals is not None
+        harmonics = self.harmonics
+        if wanted or harmonics is not None:
+            rotations = self.splats.rotations(self.vertices, vertices)
+            normals = self._turned_normals(rotations) if wanted else normals
+            harmonics = None if harmonics is None else turned_harmonics(harmonics, rotations)
+        return replace(self, vertices=vertices, normals=normals, harmonics=harmonics, binding=binding)
 
-    def _turned(self, normals: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-        """``normals`` (v, 3), turned as the triangles around each vertex turn where vertices move to
-        ``vertices``; of their lengths."""
-        splats = self.splats
-        corner, owner = self.faces.ravel(), np.repeat(splats.of_face, 3)
-        turned = np.einsum("cij,cj->ci", splats.rotations(self.vertices, vertices)[owner], normals[corner])
+    def _turned_normals(self, rotations: np.ndarray) -> np.ndarray:
+        """(v, 3) normals, turned as the triangles around each vertex turn by the (s, 3, 3) ``rotations`` of
+        their splats; of their lengths."""
+        assert self.normals is not None
+        normals = self.normals
+        corner, owner = self.faces.ravel(), np.repeat(self.splats.of_face, 3)
+        turned = np.einsum("cij,cj->ci", rotations[owner], normals[corner])
         sums = np.stack([np.bincount(corner, column, len(normals)) for column in turned.T], axis=1)
         length = np.linalg.norm(sums, axis=1, keepdims=True)
         wanted = np.linalg.norm(normals.astype(np.float64), axis=1, keepdims=True)

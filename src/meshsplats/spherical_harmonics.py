@@ -57,14 +57,38 @@ def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
     The functions of a degree span a space that rotations map to itself, so a least-squares fit to values in a
     few directions is exact.
     """
-    i = np.arange(64) + 0.5  # directions on a Fibonacci spiral
-    z, angle = 1 - i / 32, i * np.pi * (1 + 5**0.5)
-    r = np.sqrt(1 - z * z)
-    directions = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    directions = _spiral(64)
     before = sh_basis(directions @ orthogonal, degree)[:, 1:]
     matrix = np.linalg.lstsq(sh_basis(directions, degree)[:, 1:], before, rcond=None)[0]
     matrix[np.abs(matrix) < 1e-12] = 0
     return matrix.astype(np.float32)
+
+
+def turned_harmonics(harmonics: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """(s, k, 3) float32 ``harmonics`` (s, k, 3) of degree 1 and more, k = 3, 8 or 15, each turned by its
+    rotation, of (s, 3, 3): seen along ``rotation @ d``, a splat then looks as it did along d."""
+    degree = int((harmonics.shape[1] + 1) ** 0.5) - 1
+    basis = sh_basis(_DIRECTIONS, degree)[:, 1:]
+    # As in harmonics_map, but from the values of each splat.
+    fit = np.linalg.pinv(basis)
+    turned = np.empty_like(harmonics, np.float32)
+    for start in range(0, len(harmonics), 1 << 13):
+        part = slice(start, start + (1 << 13))
+        before = (_DIRECTIONS @ rotations[part]).reshape(-1, 3)
+        values = sh_basis(before, degree)[:, 1:].reshape(-1, *basis.shape) @ harmonics[part]
+        turned[part] = fit @ values
+    return turned
+
+
+def _spiral(count: int) -> np.ndarray:
+    """(count, 3) unit directions on a Fibonacci spiral."""
+    i = np.arange(count) + 0.5
+    z, angle = 1 - 2 * i / count, i * np.pi * (1 + 5**0.5)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+_DIRECTIONS = _spiral(32)
 
 
 def _norm(over: int, under: int) -> float:

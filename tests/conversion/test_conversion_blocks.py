@@ -69,7 +69,7 @@ def test_blocks_are_the_mesh_of_the_whole(small_blocks, options, strays):
 def test_cameras_and_their_colors(small_blocks):
     cloud = with_strays(40_000, 100)
     cameras = orbit(cloud, 5, distance=0.3)  # close: many splats are in no image
-    for colors in ("degree0", "cameras"):
+    for colors in ("base", "mean", "view"):
         parts = list(convert_blocks(in_blocks(cloud, 3000), cameras=cameras, colors=colors))
         assert_same(parts, convert(cloud, cameras=cameras, colors=colors))
 

@@ -286,7 +286,7 @@ class TestColors:
     def test_one_camera_by_hand(self):
         camera = look_at((0, 0, -5), (0, 0, 0))  # looks along +z
         c1 = (3 / (4 * np.pi)) ** 0.5
-        mesh = convert(self.sh_cloud(), cameras=[camera], colors="cameras")
+        mesh = convert(self.sh_cloud(), cameras=[camera], colors="mean")
         np.testing.assert_allclose(
             mesh.colors[:, :3],
             np.tile([0.5 + 0.5 * c1, 0.5, 0.5 + 0.5 * SH_C0], (len(mesh.vertices), 1)),
@@ -299,7 +299,7 @@ class TestColors:
         # From -z at distance 1 (weight 1) and from -x at distance 2 (weight 1/4).
         cameras = [look_at((0, 0, -1), (0, 0, 0)), look_at((-2, 0, 0), (0, 0, 0))]
         c1 = (3 / (4 * np.pi)) ** 0.5
-        mesh = convert(self.sh_cloud(), cameras=cameras, colors="cameras")
+        mesh = convert(self.sh_cloud(), cameras=cameras, colors="mean")
         expected = [0.5 + 0.8 * 0.5 * c1, 0.5 + 0.2 * 0.5 * c1, 0.5 + 0.5 * SH_C0]
         np.testing.assert_allclose(mesh.colors[0, :3], expected, atol=1e-6)
 
@@ -311,7 +311,7 @@ class TestColors:
             [0.5] * 2,
             np.repeat(self.sh_cloud().sh, 2, axis=0),
         )
-        mesh = convert(cloud, cameras=[look_at((0, 0, -5), (0, 0, 0))], colors="cameras")
+        mesh = convert(cloud, cameras=[look_at((0, 0, -5), (0, 0, 0))], colors="mean")
         np.testing.assert_allclose(mesh.colors[-1, :3], [0.5, 0.5, 0.5 + 0.5 * SH_C0], atol=1e-6)
         assert mesh.colors[0, 0] > 0.7
 
@@ -319,7 +319,7 @@ class TestColors:
         cloud = self.sh_cloud()
         strong = replace(cloud, sh=cloud.sh * np.float32(4))  # red from one side 1.48, from the other -0.48
         cameras = [look_at((0, 0, -1), (0, 0, 0)), look_at((0, 0, 1), (0, 0, 0))]
-        mesh = convert(strong, cameras=cameras, colors="cameras")
+        mesh = convert(strong, cameras=cameras, colors="mean")
         np.testing.assert_allclose(mesh.colors[0, :3], [0.5, 0.5, 1.0], atol=1e-6)
-        one = convert(strong, cameras=cameras[:1], colors="cameras")
+        one = convert(strong, cameras=cameras[:1], colors="mean")
         assert one.colors[0, 0] == 1

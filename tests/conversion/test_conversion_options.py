@@ -156,7 +156,7 @@ REFUSED = [
     ),
     (dict(footprint="none", footprint_px2=0.3), "footprint_px2"),
     (dict(footprint_px2=-1), "footprint_px2"),
-    (dict(colors="cameras"), "colors='cameras' needs cameras"),
+    (dict(colors="mean"), "colors='mean' needs cameras"),
     (dict(detail="cameras"), "detail='cameras' needs cameras"),
     (dict(detail="finest"), "detail must be one of even, cameras"),
     (dict(detail="cameras", mode="3d", cameras=[CAMERA]), "mode '3d'"),
@@ -192,7 +192,7 @@ def test_every_option_does_something():
         [[1, 0, 0, 0]] * 60,
         np.exp(rng.normal(size=(60, 3)) - 3),
         rng.uniform(0.004, 1, 60),
-        rng.normal(size=(60, 4, 3)),
+        rng.normal(size=(60, 9, 3)),
     )
     other = dict(
         mode="3d",
@@ -215,7 +215,8 @@ def test_every_option_does_something():
         max_splats=9,
         max_triangles=99,
         budget="drop",
-        colors="cameras",
+        colors="mean",
+        sh_degree=1,
     )
     assert set(other) == {f.name for f in fields(ConversionOptions)}
     for name, value in other.items():
@@ -229,6 +230,7 @@ def test_every_option_does_something():
             a.vertices.shape == b.vertices.shape
             and (a.vertices == b.vertices).all()
             and (a.colors == b.colors).all()
+            and a.sh_degree == b.sh_degree
         )
         assert not same, name
 

@@ -35,7 +35,7 @@ from meshsplats.finetuning.step import (
     view_of_step,
 )
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import MAX_COLOR, SplatMesh
 
 
 @pytest.fixture(scope="module")
@@ -125,6 +125,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     from meshsplats.rendering.autograd import rasterize
 
     _, dataset, mesh = scene
+    mesh = mesh.of_degree(0) if blending == "linear" else mesh
     state = State.begin(
         replace(mesh, blending=blending), 1, make_config(ssim_weight=0.3, l2_weight=7.0, exposure=True), None
     )
@@ -138,12 +139,15 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     monkeypatch.setattr(State, "step", lambda state, gradients, *rest, **more: found.extend(gradients))
     loss = make_step(state, [view], 0, 0.0, Blended(state.config))
 
-    leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
+    assert (state.harmonics is None) == (blending == "linear")
+    arrays = [a for a in (state.vertices, state.colors, state.harmonics) if a is not None]
+    leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in arrays]
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
     behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
     options = dict(
         face_splat=mesh.face_splat, min_transmittance=TRAINING_MIN_TRANSMITTANCE[blending], samples=2
     )
+    options["harmonics"] = leaves[2] if len(leaves) > 2 else None
     rendered = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
     if blending == "linear":
         curve = 1.055 * rendered.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
@@ -155,6 +159,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     expected = expected + 7 * (square if mask is None else square[inside]).mean()
     expected.backward()
     assert loss == pytest.approx(float(expected.detach()), rel=1e-5)
+    found = [part for part in found if part is not None]
     for ours, theirs in zip(found, (*leaves, exposure), strict=True):
         assert np.allclose(ours, theirs.grad, rtol=1e-3, atol=1e-5 * float(theirs.grad.abs().max()))
 
@@ -372,9 +377,12 @@ def test_black_fans_on_black_take_on_colors(scene):
 
 def test_colors_stay_in_range(scene):
     _, dataset, mesh = scene
-    tuned = finetune(mesh, dataset, make_config(steps=20, color_rate=0.9))
-    assert tuned.colors.min() >= 0
-    assert tuned.colors.max() <= 1
+    assert mesh.harmonics is not None
+    for start, brightest in ((mesh, MAX_COLOR), (mesh.of_degree(0), 1)):
+        tuned = finetune(start, dataset, make_config(steps=20, color_rate=0.9))
+        assert tuned.colors.min() >= 0
+        assert tuned.colors[:, :3].max() <= brightest
+        assert tuned.colors[:, 3].max() <= 1
 
 
 def test_masked_pixels_have_no_say(scene):
@@ -541,4 +549,6 @@ def test_a_mesh_keeps_its_order_unless_another_is_asked_for():
     cut = make_config(steps=1, opacity="cutoff")
     assert State.begin(by_splat, 2, cut, None).triangles.order == "fragment"
     with pytest.raises(ValueError, match="order='splat' blends whole splats, but the mesh does not know"):
-        State.begin(replace(exact, face_splat=None), 2, make_config(steps=1, order="splat"), None)
+        State.begin(
+            replace(exact, face_splat=None, harmonics=None), 2, make_config(steps=1, order="splat"), None
+        )

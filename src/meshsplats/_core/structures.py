@@ -169,6 +169,26 @@ class EdgesStruct(CoreStruct):
     ]
 
 
+class ShadingStruct(CoreStruct):
+    _fields_ = [
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("splat_count", c_int64),
+        ("terms", c_int32),
+        ("threads", c_int32),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("face_splat", c_void_p),
+        ("harmonics", c_void_p),
+        ("eye", c_double * 3),
+        ("shaded", c_void_p),
+        ("gradient", c_void_p),
+        ("color_gradient", c_void_p),
+        ("harmonic_gradient", c_void_p),
+    ]
+
+
 class ViewerStruct(CoreStruct):
     _fields_ = [
         ("camera", CameraStruct),

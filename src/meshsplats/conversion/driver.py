@@ -11,7 +11,7 @@ import numpy as np
 from meshsplats.conversion.fan_sizes import Fans
 from meshsplats.conversion.footprint import DRAWN_PX2, SceneViews
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.conversion.selection import flattened, within
+from meshsplats.conversion.selection import within
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 
@@ -23,7 +23,9 @@ def worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarra
 
 def drawn_part(cloud: GaussianCloud, rows: np.ndarray, options: ConversionOptions) -> GaussianCloud:
     """The splats ``rows`` (k,) of ``cloud``, ascending, with the harmonics that the mesh depends on."""
-    part = cloud if options.colors == "cameras" else flattened(cloud)
+    part = cloud if options.colors != "base" else cloud.of_degree(0)
+    if options.colors == "view":
+        part = part.of_degree(min(part.sh_degree, options.sh_degree or 3))
     return part if len(rows) == len(cloud) else part.take(rows)
 
 
@@ -106,11 +108,15 @@ class Driver:
         vertices, faces, colors, owners = piece.fans.build(
             piece.cloud, piece.rows, piece.colors, self.options.compensation, kept
         )
+        harmonics = None
+        if self.options.colors == "view" and piece.cloud.sh_degree:
+            harmonics = piece.cloud.sh[:, 1:] if kept is None else piece.cloud.sh[kept, 1:]
         return SplatMesh(
             vertices,
             faces,
             colors,
             face_splat=owners,
+            harmonics=harmonics,
             up=self.up,
             filter_px2=self.filter_px2,
             origin=self.origin,

@@ -18,8 +18,8 @@ from meshsplats.cameras.framing import SAMPLE
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.conversion.selection import flattened
 from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
+from meshsplats.mesh import MAX_COLOR
 from meshsplats.spherical_harmonics import sh_basis
 
 FILTER_PX2: dict[str, dict[str, float]] = {
@@ -199,7 +199,7 @@ class SceneSample:
     def of(cls, cloud: GaussianCloud) -> SceneSample:
         """That of splats in memory, all of which are kept."""
         step = -(-len(cloud) // SAMPLE)
-        sample = flattened(cloud).take(np.arange(0, len(cloud), step))
+        sample = cloud.of_degree(0).take(np.arange(0, len(cloud), step))
         return cls(len(cloud), cloud.kernel, sample, step, origin_of(cloud.means[:: origin_step(len(cloud))]))
 
 
@@ -231,7 +231,7 @@ class SceneViews:
         """At splats that no camera sees: the median pixel of the others, of the sample at first. None: of
         those that are asked for."""
         self._cameras: list[Camera] = []
-        if cameras and "cameras" in (options.footprint, options.colors):
+        if cameras and (options.footprint == "cameras" or options.colors == "mean"):
             self._cameras = self._placed(cameras)
         self._measuring = self._cameras
         if options.footprint == "framing":
@@ -264,9 +264,11 @@ class SceneViews:
         return CameraCoverage(means, self._measuring, self._scene.origin).pixel_sizes()
 
     def colors(self, cloud: GaussianCloud) -> np.ndarray:
-        """(n, 3) display RGB of ``cloud``: the mean over the cameras, if that is asked for, else of degree 0
-        or what the harmonics say."""
-        if self._options.colors != "cameras" or not self._cameras or not cloud.sh_degree:
+        """(n, 3) display RGB of ``cloud``: the mean over the cameras, if that is asked for, else of degree 0,
+        which is above 1 where harmonics may darken it."""
+        if self._options.colors == "view" and cloud.sh_degree:
+            return np.clip(0.5 + np.float32(SH_C0) * cloud.sh[:, 0], 0, MAX_COLOR)
+        if self._options.colors != "mean" or not self._cameras or not cloud.sh_degree:
             return cloud.colors
         return CameraCoverage(cloud.means, self._cameras, self._scene.origin).mean_colors(cloud.sh)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Mode = Literal["crossed", "flat", "3d"]
 Footprint = Literal["cameras", "framing", "distance", "filter", "none"]
-Colors = Literal["degree0", "cameras"]
+Colors = Literal["view", "mean", "base"]
 Detail = Literal["even", "cameras"]
 Budget = Literal["merge", "drop"]
 Preset = Literal["default", "paper"]
@@ -101,8 +101,11 @@ class ConversionOptions:
     most important ones, by opacity times area in the images of the cameras (splats that no camera sees count
     as at the median distance), or in scene units without cameras; this tears holes."""
     colors: Annotated[Colors | None, Advanced] = None
-    """degree0: the view-independent part of the colour. cameras: where splats have spherical harmonics, the
-    mean of the colours that the cameras see."""
+    """view: as the splats, the mesh has colours that depend on the view, where the splats have spherical
+    harmonics (``SplatMesh.harmonics``). mean: one colour, the mean of those that the cameras see. base: one
+    colour, the part of degree 0. Programs that do not know the harmonics show the base colour of 'view'."""
+    sh_degree: Annotated[int | None, Range(1, 3), With(colors="view"), Advanced] = None
+    """Degree of the spherical harmonics that 'view' keeps. Default: all that the splats have."""
 
     def resolved(self, preset: str, *, has_cameras: bool) -> ConversionOptions:
         """A checked copy with the preset's values in place of None.
@@ -146,8 +149,8 @@ class ConversionOptions:
             )
         if self.footprint == "distance" and self.viewing_distance is None:
             raise ValueError("footprint='distance' needs viewing_distance, in scene units")
-        if self.colors == "cameras" and not has_cameras:
-            raise ValueError("colors='cameras' needs cameras")
+        if self.colors == "mean" and not has_cameras:
+            raise ValueError("colors='mean' needs cameras")
         if self.crop is not None:
             box = np.asarray(self.crop, np.float64)
             if box.shape != (6,) or not np.isfinite(box).all() or not (box[:3] <= box[3:]).all():
@@ -169,7 +172,7 @@ PRESETS = {
         min_opacity=1 / 255,
         shrink_faint=True,
         budget="merge",
-        colors="degree0",
+        colors="view",
     ),
     "paper": ConversionOptions(
         mode="flat",
@@ -187,7 +190,7 @@ PRESETS = {
         min_opacity=0.0,
         shrink_faint=False,
         budget="merge",
-        colors="degree0",
+        colors="base",
     ),
 }
 """default: calibrated to look like the splats. paper: arXiv 2502.07754, with the rim opacity and the number
@@ -218,6 +221,7 @@ class ConversionChanges(TypedDict, total=False):
     max_triangles: int | None
     budget: Budget | None
     colors: Colors | None
+    sh_degree: int | None
 
 
 def make_options(

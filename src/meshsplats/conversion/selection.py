@@ -72,11 +72,6 @@ def within(cloud: GaussianCloud, crop: Sequence[float] | None, min_opacity: floa
     return keep
 
 
-def flattened(cloud: GaussianCloud) -> GaussianCloud:
-    """``cloud`` with its harmonics of degree 0 alone."""
-    return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
-
-
 def inside(points: np.ndarray, box: Sequence[float], origin: np.ndarray) -> np.ndarray:
     """(n,) bool: ``points`` (n, 3), relative to ``origin``, inside the ``box`` x0 y0 z0 x1 y1 z1 of the
     world, borders included."""

@@ -18,7 +18,6 @@ from meshsplats.cameras.framing import SAMPLE, guess_up, unit_up, warn_of_strays
 from meshsplats.conversion.driver import Driver, Piece, drawn_part, filter_of, worth_drawing
 from meshsplats.conversion.footprint import SceneSample, SceneViews, origin_of, origin_step
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
-from meshsplats.conversion.selection import flattened
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 
@@ -70,7 +69,7 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
     samples, near_origin = [], []
     passed = 0
     for block in source:
-        part = replace(flattened(block).take(worth_drawing(block, options)), kernel=kernel)
+        part = replace(block.of_degree(0).take(worth_drawing(block, options)), kernel=kernel)
         samples.append(part.take(np.arange(-passed % step, len(part), step)))
         near_origin.append(part.means[-passed % distance :: distance])
         passed += len(part)
@@ -121,7 +120,8 @@ def convert_blocks(
     def pieces() -> Iterator[Piece]:
         for block, rows in _aligned(source, chosen, scene.kernel):
             piece = driver.piece(block, rows)
-            piece = replace(piece, cloud=flattened(piece.cloud))
+            if chosen.colors != "view":
+                piece = replace(piece, cloud=piece.cloud.of_degree(0))
             yield piece.select(np.flatnonzero(driver.has_area(piece)))
 
     done = 0
@@ -188,7 +188,7 @@ def _median_seen(
     the bits and one of the lower half for the two bins in the middle find them in two passes.
     """
 
-    flat = replace(options, colors="degree0")
+    flat = replace(options, colors="base")
 
     def blocks() -> Iterator[np.ndarray]:
         for block, _ in _aligned(source, flat, "3dgs"):

@@ -18,6 +18,7 @@
 #include "viewer.h"
 #endif
 #include "mesh_tile.h"
+#include "shading.h"
 #include "splat_order_tile.h"
 #include "splats.h"
 #include "ssim.h"
@@ -244,7 +245,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 10; }
+MS_EXPORT int ms_interface_version() { return 11; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -327,6 +328,14 @@ MS_EXPORT int ms_round_fans(const MsFans *fans, char *message, int message_size)
 
 MS_EXPORT int ms_edge_gradients(const MsEdges *edges, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::EdgePass(*edges).run(); });
+}
+
+MS_EXPORT int ms_shade(const MsShading *shading, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::Shading(*shading).forward(); });
+}
+
+MS_EXPORT int ms_shade_backward(const MsShading *shading, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::Shading(*shading).backward(); });
 }
 
 #ifndef MS_WIDE_ONLY

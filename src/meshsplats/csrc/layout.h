@@ -13,6 +13,7 @@
 #include "ordering.h"
 #include "viewer.h"
 #endif
+#include "shading.h"
 #include "ssim.h"
 #include "types.h"
 
@@ -160,6 +161,22 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsEdges, near),
     MS_FIELD(MsEdges, cutoff),
     MS_FIELD(MsEdges, result),
+    MS_WHOLE(MsShading),
+    MS_FIELD(MsShading, vertex_count),
+    MS_FIELD(MsShading, face_count),
+    MS_FIELD(MsShading, splat_count),
+    MS_FIELD(MsShading, terms),
+    MS_FIELD(MsShading, threads),
+    MS_FIELD(MsShading, vertices),
+    MS_FIELD(MsShading, colors),
+    MS_FIELD(MsShading, faces),
+    MS_FIELD(MsShading, face_splat),
+    MS_FIELD(MsShading, harmonics),
+    MS_FIELD(MsShading, eye),
+    MS_FIELD(MsShading, shaded),
+    MS_FIELD(MsShading, gradient),
+    MS_FIELD(MsShading, color_gradient),
+    MS_FIELD(MsShading, harmonic_gradient),
 #ifndef MS_WIDE_ONLY
     MS_WHOLE(MsNearest),
     MS_FIELD(MsNearest, count),

@@ -88,8 +88,8 @@ def compare_views(
     Args:
         look: look of the splats. 'area': the mean over each pixel's area, as programs show that take several
             samples per pixel. 'splats': the image of a 3DGS viewer at this image size.
-        sh_degree: spherical harmonics of the splats up to this degree; all by default. A mesh has one colour
-            per vertex: 0 excludes view-dependent colour from the comparison.
+        sh_degree: spherical harmonics up to this degree, of the splats and of the mesh; all by default. 0
+            excludes view-dependent colour from the comparison.
         background: display RGB in [0, 1].
         samples: samples along each side of a pixel, for the mesh. None: as many as it needs for 'area', 1 for
             'splats'.
@@ -101,6 +101,7 @@ def compare_views(
         A ``ComparedView`` for each camera, in their order.
     """
     check_look(look)
+    mesh = mesh if sh_degree is None else mesh.of_degree(sh_degree)
     samples = mesh_samples(look, mesh, cameras) if samples is None else samples
     options: dict[str, Any] = {
         "samples": samples,

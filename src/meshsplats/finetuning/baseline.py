@@ -94,29 +94,42 @@ def converted(
     if starts_with_filter(cloud, options):
         options = replace(options, footprint="filter")
     wanted = without_cameras(options)
-    if options.colors == "cameras":
-        wanted = replace(wanted, colors="cameras")
+    if options.colors == "mean":
+        wanted = replace(wanted, colors="mean")
         if wanted.footprint is None and wanted.viewing_distance is None:
             wanted = replace(wanted, footprint="framing")
-    seen_from = cameras if options.colors == "cameras" else None
+    seen_from = cameras if options.colors == "mean" else None
     mesh = convert(cloud, wanted, cameras=seen_from, up=guess_up(cloud, cameras))
     return cut_mesh(mesh, config.cutoff) if config.cuts else mesh
 
 
 def without_cameras(options: ConversionOptions) -> ConversionOptions:
     """``options`` with the default in place of what needs cameras."""
-    names = ("detail", "footprint", "colors")
-    return replace(options, **{name: None for name in names if getattr(options, name) == "cameras"})
+    needing = {"detail": "cameras", "footprint": "cameras", "colors": "mean"}
+    return replace(
+        options, **{name: None for name, value in needing.items() if getattr(options, name) == value}
+    )
 
 
 def partly(start: SplatMesh, tuned: SplatMesh, share: float) -> SplatMesh | None:
     """``start`` moved by this ``share`` of the way to ``tuned``, in positions and colours; None if they
-    differ in their triangles."""
-    if start.colors.shape != tuned.colors.shape or not np.array_equal(start.faces, tuned.faces):
+    differ in their triangles or in the degree of their colours."""
+    alike = start.colors.shape == tuned.colors.shape and start.sh_degree == tuned.sh_degree
+    if not alike or not np.array_equal(start.faces, tuned.faces):
         return None
-    vertices = start.vertices + np.float32(share) * (tuned.vertices - start.vertices)
-    colors = start.colors + np.float32(share) * (tuned.colors - start.colors)
-    return replace(tuned, vertices=vertices, colors=colors)
+
+    def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return one + np.float32(share) * (other - one)
+
+    harmonics = None
+    if start.harmonics is not None and tuned.harmonics is not None:
+        harmonics = between(start.harmonics, tuned.harmonics)
+    return replace(
+        tuned,
+        vertices=between(start.vertices, tuned.vertices),
+        colors=between(start.colors, tuned.colors),
+        harmonics=harmonics,
+    )
 
 
 def measure_baseline(

@@ -29,7 +29,6 @@ from meshsplats.camera import Camera
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.merging import simplify
-from meshsplats.conversion.selection import flattened
 from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.datasets.windows import window_of
 from meshsplats.finetuning.checkpoint import OtherRunError, cloud_digest, dataset_fingerprint
@@ -283,7 +282,7 @@ class _Tuning:
         """``part`` of ``every`` splats, merged."""
         share = min(1.0, FAR_SHARE * self.options.splats / every)
         count = max(1, round(share * len(part)))
-        return simplify(flattened(part), count, low_pass=0.0, threads=self.run.threads)
+        return simplify(part.of_degree(0), count, low_pass=0.0, threads=self.run.threads)
 
     def tune(self, task: tuple[int, tuple[int, ...]]) -> int:
         """Writes the tuned mesh of a cell after those ``before``; the count of its steps."""

@@ -173,7 +173,7 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str, order: str) -> Spl
 
 
 def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
-    """Hash of the positions, triangles, colours, binding, blending, filter and order of ``mesh``, and of the
+    """Hash of the positions, triangles, colours, harmonics, binding, blending, filter and order of ``mesh``, and of the
     mask of its ``frozen`` vertices."""
     digest = hashlib.sha256(mesh.blending.encode())
     if mesh.filter_px2:
@@ -185,6 +185,8 @@ def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
     arrays = [mesh.vertices, mesh.faces, mesh.colors]
     if mesh.binding is not None:
         arrays += [getattr(mesh.binding, field.name) for field in mesh.binding.FIELDS]
+    if mesh.harmonics is not None:
+        arrays.append(mesh.harmonics)
     if frozen is not None:
         arrays.append(frozen)
     for array in arrays:

@@ -56,6 +56,9 @@ class FinetuneConfig:
     them."""
     position_rate: Annotated[float, Range(0, 10), Advanced] = 0.02
     """Adam's learning rate of the vertex positions, in ``position_unit``. 0: positions are fixed."""
+    harmonics_rate: Annotated[float, Range(0, 1), Advanced] = 0.02
+    """Adam's learning rate of the spherical harmonics of splats, where the mesh has them. It falls as that of
+    colours does. 0: they stay."""
     position_unit: Annotated[Unit, Advanced] = "splat"
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
     as in the paper."""
@@ -232,6 +235,7 @@ class FinetuneChanges(TypedDict, total=False):
     minutes: float | None
     color_rate: float
     position_rate: float
+    harmonics_rate: float
     position_unit: Unit
     soft_edges: bool
     final_share: float

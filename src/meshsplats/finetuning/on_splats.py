@@ -13,6 +13,7 @@ from meshsplats._arrays import subsample
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
+from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning.baseline import SHARES, SizeScores, converted, measure_baseline, partly
 from meshsplats.finetuning.config import FinetuneConfig
@@ -71,13 +72,23 @@ class SplatRun:
     device: Device = "cpu"
 
 
+def as_bright_as(options: ConversionOptions, dataset: Dataset) -> ConversionOptions:
+    """``options`` with the harmonics that images of splats in ``dataset`` show, unless they name colours."""
+    sources = [view.source for view in dataset.train if isinstance(view.source, RenderedSplats)]
+    degrees = {source.sh_degree for source in sources}
+    if options.colors is not None or options.sh_degree is not None or degrees <= {None}:
+        return options
+    degree = max(degree or 0 for degree in degrees)
+    return replace(options, colors="view", sh_degree=degree) if degree else replace(options, colors="base")
+
+
 class SplatTuning:
     """A run on images of splats that is ready to begin. Reads or makes the record of its start."""
 
     def __init__(self, run: SplatRun, setup: Setup) -> None:
         self._run, self._setup = run, setup
         self.dataset, self.config = run.targets(run.config, None), run.config
-        self._options = replace(run.options, look=self.dataset.look)
+        self._options = as_bright_as(replace(run.options, look=self.dataset.look), self.dataset)
         self._record = StartRecord.load(run.folder) if run.resumed else self._timed()
         if self._record.brief_steps is not None:
             self.config = of_brief_run(self.config, self._record.brief_steps, set(run.fixed))

@@ -19,7 +19,7 @@ from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored
 from meshsplats.finetuning.config import FinetuneConfig, epsilons
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.loss import LossRates
-from meshsplats.mesh import SplatMesh, Triangles, solid_faces
+from meshsplats.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
 from meshsplats.order import Order, checked_order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
@@ -60,6 +60,8 @@ class Gradients(NamedTuple):
     """(v, 3)."""
     colors: np.ndarray
     """(v, 4)."""
+    harmonics: np.ndarray | None = None
+    """(s, k, 3); None for a mesh without harmonics."""
     exposure: np.ndarray | None = None
     """(6,): gain and offset of this view's exposure; None if exposures are not fitted."""
 
@@ -76,7 +78,9 @@ class State:
     Attributes:
         vertices: (v, 3) float32, scene units, changed in place. After whole steps of the engine, they are
             fetched when they are read.
-        colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, likewise.
+        colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, likewise. With harmonics
+            RGB may be above 1.
+        harmonics: (s, k, 3) float32 as in ``SplatMesh``, changed in place; None if the mesh has none.
         mesh: the initial mesh without pruned triangles: triangles, their splats, attributes.
         sizes: (v,) float32, the unit of each vertex' position or, on a base mesh, of its weights.
         bound: for a mesh that is bound to a base, the barycentric weights that are optimised in place of
@@ -112,7 +116,12 @@ class State:
         else:
             unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self._vertices, lr=1.0, scale=unit, eps=position_epsilon)
-        self._colors = adam(self._rgba, lr=1.0, bounds=(0, 1), eps=color_epsilon)
+        self.harmonics = None if mesh.harmonics is None else mesh.harmonics.copy()
+        self._harmonics = None
+        if self.harmonics is not None:
+            self._harmonics = adam(self._flat_harmonics, lr=1.0, eps=color_epsilon)
+        brightest = 1 if mesh.harmonics is None else MAX_COLOR
+        self._colors = adam(self._rgba, lr=1.0, bounds=(0, brightest), eps=color_epsilon)
         # Depends on the triangles alone, so that a resumed run finds the same boundary.
         self._boundary = boundary_vertices(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
         self._exposures = None
@@ -130,7 +139,9 @@ class State:
     @property
     def triangles(self) -> Triangles:
         """The mesh as it is now."""
-        return self.mesh.triangles._replace(vertices=self.vertices, colors=self.colors)
+        return self.mesh.triangles._replace(
+            vertices=self.vertices, colors=self.colors, harmonics=self.harmonics
+        )
 
     @cached_property
     def beyond(self) -> np.ndarray:
@@ -141,6 +152,12 @@ class State:
     def colors(self) -> np.ndarray:
         self._fetch()
         return self._rgba
+
+    @property
+    def _flat_harmonics(self) -> np.ndarray:
+        """(s, 3 k) view of ``harmonics``."""
+        assert self.harmonics is not None
+        return self.harmonics.reshape(len(self.harmonics), -1)
 
     @classmethod
     def begin(
@@ -160,6 +177,7 @@ class State:
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
         if config.blending == "linear" and mesh.blending == "display":
+            mesh = mesh.of_degree(0)  # harmonics are display colours
             colors = mesh.colors.copy()
             colors[:, :3] = np.clip(srgb_to_linear(colors[:, :3]), 0, 1)
             mesh = replace(mesh, colors=colors, blending="linear")
@@ -238,6 +256,7 @@ class State:
             self.mesh,
             vertices=self.vertices.copy(),
             colors=self.colors.copy(),
+            harmonics=None if self.harmonics is None else self.harmonics.copy(),
             binding=None if self.bound is None else self.bound.binding(),
         )
 
@@ -264,6 +283,9 @@ class State:
         transparent = None if self._boundary is None else self._boundary & (opacity == 0)
         self._colors.lr = color_rate
         self._colors.step(gradients.colors, reached)
+        if self._harmonics is not None:
+            np.minimum(opacity, 1, out=opacity)
+            self._step_harmonics(gradients, color_rate)
         if self.config.opacity_decay:
             # In proportion to the rate: its balance with the gradients is the same in runs of any length.
             lost = self.config.opacity_decay * color_rate / self.config.color_rate
@@ -294,6 +316,27 @@ class State:
             mean = self.exposures.mean(axis=0, dtype=np.float64) - [1, 1, 1, 0, 0, 0]
             self.exposures -= mean.astype(np.float32)
 
+    def _step_harmonics(self, gradients: Gradients, color_rate: float) -> None:
+        """One step for the harmonics of splats that the view reached, at a rate that falls as that of colours
+        does."""
+        assert self._harmonics is not None
+        assert gradients.harmonics is not None
+        config, flat = self.config, gradients.harmonics.reshape(len(gradients.harmonics), -1)
+        rate = config.harmonics_rate * color_rate / config.color_rate
+        if rate > 0:
+            reached = nonzero_rows(flat)
+            if self.frozen is not None:
+                reached &= ~self._frozen_splats
+            self._harmonics.lr = rate
+            self._harmonics.step(flat, reached)
+
+    @cached_property
+    def _frozen_splats(self) -> np.ndarray:
+        """(s,) bool: the splats with a frozen vertex."""
+        assert self.frozen is not None
+        splats = self.mesh.splats
+        return np.logical_or.reduceat(self.frozen[self.mesh.faces].any(axis=1), splats.starts)
+
     @property
     def needs(self) -> set[Need]:
         """What a step of this state asks of who takes it."""
@@ -305,6 +348,7 @@ class State:
             "rounding": self._rounds,
             "frozen": self.frozen is not None or self.solid is not None,
             "depth groups": self.mesh.depth_group is not None,
+            "harmonics": self.harmonics is not None,
         }
         return {need for need, there in of_state.items() if there}
 
@@ -387,6 +431,12 @@ class State:
         result._colors = self._colors.select(result.colors, rows)
         if sizes is not None and result._positions.scale is not None:
             result._positions.scale = sizes.copy()
+        if self._harmonics is not None and result.harmonics is not None:
+            source = np.zeros(len(result.harmonics), np.int64)
+            own, before = mesh.splats.of_vertex, self.mesh.splats.of_vertex
+            used = own >= 0
+            source[own[used]] = before[rows[used]]
+            result._harmonics = self._harmonics.select(result._flat_harmonics, source)
         if self._exposures is not None:
             every = np.arange(len(self._exposures.mean))
             result._exposures = self._exposures.select(result.exposures, every)
@@ -401,9 +451,12 @@ class State:
         self._change()
         self._positions.restart(rows)
         self._colors.restart(rows)
+        if self._harmonics is not None:
+            self._harmonics.restart(np.unique(self.mesh.splats.of_vertex[rows]))
 
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}
+        found |= {} if self._harmonics is None else {"harmonics": self._harmonics}
         return found if self._exposures is None else found | {"exposure": self._exposures}
 
 

@@ -19,6 +19,7 @@ from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, Rates, State, S
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapeOptions
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.engine import Need, Taped, WholeSteps
+from meshsplats.rendering.shading import shaded
 
 TRAINING_MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
 """Early termination: a pixel stops below this transmittance, and the background gets the rest. It saves a
@@ -90,8 +91,8 @@ class RenderedView:
         color: (h, w, 3) float32 display RGB.
     """
 
-    def __init__(self, rendering: Taped, linear: bool) -> None:
-        self._rendering, self._linear = rendering, linear
+    def __init__(self, rendering: Taped, linear: bool, harmonics: np.ndarray | None = None) -> None:
+        self._rendering, self._linear, self._harmonics = rendering, linear, harmonics
         self.color = linear_to_srgb(rendering.color) if linear else rendering.color
 
     def backward(self, grad_color: np.ndarray, expected: ExpectedError | None = None) -> Gradients:
@@ -103,13 +104,18 @@ class RenderedView:
         if self._linear:
             grad_color = grad_color * encoding_slope(self._rendering.color)
         count = self._rendering.vertex_count
-        gradients = Gradients(np.zeros((count, 3), np.float32), np.zeros((count, 4), np.float32))
+        gradients = Gradients(
+            np.zeros((count, 3), np.float32),
+            np.zeros((count, 4), np.float32),
+            None if self._harmonics is None else np.zeros_like(self._harmonics),
+        )
         self._rendering.backward(
             grad_color,
             None,
             None,
             vertices=gradients.vertices,
             colors=gradients.colors,
+            harmonics=gradients.harmonics,
             expected=expected,
         )
         return gradients
@@ -188,7 +194,8 @@ def view_gradients(
     """Loss and gradients of the training view ``numbered``. DivergenceError if they are not finite."""
     config, (index, view) = state.config, numbered
     options = tape_options(state, target.background, plan)
-    rendered = RenderedView(state.tape(view.camera, options), state.mesh.blending == "linear")
+    taped, linear = state.tape(view.camera, options), state.mesh.blending == "linear"
+    rendered = RenderedView(taped, linear, state.harmonics)
     image = rendered.color
     if state.exposures is not None:
         exposure = state.exposures[index]
@@ -207,8 +214,9 @@ def view_gradients(
         grad_image = grad_image * exposure[GAIN]
     edges = None
     if plan.edges is not None:
+        seen = shaded(state.triangles, view.camera, threads=state.threads)
         edges = edge_gradients(
-            replace(state.mesh, vertices=state.vertices, colors=state.colors),
+            replace(state.mesh, vertices=seen.vertices, colors=seen.colors, harmonics=None),
             view.camera,
             plan.edges,
             grad_image,

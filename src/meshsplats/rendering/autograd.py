@@ -40,6 +40,7 @@ def rasterize(
     *,
     background: Sequence[float] | np.ndarray | torch.Tensor = (1, 1, 1),
     world_to_camera: torch.Tensor | None = None,
+    harmonics: torch.Tensor | None = None,
     samples: int = 1,
     face_splat: torch.Tensor | np.ndarray | None = None,
     depth_group: torch.Tensor | np.ndarray | None = None,
@@ -52,8 +53,8 @@ def rasterize(
 ) -> Raster:
     """The images that ``render`` gives, differentiable once.
 
-    Gradients go to ``vertices``, ``attributes``, ``background`` and ``world_to_camera``. They pass through
-    blending and perspective-correct interpolation. The fragments of a sample and their order count as
+    Gradients go to ``vertices``, ``attributes``, ``background``, ``world_to_camera`` and ``harmonics``. They
+    pass through blending and perspective-correct interpolation. The fragments of a sample and their order count as
     constant, so an edge that passes over a sample has no gradient. An opacity of 1 is no exception: its
     gradient takes account of the fragments behind it, at least six layers of them.
 
@@ -74,6 +75,8 @@ def rasterize(
         background: (3,), (h, w, 3) or (b, h, w, 3) RGB.
         world_to_camera: (b, 4, 4), or (4, 4) for one camera: overrides that of the cameras, to optimise
             poses. The last row is not used.
+        harmonics: (s, k, 3) float32, as in ``SplatMesh``; needs ``face_splat``. The directions to the vertices
+            count as constant; where a colour is held at 0, only a gradient that raises it counts.
         samples: side of the grid of samples in each pixel.
         face_splat, depth_group: (f,) int32, as in ``SplatMesh``.
         filter_px2: variance in square pixels of the filter for splats, as in ``render``. Gradients go through
@@ -117,6 +120,7 @@ def rasterize(
         attributes,
         background,
         world_to_camera,
+        harmonics,
         Scene(views, faces, face_splat, depth_group, filter_px2, order),
         TapeOptions(samples=samples, min_transmittance=min_transmittance),
         drawing,

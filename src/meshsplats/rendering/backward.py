@@ -13,6 +13,7 @@ from meshsplats._core import library, structures
 from meshsplats.camera import Camera
 from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_cutoff
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options, mesh_struct
+from meshsplats.rendering.shading import Shading
 
 TAPE_BYTES = 128 << 20
 """Largest size of the tape of one image, which takes about two bytes a fragment. The backward pass renders
@@ -112,6 +113,10 @@ class TapedRendering:
             self._options.cutoff, self._options.ramp_height = ramp.cutoff, ramp.height
             self._options.ramp_slope, self._options.ramp_leak = ramp.slope, ramp.leak
             self._options.ramp_width = ramp.width * options.samples
+        self._shading = None
+        if triangles.harmonics is not None:
+            self._shading = Shading(triangles, camera, pose, threads=threads)
+            triangles = triangles._replace(colors=self._shading.colors, harmonics=None)
         self._camera = camera_struct(camera.with_near_plane(triangles.vertices, pose))
         if pose is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*pose[:3].ravel())
@@ -156,6 +161,7 @@ class TapedRendering:
         vertices: np.ndarray,
         colors: np.ndarray,
         vertex_attributes: np.ndarray | None = None,
+        harmonics: np.ndarray | None = None,
         expected: ExpectedError | None = None,
     ) -> None:
         """Runs the backward pass: adds vertex gradients to the arrays given.
@@ -167,6 +173,7 @@ class TapedRendering:
             color: (h, w, 3) gradient of the image's colour.
             alpha, attributes: (h, w) and (h, w, k) gradients of those outputs, or None.
             vertices, colors, vertex_attributes: (v, 3), (v, 4) and (v, k), to be added to.
+            harmonics: (s, k, 3), likewise, for triangles with harmonics; see ``Shading.backward``.
             expected: a further loss, whose gradient is added.
 
         The slope k of an ``OpacityRamp`` counts as constant, too. All arrays are float32 and C-contiguous.
@@ -183,9 +190,10 @@ class TapedRendering:
             None if expected is None else library.pointer(expected.weight),
             None if expected is None else library.pointer(expected.target),
         )
+        of_shaded = colors if self._shading is None else np.zeros_like(colors)
         vertex_gradients = structures.VertexGradientsStruct(
             library.pointer(vertices),
-            library.pointer(colors),
+            library.pointer(of_shaded),
             None if attributes is None else library.pointer(vertex_attributes),
         )
         library.call(
@@ -197,3 +205,5 @@ class TapedRendering:
             image_gradients,
             vertex_gradients,
         )
+        if self._shading is not None:
+            self._shading.backward(of_shaded, colors, harmonics)

@@ -13,6 +13,7 @@ from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options, mesh_struct
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
+from meshsplats.rendering.shading import shaded
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class CpuEngine:
         wanted.max_layers, wanted.min_transmittance = options.max_layers, options.min_transmittance
         if options.cutoff is not None:
             wanted.cutoff = options.cutoff
-        triangles = mesh.triangles._replace(
+        triangles = shaded(mesh.triangles, camera, threads=self.threads)._replace(
             values=options.values, filter_px2=options.filter_px2, order=options.order
         )
         h, w = camera.height, camera.width

@@ -16,6 +16,7 @@ from meshsplats._core import kernels
 from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import render
+from meshsplats.rendering.shading import seen_from
 
 EDGE_SAMPLES = 2
 """Samples along each side of a pixel between which edges are looked for."""
@@ -103,6 +104,7 @@ def edge_gradients(
             over their area.
         beyond: ``corners_beyond(mesh.faces)``, precomputed, if you have it.
     """
+    mesh = seen_from(mesh, camera, threads=threads)
     camera = camera.with_near_plane(mesh.vertices)  # not measured again on the triangles of front_faces
     fine, near = camera.scaled(EDGE_SAMPLES), camera.near_plane(mesh.vertices)
     front = front_faces(mesh, fine, cutoff, background=background, threads=threads)

@@ -22,11 +22,21 @@ Device = Literal["cpu", "gpu"]
 """Where meshes are rendered: by the compiled core, or on a GPU by WebGPU."""
 
 Need = Literal[
-    "cutoff", "base mesh", "exposure", "linear light", "decay", "rounding", "frozen", "depth groups", "loss"
+    "cutoff",
+    "base mesh",
+    "exposure",
+    "linear light",
+    "decay",
+    "rounding",
+    "frozen",
+    "depth groups",
+    "loss",
+    "harmonics",
 ]
 """What a run may ask of steps beyond positions and colours that follow the default loss: gradients for a
 cutoff; positions on a base mesh; exposures of images; blending in linear light; opacities that decay; fans
-that are rounded between steps; vertices that stay; triangles that share a depth; a loss of one's own."""
+that are rounded between steps; vertices that stay; triangles that share a depth; a loss of one's own; colours
+that depend on the view."""
 
 
 def check_device(device: str) -> None:
@@ -92,6 +102,7 @@ class Taped(Protocol):
         vertices: np.ndarray,
         colors: np.ndarray,
         vertex_attributes: np.ndarray | None = None,
+        harmonics: np.ndarray | None = None,
         expected: ExpectedError | None = None,
     ) -> None:
         """Adds vertex gradients to the arrays given; see ``backward.TapedRendering.backward``."""

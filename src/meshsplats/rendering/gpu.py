@@ -16,6 +16,7 @@ from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, checked_options
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
+from meshsplats.rendering.shading import Shading, seen_from
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
 from meshsplats.webgpu.gradients import GradientRenderer, WindowLimit, changing_mesh, check_limits
@@ -27,7 +28,17 @@ CANNOT: Mapping[Need, str] = {
 }
 """What is refused, and how."""
 RUN_BY_RUN: frozenset[Need] = frozenset(
-    ("base mesh", "exposure", "linear light", "decay", "rounding", "frozen", "depth groups", "loss")
+    (
+        "base mesh",
+        "exposure",
+        "linear light",
+        "decay",
+        "rounding",
+        "frozen",
+        "depth groups",
+        "loss",
+        "harmonics",
+    )
 )
 """What whole steps do not know. Such runs take the rest of each step themselves, with images and gradients
 from here; so do those with images of more than ``MAX_PIXELS`` pixels. Meshes that do not fit are in
@@ -71,7 +82,7 @@ class GpuEngine:
             filter_px2=options.filter_px2,
         )
         with self.errors():
-            drawn = self.renderer_of(mesh).draw(
+            drawn = self.renderer_of(seen_from(mesh, camera)).draw(
                 camera, settings, depth=options.depth, normals=options.normals, values=options.values
             )
         backdrop = np.asarray(options.background, np.float32)
@@ -197,6 +208,10 @@ class GpuRendering:
         if options.ramp is not None:
             raise ValueError(CANNOT["cutoff"])
         checked = checked_options(Pointers(), camera, options.background, options.samples, None)
+        self._shading = None
+        if triangles.harmonics is not None:
+            self._shading = Shading(triangles, camera, options.pose)
+            triangles = triangles._replace(colors=self._shading.colors, harmonics=None)
         self._engine = engine
         self._background = np.asarray(options.background, np.float32)
         self._matrix = camera.world_to_camera if options.pose is None else options.pose
@@ -231,6 +246,7 @@ class GpuRendering:
         vertices: np.ndarray,
         colors: np.ndarray,
         vertex_attributes: np.ndarray | None = None,
+        harmonics: np.ndarray | None = None,
         expected: ExpectedError | None = None,
     ) -> None:
         """Runs the backward pass: adds vertex gradients to the arrays given.
@@ -252,7 +268,10 @@ class GpuRendering:
                 self.tape, gradient, attributes if self.attributes.shape[2] else None
             )
         vertices += found[:, :3] @ self._matrix[:3, :3].astype(np.float32)
-        colors += found[:, 4:]
+        if self._shading is None:
+            colors += found[:, 4:]
+        else:
+            self._shading.backward(np.ascontiguousarray(found[:, 4:]), colors, harmonics)
         if more is not None and vertex_attributes is not None:
             vertex_attributes += more
 

@@ -24,6 +24,7 @@ from meshsplats.rendering.reference_samples import (
     sample_positions,
     to_camera,
 )
+from meshsplats.spherical_harmonics import sh_basis
 
 FILTER_MIN_VARIANCE = 1e-4
 """The filter takes no fan to have a smaller variance than this share of its own."""
@@ -91,7 +92,7 @@ def render(
         # Weights add up to 1 but for rounding, which must not lead outside the range of the corners.
         return np.clip(mixed, at_corners.min(axis=1), at_corners.max(axis=1))
 
-    rgba = interpolated(mesh.colors)
+    rgba = interpolated(shaded_colors(mesh, camera))
     if cutoff is not None:
         # The core compares float32 values: so does this with the cutoff.
         rgba[:, 3] = rgba[:, 3] >= np.float32(checked_cutoff(cutoff))
@@ -337,6 +338,22 @@ def _share_depths(
         a, b, c = edges[largest].sum(axis=0) / determinants[largest]
         plane = a * x[sample[chosen]] + b * y[sample[chosen]] + c
         nearness[chosen] = np.clip(plane, limits.min(), limits.max())
+
+
+def shaded_colors(mesh: SplatMesh, camera: Camera) -> np.ndarray:
+    """(v, 4) float64 colours that ``camera`` sees: those of the vertices, and what the harmonics of their
+    splats add along the directions from the camera; at least 0."""
+    colors = mesh.colors.astype(np.float64)
+    if mesh.harmonics is None:
+        return colors
+    owner = mesh.splats.of_vertex
+    used = np.flatnonzero(owner >= 0)
+    away = mesh.vertices[used].astype(np.float64) - camera.center
+    directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-150)
+    basis = sh_basis(directions, mesh.sh_degree)[:, 1:]
+    added = np.einsum("vk,vkc->vc", basis, mesh.harmonics[owner[used]].astype(np.float64))
+    colors[used, :3] = np.maximum(colors[used, :3] + added, 0)
+    return colors
 
 
 def _front_to_back(

@@ -14,6 +14,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
+from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.order import Order
 from meshsplats.rendering import reference
@@ -28,6 +29,7 @@ except ImportError as error:
 from meshsplats.rendering.autograd import Raster
 from meshsplats.rendering.backward import OpacityRamp
 from meshsplats.rendering.reference_samples import sample_positions
+from meshsplats.spherical_harmonics import sh_basis
 
 
 def rasterize(
@@ -38,6 +40,7 @@ def rasterize(
     *,
     background: Sequence[float] | np.ndarray | torch.Tensor = (1, 1, 1),
     world_to_camera: torch.Tensor | None = None,
+    harmonics: torch.Tensor | None = None,
     samples: int = 1,
     face_splat: np.ndarray | None = None,
     depth_group: np.ndarray | None = None,
@@ -59,6 +62,7 @@ def rasterize(
             [cameras],
             background=background,
             world_to_camera=pose,
+            harmonics=harmonics,
             samples=samples,
             face_splat=face_splat,
             depth_group=depth_group,
@@ -79,9 +83,10 @@ def rasterize(
             else world_to_camera[i].double()
         )
         own = backdrop[i] if backdrop.ndim == 4 else backdrop
-        images.append(
-            _image(vertices, attributes, triangles, camera, pose, own, samples=samples, ramp=ramp)[0]
-        )
+        seen = attributes
+        if harmonics is not None:
+            seen = _shaded(attributes, harmonics, triangles, pose.detach().numpy())
+        images.append(_image(vertices, seen, triangles, camera, pose, own, samples=samples, ramp=ramp)[0])
     return Raster(*(torch.stack(parts) for parts in zip(*images, strict=True)))
 
 
@@ -111,6 +116,21 @@ def expected_error(
     )
     # The weights of a sample add up to 1.
     return squares - 2 * (image.color * target).sum(dim=-1) + (target**2).sum(dim=-1)
+
+
+def _shaded(
+    attributes: torch.Tensor, harmonics: torch.Tensor, triangles: Triangles, pose: np.ndarray
+) -> torch.Tensor:
+    """(v, 4 + k) ``attributes`` with the colours that the camera of that ``pose`` sees."""
+    owner = FaceSplats(triangles.faces, triangles.face_splat, len(triangles.vertices)).of_vertex
+    used = torch.from_numpy(np.flatnonzero(owner >= 0))
+    away = triangles.vertices.astype(np.float64) + pose[:3, :3].T @ pose[:3, 3]
+    away = away[used] / np.linalg.norm(away[used], axis=1, keepdims=True)
+    degree = int((harmonics.shape[1] + 1) ** 0.5) - 1
+    basis = torch.from_numpy(np.ascontiguousarray(sh_basis(away, degree)[:, 1:]))
+    added = torch.einsum("vk,vkc->vc", basis, harmonics.double()[torch.from_numpy(owner)[used]])
+    seen = _AtLeastZero.apply(attributes[used, :3].double() + added)  # type: ignore[no-untyped-call]
+    return torch.cat([attributes[:, :3].double().index_put((used,), seen), attributes[:, 3:].double()], dim=1)
 
 
 def _detached(vertices: torch.Tensor, faces: np.ndarray, attributes: torch.Tensor) -> Triangles:
@@ -249,3 +269,17 @@ class _Leaky(torch.autograd.Function):
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         inside, k = ctx.saved_tensors
         return grad * torch.where(inside, torch.ones_like(k), ctx.leak / k), None, None
+
+
+class _AtLeastZero(torch.autograd.Function):
+    """Clamps at 0; there, the derivative is 1 for a gradient below 0, which raises the value, else 0."""
+
+    @staticmethod
+    def forward(ctx: Any, value: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(value > 0)
+        return value.clamp(min=0)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:
+        (above,) = ctx.saved_tensors
+        return torch.where(above | (grad < 0), grad, torch.zeros_like(grad))

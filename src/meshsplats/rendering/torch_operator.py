@@ -11,6 +11,7 @@ import numpy as np
 from meshsplats._kinds import described
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
+from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import Triangles
 from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
@@ -54,6 +55,7 @@ def images_of(
     attributes: torch.Tensor,
     background: Sequence[float] | np.ndarray | torch.Tensor,
     poses: torch.Tensor | None,
+    harmonics: torch.Tensor | None,
     scene: Scene,
     options: TapeOptions,
     engine: Engine,
@@ -63,6 +65,7 @@ def images_of(
 
     Args:
         poses: (b, 4, 4), or (4, 4) of one camera; None for those of the cameras.
+        harmonics: (s, k, 3) of the splats, or None.
 
     Raises TypeError or ValueError for tensors that do not fit.
     """
@@ -85,13 +88,16 @@ def images_of(
         if not bool(torch.isfinite(poses).all()):
             raise ValueError("world_to_camera must be finite")
     faces = _faces(scene.faces, len(vertices))
+    face_splat = _per_face("face_splat", scene.face_splat, len(faces))
+    if harmonics is not None:
+        _check_harmonics(harmonics, FaceSplats(faces, face_splat, len(vertices)))
     constant = _Constant(
         views,
         Triangles(
             _NOTHING,
             faces,
             _NOTHING,
-            face_splat=_per_face("face_splat", scene.face_splat, len(faces)),
+            face_splat=face_splat,
             depth_group=_per_face("depth_group", scene.depth_group, len(faces)),
             filter_px2=scene.filter_px2,
             order=scene.order,
@@ -100,7 +106,7 @@ def images_of(
         engine,
         tape_bytes,
     )
-    inputs = (vertices, attributes, backdrop, poses)
+    inputs = (vertices, attributes, backdrop, poses, harmonics)
     if torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in inputs):
         images: Images = _Rasterize.apply(*inputs, constant)  # type: ignore[no-untyped-call]
         return images
@@ -112,6 +118,7 @@ def _forward(
     attributes: torch.Tensor,
     background: torch.Tensor,
     poses: torch.Tensor | None,
+    harmonics: torch.Tensor | None,
     constant: _Constant,
     tapes: list[Taped] | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -121,6 +128,7 @@ def _forward(
         vertices=_array(vertices),
         colors=_array(values if values.shape[1] == 4 else values[:, :4]),
         values=_array(values[:, 4:]) if values.shape[1] > 4 else None,
+        harmonics=None if harmonics is None else _array(harmonics),
     )
     backdrop = background.detach().numpy()
     images = []
@@ -152,12 +160,13 @@ class _Rasterize(torch.autograd.Function):
         attributes: torch.Tensor,
         background: torch.Tensor,
         poses: torch.Tensor | None,
+        harmonics: torch.Tensor | None,
         constant: _Constant,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         ctx.tapes = []
-        images = _forward(vertices, attributes, background, poses, constant, ctx.tapes)
+        images = _forward(vertices, attributes, background, poses, harmonics, constant, ctx.tapes)
         # The core reads these arrays again: torch checks that nobody has changed them in place.
-        ctx.save_for_backward(vertices, attributes, background, poses, images[1])
+        ctx.save_for_backward(vertices, attributes, background, poses, harmonics, images[1])
         ctx.set_materialize_grads(False)
         return images
 
@@ -169,34 +178,38 @@ class _Rasterize(torch.autograd.Function):
         grad_alpha: torch.Tensor | None,
         grad_extra: torch.Tensor | None,
     ) -> tuple[torch.Tensor | None, ...]:
-        vertices, attributes, background, poses, alpha = ctx.saved_tensors
+        vertices, attributes, background, poses, harmonics, alpha = ctx.saved_tensors
         needs = ctx.needs_input_grad
         if grad_color is None:
             grad_color = torch.zeros(*alpha.shape, 3)
         of_images = [None if part is None else _array(part) for part in (grad_color, grad_alpha, grad_extra)]
-        grad_vertices = grad_attributes = grad_poses = grad_background = None
-        if needs[0] or needs[1] or needs[3]:
+        grad_vertices = grad_attributes = grad_poses = grad_background = grad_harmonics = None
+        if needs[0] or needs[1] or needs[3] or needs[4]:
             width = attributes.shape[1] - 4
             points = np.zeros(vertices.shape, np.float32)
             colors = np.zeros((len(vertices), 4), np.float32)
             more = np.zeros((len(vertices), width), np.float32)
+            shades = np.zeros(harmonics.shape, np.float32) if needs[4] else None
             by_pose = []
             for i, rendering in enumerate(ctx.tapes):
                 of_image = [None if part is None else part[i] for part in of_images]
                 own = np.zeros_like(points) if needs[3] else points
-                rendering.backward(*of_image, vertices=own, colors=colors, vertex_attributes=more)
+                rendering.backward(
+                    *of_image, vertices=own, colors=colors, vertex_attributes=more, harmonics=shades
+                )
                 if needs[3]:
                     by_pose.append(_pose_gradient(vertices, poses[i], own))
                     points += own
             if needs[3]:
                 grad_poses = torch.from_numpy(np.stack(by_pose)).to(poses)
+            grad_harmonics = None if shades is None else torch.from_numpy(shades)
             grad_vertices = torch.from_numpy(points)
             grad_attributes = torch.from_numpy(np.concatenate([colors, more], axis=1) if width else colors)
         if needs[2]:
             grad_background = grad_color * (1 - alpha)[..., None]
             if background.ndim < 4:
                 grad_background = grad_background.sum(dim=0 if background.ndim == 3 else (0, 1, 2))
-        return grad_vertices, grad_attributes, grad_background, grad_poses, None
+        return grad_vertices, grad_attributes, grad_background, grad_poses, grad_harmonics, None
 
 
 def _pose_gradient(vertices: torch.Tensor, pose: torch.Tensor, gradients: np.ndarray) -> np.ndarray:
@@ -228,6 +241,21 @@ def _check(name: str, tensor: torch.Tensor, shape: str, fits: Callable[[torch.Si
             f"{name} must be {shape} float32 on the CPU, got {tuple(tensor.shape)} {tensor.dtype} on"
             f" {tensor.device}"
         )
+
+
+def _check_harmonics(harmonics: torch.Tensor, splats: FaceSplats) -> None:
+    if splats.face_splat is None:
+        raise ValueError("harmonics are of splats: give face_splat, too")
+    _check(
+        "harmonics",
+        harmonics,
+        f"({len(splats)}, 3, 8 or 15, 3)",
+        lambda shape: (
+            len(shape) == 3 and shape[0] == len(splats) and shape[1] in (3, 8, 15) and shape[2] == 3
+        ),
+    )
+    if splats.share_vertices:
+        raise ValueError("harmonics are of splats, but two splats share a vertex: give each its own")
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:
