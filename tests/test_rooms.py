@@ -16,7 +16,7 @@ LOWEST = (
 )
 """Rooms that import no other room."""
 FLOORS = (
-    ("_json", "binding", "camera", "cluster", "draw_order", "gaussians"),
+    ("_json", "binding", "camera", "cluster", "draw_order", "gaussians", "mesh_joining"),
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),

@@ -9,10 +9,11 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, chosen_rows, joined_rows
-from meshsplats._origin import in_words, relative, shared_origin, zero_origin
+from meshsplats._arrays import checked_array, chosen_rows
+from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
+from meshsplats.mesh_joining import joined_meshes
 from meshsplats.order import Order, checked_order
 from meshsplats.spherical_harmonics import turned_harmonics
 
@@ -76,10 +77,13 @@ class SplatMesh:
     """(f,) int32: triangles with the same value >= 0 are coplanar layers that share one depth, that of their
     common plane, and are ordered by face index; -1 keeps a triangle's own depth."""
     harmonics: np.ndarray | None = None
-    """(s, k, 3) float32 spherical harmonics of each splat, which make its colour depend on the view: k is 3, 8
-    or 15, for degree 1, 2 or 3. Row i belongs to splat i of ``splats``, whose vertices have the colour
+    """(s, k, 3) float32 spherical harmonics of each splat, which make its colour depend on the view: k is 3,
+    8 or 15, for degree 1, 2 or 3. Row i belongs to splat i of ``splats``, whose vertices have the colour
     ``max(0, colors[:, :3] + sh_basis(d, degree)[:, 1:] @ harmonics[i])`` along the direction d from the
     camera. None: colours are the same from everywhere."""
+    plain_colors: np.ndarray | None = None
+    """(v, 3) float32 RGB in [0, 1] for programs that draw no harmonics: the mean of what views show. None:
+    ``colors``."""
     up: np.ndarray = field(default_factory=lambda: np.array([0, -1, 0], np.float32))
     """(3,) float32 direction that points up in the world frame, normalised by the constructor; splats trained
     from COLMAP cameras have y down."""
@@ -107,6 +111,7 @@ class SplatMesh:
         ArrayField("face_splat", np.int32, "face", optional=True),
         ArrayField("depth_group", np.int32, "face", optional=True),
         ArrayField("harmonics", np.float32, "splat", (None, 3), optional=True),
+        ArrayField("plain_colors", np.float32, "vertex", 3, optional=True),
     )
     EXTRAS: ClassVar[tuple[ArrayField, ...]] = tuple(f for f in FIELDS if f.optional and f.name != "normals")
     """The optional arrays that formats of other programs have no place for. Those of vertices and splats are
@@ -126,6 +131,9 @@ class SplatMesh:
             raise ValueError(f"opacities, the last column of colors, must lie in [0, 1], got {opacity:.4g}")
         if self.harmonics is not None:
             self._check_harmonics(self.harmonics)
+        plain = self.plain_colors
+        if plain is not None and v and (plain.min() < 0 or plain.max() > 1):
+            raise ValueError(f"plain_colors must lie in [0, 1], got {plain.min():.4g} to {plain.max():.4g}")
 
         def set_(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
@@ -174,8 +182,8 @@ class SplatMesh:
             )
         if self.splats.share_vertices:
             raise ValueError(
-                "harmonics are of splats, but two splats share a vertex: give every splat its own vertices, or"
-                " harmonics=None"
+                "harmonics are of splats, but two splats share a vertex: give every splat its own vertices,"
+                " or harmonics=None"
             )
 
     def __repr__(self) -> str:
@@ -263,15 +271,26 @@ class SplatMesh:
         return 0 if self.harmonics is None else int((self.harmonics.shape[1] + 1) ** 0.5) - 1
 
     def of_degree(self, degree: int) -> SplatMesh:
-        """The mesh with its harmonics up to ``degree``, 0 to 3. Without any, colours are limited to 1, as those
-        of splats are."""
+        """The mesh with its harmonics up to ``degree``, 0 to 3. Without any, colours are limited to 1, as
+        those of splats are."""
         if not 0 <= degree <= 3:
             raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
         if self.harmonics is None or degree >= self.sh_degree:
             return self
         if degree:
             return replace(self, harmonics=self.harmonics[:, : (degree + 1) ** 2 - 1])
-        return replace(self, harmonics=None, colors=np.minimum(self.colors, 1))
+        return replace(self, harmonics=None, plain_colors=None, colors=np.minimum(self.colors, 1))
+
+    @property
+    def plain(self) -> SplatMesh:
+        """The mesh as programs that draw no harmonics should show it: with ``plain_colors`` and opacities, in
+        [0, 1]."""
+        if self.harmonics is None and self.plain_colors is None:
+            bright = len(self.colors) and self.colors.max() > 1
+            return replace(self, colors=np.minimum(self.colors, 1)) if bright else self
+        rgb = self.colors[:, :3] if self.plain_colors is None else self.plain_colors
+        colors = np.concatenate([np.minimum(rgb, 1), self.colors[:, 3:]], axis=1)
+        return replace(self, colors=colors, harmonics=None, plain_colors=None)
 
     @property
     def splats(self) -> FaceSplats:
@@ -354,60 +373,7 @@ class SplatMesh:
         Raises ValueError, which names the part, where they do not agree, for bases that differ, and for more
         vertices or triangles than int32 can number.
         """
-        if not parts:
-            raise ValueError("there must be at least one mesh to join")
-        for number, part in enumerate(parts[1:], 1):
-            parts[0].check_alike(part, f"parts[{number}]")
-        origin = shared_origin(part.origin for part in parts)
-        parts = [part.relative_to(origin) for part in parts]
-        first = parts[0]
-        prefix = "attribute."
-        arrays: dict[str, Any] = joined_rows(
-            [
-                {f.name: value for f in first.FIELDS if (value := getattr(part, f.name)) is not None}
-                | {prefix + name: value for name, value in part.attributes.items()}
-                for part in parts
-            ]
-        )
-        arrays["up"] = first.up
-        if any(part.depth_group is not None for part in parts):
-            arrays["depth_group"] = _joined_groups(parts)
-        if first.face_splat is not None and not same_splats:
-            count = np.cumsum([0, *(part.splat_count or 0 for part in parts)])
-            owners = [part.splats.of_face + start for part, start in zip(parts, count, strict=False)]
-            arrays["face_splat"] = np.concatenate(owners)
-        elif first.face_splat is not None:
-            numbers = np.concatenate([part.splats.numbers for part in parts])
-            order = np.argsort(arrays["face_splat"], kind="stable")
-            rows = {"face": order, "splat": np.unique(numbers, return_index=True)[1]}
-            for f in first.FIELDS:
-                if f.per in rows and f.name in arrays:
-                    arrays[f.name] = arrays[f.name][rows[f.per]]
-        attributes = {name: arrays.pop(prefix + name) for name in first.attributes}
-        bindings = [part.binding for part in parts[1:] if part.binding is not None]
-        binding = None if first.binding is None else first.binding.joined(bindings)
-        return replace(first, **arrays, attributes=attributes, binding=binding)
-
-    def check_alike(self, other: SplatMesh, name: str) -> None:
-        """Raises ValueError, which names the ``other`` mesh, unless both can be joined; bases may differ."""
-        for what in ("blending", "filter_px2", "order"):
-            if (own := getattr(self, what)) != (theirs := getattr(other, what)):
-                raise ValueError(
-                    f"meshes to be joined must have the same {what}: {own!r} first, {theirs!r} in {name}"
-                )
-        if np.abs(self.up - other.up).max() > 1e-6:
-            raise ValueError(
-                f"meshes to be joined must have the same up: {self.up.tolist()} first, {other.up.tolist()} in"
-                f" {name}; turn one, or give it the other's with replace(mesh, up=...)"
-            )
-        one, two = ({part: tuple(shape) for part, shape in m._optional().items()} for m in (self, other))
-        for part in sorted(one.keys() | two.keys()):
-            if one.get(part) != two.get(part):
-                raise ValueError(
-                    f"meshes to be joined must have the same arrays: {part} is {_in_words(one.get(part))}"
-                    f" first, {_in_words(two.get(part))} in {name}; add it, or take it out, by"
-                    " replace(mesh, ...)"
-                )
+        return joined_meshes(parts, same_splats=same_splats)
 
     def moved(
         self, vertices: np.ndarray, *, normals: np.ndarray | None = None, binding: Binding | None = None
@@ -447,33 +413,10 @@ class SplatMesh:
         kept = length <= 1e-6 * wanted
         return np.where(kept, normals, sums * (wanted / np.where(kept, 1, length))).astype(np.float32)
 
-    def _optional(self) -> dict[str, tuple[int, ...]]:
-        """The optional arrays but ``depth_group``, attributes and binding: the shape of a row by name."""
-        found = {f.name: getattr(self, f.name) for f in self.FIELDS if f.optional and f.name != "depth_group"}
-        found |= {f"attribute {name!r}": value for name, value in self.attributes.items()}
-        shapes = {name: value.shape[1:] for name, value in found.items() if value is not None}
-        return shapes if self.binding is None else shapes | {"binding": ()}
-
     def prune(self, min_opacity: float) -> SplatMesh:
         """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the
         vertices that no triangle then uses."""
         return self.take((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
-
-
-def _joined_groups(parts: Sequence[SplatMesh]) -> np.ndarray:
-    """(f,) int64 depth groups of all parts, those of each behind those of the parts before."""
-    groups, first = [], 0
-    for part in parts:
-        own = np.full(len(part.faces), -1) if part.depth_group is None else part.depth_group.astype(np.int64)
-        groups.append(np.where(own < 0, own, own + first))
-        first += int(own.max(initial=-1)) + 1
-    return np.concatenate(groups)
-
-
-def _in_words(row: tuple[int, ...] | None) -> str:
-    if row is None:
-        return "missing"
-    return f"{row[0]} numbers wide" if row else "there"
 
 
 def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:

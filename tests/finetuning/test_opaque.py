@@ -19,13 +19,14 @@ from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config, starting_mesh
 from meshsplats.finetuning.clock import Clock
 from meshsplats.finetuning.config import learning_rates
+from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.hybrid import COLOR_SLOPE, ColorLimits, softness, with_soft_splats
 from meshsplats.finetuning.opaque import expected_error, visible_samples
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.cutting import Cutting
 from meshsplats.finetuning.phases.hybrid import Hybrid
 from meshsplats.finetuning.phases.phase import Moment
-from meshsplats.finetuning.state import Gradients, State
+from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh, solid_faces

@@ -21,9 +21,10 @@ from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.checkpoint import OtherRunError
+from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.run import TrainingLoop, run_start
-from meshsplats.finetuning.state import Gradients, State
+from meshsplats.finetuning.state import State
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh

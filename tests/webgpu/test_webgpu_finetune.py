@@ -17,9 +17,10 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DeviceError, DivergenceError, FileFormatError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
+from meshsplats.finetuning.gradients import Rates, StepImage
 from meshsplats.finetuning.loss import DefaultLoss, LossRates
 from meshsplats.finetuning.phases.blended import Blended
-from meshsplats.finetuning.state import Rates, State, StepImage
+from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step, view_of_step
 from meshsplats.prior import bind
 from meshsplats.rendering.backward import TapeOptions

@@ -173,8 +173,8 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str, order: str) -> Spl
 
 
 def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
-    """Hash of the positions, triangles, colours, harmonics, binding, blending, filter and order of ``mesh``, and of the
-    mask of its ``frozen`` vertices."""
+    """Hash of the positions, triangles, colours, harmonics, binding, blending, filter and order of ``mesh``,
+    and of the mask of its ``frozen`` vertices."""
     digest = hashlib.sha256(mesh.blending.encode())
     if mesh.filter_px2:
         digest.update(repr(mesh.filter_px2).encode())

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig, epsilons
+from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.loss import LossRates
 from meshsplats.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
@@ -32,44 +32,6 @@ GAIN, OFFSET = slice(0, 3), slice(3, 6)
 
 MAX_OPACITY = np.float32(254 / 255)
 """Greatest opacity of a corner of blended triangles beside opaque ones, so that they differ."""
-
-
-class Rates(NamedTuple):
-    """Learning rates of a step."""
-
-    colors: float
-    positions: float
-    """0: positions are fixed."""
-
-
-class StepImage(NamedTuple):
-    """The image of a whole step, and what it is compared with."""
-
-    camera: Camera
-    options: TapeOptions
-    target: np.ndarray
-    """(h, w, 3) float32 RGB."""
-    mask: np.ndarray | None
-    """(h, w) bool, True where pixels count; None: all do."""
-
-
-class Gradients(NamedTuple):
-    """Gradients of the loss of one image; float32, C-contiguous."""
-
-    vertices: np.ndarray
-    """(v, 3)."""
-    colors: np.ndarray
-    """(v, 4)."""
-    harmonics: np.ndarray | None = None
-    """(s, k, 3); None for a mesh without harmonics."""
-    exposure: np.ndarray | None = None
-    """(6,): gain and offset of this view's exposure; None if exposures are not fitted."""
-
-    def finite(self) -> bool:
-        """Whether all values are finite."""
-        # A sum of finite numbers may overflow, but such a run has diverged, too.
-        with np.errstate(over="ignore", invalid="ignore"):
-            return all(bool(np.isfinite(part.sum())) for part in self if part is not None)
 
 
 class State:

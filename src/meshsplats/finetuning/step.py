@@ -13,9 +13,10 @@ from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig
+from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
 from meshsplats.finetuning.loss import DefaultLoss, Loss, Target, loss_name, own_loss
 from meshsplats.finetuning.opaque import expected_error
-from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, Rates, State, StepImage
+from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapeOptions
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.engine import Need, Taped, WholeSteps

@@ -54,9 +54,9 @@ def rasterize(
     """The images that ``render`` gives, differentiable once.
 
     Gradients go to ``vertices``, ``attributes``, ``background``, ``world_to_camera`` and ``harmonics``. They
-    pass through blending and perspective-correct interpolation. The fragments of a sample and their order count as
-    constant, so an edge that passes over a sample has no gradient. An opacity of 1 is no exception: its
-    gradient takes account of the fragments behind it, at least six layers of them.
+    pass through blending and perspective-correct interpolation. The fragments of a sample and their order
+    count as constant, so an edge that passes over a sample has no gradient. An opacity of 1 is no exception:
+    its gradient takes account of the fragments behind it, at least six layers of them.
 
     The forward pass records a tape of at most ``tape_bytes`` for each image, about two bytes a fragment; the
     backward pass renders tiles that did not fit once more. Every result has the same bits in every run, with
@@ -75,8 +75,8 @@ def rasterize(
         background: (3,), (h, w, 3) or (b, h, w, 3) RGB.
         world_to_camera: (b, 4, 4), or (4, 4) for one camera: overrides that of the cameras, to optimise
             poses. The last row is not used.
-        harmonics: (s, k, 3) float32, as in ``SplatMesh``; needs ``face_splat``. The directions to the vertices
-            count as constant; where a colour is held at 0, only a gradient that raises it counts.
+        harmonics: (s, k, 3) float32, as in ``SplatMesh``; needs ``face_splat``. The directions to the
+            vertices count as constant; where a colour is held at 0, only a gradient that raises it counts.
         samples: side of the grid of samples in each pixel.
         face_splat, depth_group: (f,) int32, as in ``SplatMesh``.
         filter_px2: variance in square pixels of the filter for splats, as in ``render``. Gradients go through
@@ -98,7 +98,7 @@ def rasterize(
     if not isinstance(cameras, Camera):
         need_all(Camera, cameras=cameras)
     try:
-        from meshsplats.rendering.torch_operator import Scene, images_of
+        from meshsplats.rendering.torch_operator import Optional, Scene, images_of
     except ImportError as error:
         raise MissingDependencyError(f"rasterize needs torch; {GET_TORCH}") from error
 
@@ -119,8 +119,7 @@ def rasterize(
         vertices,
         attributes,
         background,
-        world_to_camera,
-        harmonics,
+        Optional(world_to_camera, harmonics),
         Scene(views, faces, face_splat, depth_group, filter_px2, order),
         TapeOptions(samples=samples, min_transmittance=min_transmittance),
         drawing,

@@ -46,7 +46,8 @@ class Shading:
 
         Raises ValueError for another number of splats than harmonics have rows.
         """
-        assert triangles.harmonics is not None and triangles.face_splat is not None
+        assert triangles.harmonics is not None
+        assert triangles.face_splat is not None
         self._triangles = triangles
         self.colors = np.empty_like(triangles.colors)
         count, terms, _ = triangles.harmonics.shape

@@ -38,6 +38,15 @@ class Scene(NamedTuple):
     order: Order
 
 
+class Optional(NamedTuple):
+    """Tensors that may be missing."""
+
+    poses: torch.Tensor | None
+    """(b, 4, 4), or (4, 4) of one camera; None for those of the cameras."""
+    harmonics: torch.Tensor | None
+    """(s, k, 3) of the splats."""
+
+
 _NOTHING = np.zeros((0, 0), np.float32)
 
 
@@ -54,8 +63,7 @@ def images_of(
     vertices: torch.Tensor,
     attributes: torch.Tensor,
     background: Sequence[float] | np.ndarray | torch.Tensor,
-    poses: torch.Tensor | None,
-    harmonics: torch.Tensor | None,
+    optional: Optional,
     scene: Scene,
     options: TapeOptions,
     engine: Engine,
@@ -64,12 +72,11 @@ def images_of(
     """The images of ``rasterize``.
 
     Args:
-        poses: (b, 4, 4), or (4, 4) of one camera; None for those of the cameras.
-        harmonics: (s, k, 3) of the splats, or None.
+        optional: further tensors that gradients may go to.
 
     Raises TypeError or ValueError for tensors that do not fit.
     """
-    views = scene.cameras
+    views, (poses, harmonics) = scene.cameras, optional
     _check("vertices", vertices, "(v, 3)", lambda shape: len(shape) == 2 and shape[1] == 3)
     _check(
         "attributes",

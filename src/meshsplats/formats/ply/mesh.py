@@ -40,6 +40,7 @@ from meshsplats.formats.ply.header import (
 )
 from meshsplats.formats.ply.table import POSITION, FloatTable
 from meshsplats.mesh import SplatMesh
+from meshsplats.mesh_joining import check_alike
 
 _ATTRIBUTE = "attribute_"
 _LOCAL = ("local_x", "local_y", "local_z")
@@ -78,7 +79,7 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
     ):
         for number, part in enumerate(parts):
             layout, empty = layout or _Layout(part), empty or part.take(slice(0))
-            empty.check_alike(part, f"parts[{number}]")
+            check_alike(empty, part, f"parts[{number}]")
             if number and (part.depth_group is not None or empty.depth_group is not None):
                 raise ValueError(
                     "depth groups of parts are not told apart: join them first, SplatMesh.joined"
@@ -179,7 +180,7 @@ def _tables(mesh: SplatMesh) -> dict[str, np.ndarray]:
     return extras | {_stored(name): values for name, values in mesh.attributes.items()}
 
 
-def _properties(name: str, columns: int | None) -> tuple[str, ...]:
+def _properties(name: str, columns: Any) -> tuple[str, ...]:
     """Names of the properties that hold an array of ``columns``, None for (v,)."""
     return (name,) if columns is None else tuple(f"{name}:{i}" for i in range(columns))
 

@@ -1,0 +1,98 @@
+"""Joining meshes: one mesh of several, and what they must have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from meshsplats._arrays import joined_rows
+from meshsplats._origin import shared_origin
+
+Mesh = TypeVar("Mesh", bound=Any)
+"""``SplatMesh``, which imports this module."""
+
+
+def joined_meshes(parts: Sequence[Mesh], *, same_splats: bool = False) -> Mesh:
+    """``SplatMesh.joined``."""
+    if not parts:
+        raise ValueError("there must be at least one mesh to join")
+    for number, part in enumerate(parts[1:], 1):
+        check_alike(parts[0], part, f"parts[{number}]")
+    origin = shared_origin(part.origin for part in parts)
+    parts = [part.relative_to(origin) for part in parts]
+    first = parts[0]
+    prefix = "attribute."
+    arrays: dict[str, Any] = joined_rows(
+        [
+            {f.name: value for f in first.FIELDS if (value := getattr(part, f.name)) is not None}
+            | {prefix + name: value for name, value in part.attributes.items()}
+            for part in parts
+        ]
+    )
+    arrays["up"] = first.up
+    if any(part.depth_group is not None for part in parts):
+        arrays["depth_group"] = _joined_groups(parts)
+    if first.face_splat is not None and not same_splats:
+        count = np.cumsum([0, *(part.splat_count or 0 for part in parts)])
+        owners = [part.splats.of_face + start for part, start in zip(parts, count, strict=False)]
+        arrays["face_splat"] = np.concatenate(owners)
+    elif first.face_splat is not None:
+        numbers = np.concatenate([part.splats.numbers for part in parts])
+        order = np.argsort(arrays["face_splat"], kind="stable")
+        rows = {"face": order, "splat": np.unique(numbers, return_index=True)[1]}
+        for f in first.FIELDS:
+            if f.per in rows and f.name in arrays:
+                arrays[f.name] = arrays[f.name][rows[f.per]]
+    attributes = {name: arrays.pop(prefix + name) for name in first.attributes}
+    bindings = [part.binding for part in parts[1:] if part.binding is not None]
+    binding = None if first.binding is None else first.binding.joined(bindings)
+    return replace(first, **arrays, attributes=attributes, binding=binding)
+
+
+def check_alike(mesh: Mesh, other: Mesh, name: str) -> None:
+    """Raises ValueError, which names the ``other`` mesh, unless both can be joined; bases may differ."""
+    for what in ("blending", "filter_px2", "order"):
+        if (own := getattr(mesh, what)) != (theirs := getattr(other, what)):
+            raise ValueError(
+                f"meshes to be joined must have the same {what}: {own!r} first, {theirs!r} in {name}"
+            )
+    if np.abs(mesh.up - other.up).max() > 1e-6:
+        raise ValueError(
+            f"meshes to be joined must have the same up: {mesh.up.tolist()} first, {other.up.tolist()} in"
+            f" {name}; turn one, or give it the other's with replace(mesh, up=...)"
+        )
+    one, two = ({part: tuple(shape) for part, shape in _optional(m).items()} for m in (mesh, other))
+    for part in sorted(one.keys() | two.keys()):
+        if one.get(part) != two.get(part):
+            raise ValueError(
+                f"meshes to be joined must have the same arrays: {part} is {_in_words(one.get(part))}"
+                f" first, {_in_words(two.get(part))} in {name}; add it, or take it out, by"
+                " replace(mesh, ...)"
+            )
+
+
+def _optional(mesh: Mesh) -> dict[str, tuple[int, ...]]:
+    """The optional arrays but ``depth_group``, attributes and binding: the shape of a row by name."""
+    found = {f.name: getattr(mesh, f.name) for f in mesh.FIELDS if f.optional and f.name != "depth_group"}
+    found |= {f"attribute {name!r}": value for name, value in mesh.attributes.items()}
+    shapes = {name: value.shape[1:] for name, value in found.items() if value is not None}
+    return shapes if mesh.binding is None else shapes | {"binding": ()}
+
+
+def _joined_groups(parts: Sequence[Mesh]) -> np.ndarray:
+    """(f,) int64 depth groups of all parts, those of each behind those of the parts before."""
+    groups, first = [], 0
+    for part in parts:
+        own = np.full(len(part.faces), -1) if part.depth_group is None else part.depth_group.astype(np.int64)
+        groups.append(np.where(own < 0, own, own + first))
+        first += int(own.max(initial=-1)) + 1
+    return np.concatenate(groups)
+
+
+def _in_words(row: tuple[int, ...] | None) -> str:
+    if row is None:
+        return "missing"
+    return f"{row[0]} numbers wide" if row else "there"
