@@ -205,9 +205,7 @@ def check_fields(owner: Any) -> dict[str, int]:
         value = getattr(owner, field.name)
         if value is not None or not field.optional:
             if field.per == "splat" and "splat" not in counts:
-                if owner.splat_count is None:
-                    raise ValueError(f"{field.name} has a row for each splat: give face_splat, too")
-                counts["splat"] = owner.splat_count
+                counts["splat"] = owner.count_splats(field.name)
             array = checked_array(field.name, value, field.dtype, field.shape(counts))
             object.__setattr__(owner, field.name, array)
             counts.setdefault(field.per, len(array))

@@ -114,3 +114,15 @@ class FaceSplats:
         v = vt.transpose(0, 2, 1)
         v[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
         return np.asarray(v @ u.transpose(0, 2, 1))
+
+    def turned(self, vectors: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+        """(v, 3) float32 ``vectors`` (v, 3) of vertices, turned as the triangles around each vertex turn by the
+        (s, 3, 3) ``rotations`` of their splats; of their lengths."""
+        corner, owner = self.faces.ravel(), np.repeat(self.of_face, 3)
+        turned = np.einsum("cij,cj->ci", rotations[owner], vectors[corner])
+        sums = np.stack([np.bincount(corner, column, len(vectors)) for column in turned.T], axis=1)
+        length = np.linalg.norm(sums, axis=1, keepdims=True)
+        wanted = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
+        # A vertex of no triangle keeps its vector, and one whose triangles turn against each other.
+        kept = length <= 1e-6 * wanted
+        return np.where(kept, vectors, sums * (wanted / np.where(kept, 1, length))).astype(np.float32)

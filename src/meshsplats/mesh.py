@@ -139,9 +139,8 @@ class SplatMesh:
             object.__setattr__(self, name, value)
 
         set_("origin", checked_array("origin", self.origin, np.float64, (3,)))
-        splat, group = self.face_splat, self.depth_group
-        if splat is not None and f and (splat[0] < 0 or (splat[1:] < splat[:-1]).any()):
-            raise ValueError("face_splat must be ascending indices >= 0")
+        self._check_ascending()
+        group = self.depth_group
         if group is not None and f and group.min() < -1:
             raise ValueError(f"depth_group must be >= 0, or -1 for none, got {group.min()}")
         length = float(np.linalg.norm(self.up))
@@ -169,6 +168,18 @@ class SplatMesh:
             face = self.binding.vertex_face[faces]
             if (face != face[:, :1]).any():
                 raise ValueError("all corners of a triangle must be bound to one face of the base")
+
+    def _check_ascending(self) -> None:
+        splat = self.face_splat
+        if splat is not None and len(splat) and (splat[0] < 0 or (splat[1:] < splat[:-1]).any()):
+            raise ValueError("face_splat must be ascending indices >= 0")
+
+    def count_splats(self, name: str) -> int:
+        """Count of splats, for the array ``name`` that has a row for each. ValueError without splats."""
+        if self.face_splat is None:
+            raise ValueError(f"{name} has a row for each splat: give face_splat, too")
+        self._check_ascending()
+        return len(self.splats)
 
     def _check_harmonics(self, harmonics: np.ndarray) -> None:
         if harmonics.shape[1] not in (3, 8, 15):
@@ -391,27 +402,14 @@ class SplatMesh:
         Raises ValueError for another number of vertices, or positions that are not finite.
         """
         vertices = checked_array("vertices", vertices, np.float32, (len(self.vertices), 3))
-        wanted = normals is None and self.normals is not None
         harmonics = self.harmonics
-        if wanted or harmonics is not None:
-            rotations = self.splats.rotations(self.vertices, vertices)
-            normals = self._turned_normals(rotations) if wanted else normals
+        old = self.normals if normals is None else None
+        if old is not None or harmonics is not None:
+            splats = self.splats
+            rotations = splats.rotations(self.vertices, vertices)
+            normals = normals if old is None else splats.turned(old, rotations)
             harmonics = None if harmonics is None else turned_harmonics(harmonics, rotations)
         return replace(self, vertices=vertices, normals=normals, harmonics=harmonics, binding=binding)
-
-    def _turned_normals(self, rotations: np.ndarray) -> np.ndarray:
-        """(v, 3) normals, turned as the triangles around each vertex turn by the (s, 3, 3) ``rotations`` of
-        their splats; of their lengths."""
-        assert self.normals is not None
-        normals = self.normals
-        corner, owner = self.faces.ravel(), np.repeat(self.splats.of_face, 3)
-        turned = np.einsum("cij,cj->ci", rotations[owner], normals[corner])
-        sums = np.stack([np.bincount(corner, column, len(normals)) for column in turned.T], axis=1)
-        length = np.linalg.norm(sums, axis=1, keepdims=True)
-        wanted = np.linalg.norm(normals.astype(np.float64), axis=1, keepdims=True)
-        # A vertex of no triangle keeps its normal, and one whose triangles turn against each other.
-        kept = length <= 1e-6 * wanted
-        return np.where(kept, normals, sums * (wanted / np.where(kept, 1, length))).astype(np.float32)
 
     def prune(self, min_opacity: float) -> SplatMesh:
         """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the
