@@ -116,8 +116,8 @@ class FaceSplats:
         return np.asarray(v @ u.transpose(0, 2, 1))
 
     def turned(self, vectors: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """(v, 3) float32 ``vectors`` (v, 3) of vertices, turned as the triangles around each vertex turn by the
-        (s, 3, 3) ``rotations`` of their splats; of their lengths."""
+        """(v, 3) float32 ``vectors`` (v, 3) of vertices, turned as the triangles around each vertex turn by
+        the (s, 3, 3) ``rotations`` of their splats; of their lengths."""
         corner, owner = self.faces.ravel(), np.repeat(self.of_face, 3)
         turned = np.einsum("cij,cj->ci", rotations[owner], vectors[corner])
         sums = np.stack([np.bincount(corner, column, len(vectors)) for column in turned.T], axis=1)
