@@ -50,6 +50,7 @@ def prepare(
     mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions, layers: int
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and facts, the fields of ``inside.scene.Subject``; ``layers`` as from ``count``."""
+    mesh = mesh.plain
     bounds = scene_bounds(mesh)
     up = mesh.up.astype(np.float64)
     facts = {
@@ -104,6 +105,7 @@ def lit_subject(
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Arrays and facts that a lit mesh has besides or instead of those of an unlit one, by the names of
     ``inside.scene.Subject``. A mesh prior, whose shape changes, has no stand-in."""
+    mesh = mesh.plain
     lit, self_shadow = lit_arrays(mesh, cameras, threads=threads)
     arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
     if mesh.binding is None:

@@ -282,7 +282,7 @@ class _Tuning:
         """``part`` of ``every`` splats, merged."""
         share = min(1.0, FAR_SHARE * self.options.splats / every)
         count = max(1, round(share * len(part)))
-        return simplify(part.of_degree(0), count, low_pass=0.0, threads=self.run.threads)
+        return simplify(part, count, low_pass=0.0, threads=self.run.threads)
 
     def tune(self, task: tuple[int, tuple[int, ...]]) -> int:
         """Writes the tuned mesh of a cell after those ``before``; the count of its steps."""

@@ -14,6 +14,10 @@ VERTEX_BYTES = 7 * 4 * 6 + 4
 written, and the size of the splat."""
 BOUND_BYTES = 36 + 12 * 4
 """Additionally per vertex bound to a base mesh: corners, weights and their copies."""
+SHADED_BYTES = 2 * 16
+"""Additionally per vertex whose colour depends on the view: its colour there, and the gradient."""
+HARMONIC_BYTES = 4 * 6
+"""Per coefficient of the harmonics of splats: gradient, two moments and copies, as for vertices."""
 FILTER_BYTES = 2 * 24 + 4 + 4 + 12
 """Additionally per vertex drawn with the low-pass filter: positions before and after, splat, and gradient."""
 FACE_BYTES = 12 + 4 + 4 + 64
@@ -34,7 +38,11 @@ def estimate_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_
     vertex = BOUND_BYTES if mesh.binding is not None else 0
     vertex += FILTER_BYTES if mesh.filter_px2 else 0
     count = len(mesh.vertices)
-    return estimate_bytes(count, len(mesh.faces), dataset, cache_bytes) + count * vertex
+    harmonics = 0
+    if mesh.harmonics is not None:
+        vertex += SHADED_BYTES
+        harmonics = mesh.harmonics.size * HARMONIC_BYTES
+    return estimate_bytes(count, len(mesh.faces), dataset, cache_bytes) + count * vertex + harmonics
 
 
 def estimate_bytes(vertices: int, faces: int, dataset: Dataset, cache_bytes: int) -> int:

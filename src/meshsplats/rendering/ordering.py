@@ -209,7 +209,7 @@ def solve(
     counts = np.bincount(pieces.of_face, minlength=len(pieces.splat))
     record = kernels.Pieces(
         mesh.vertices,
-        mesh.colors,
+        mesh.plain.colors,
         np.ascontiguousarray(mesh.faces[order]),
         np.ascontiguousarray(pieces.turned[order]),
         np.concatenate([[0], np.cumsum(counts)]),

@@ -96,7 +96,7 @@ def _checked_backdrop(
 
 
 def _display_colors(mesh: SplatMesh) -> np.ndarray:
-    colors = mesh.colors
+    colors = mesh.plain.colors
     if mesh.blending == "linear":
         colors = np.concatenate([linear_to_srgb(colors[:, :3]), colors[:, 3:]], axis=1)
     return np.ascontiguousarray(colors, np.float32)

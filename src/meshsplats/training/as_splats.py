@@ -15,7 +15,7 @@ THICKNESS = 0.02
 
 
 def splats_of_fans(mesh: SplatMesh) -> GaussianCloud:
-    """Splats of degree 0 with the place, extent, colour and opacity of the fans of ``mesh``.
+    """Splats with the place, extent, colour and opacity of the fans of ``mesh``.
 
     A fan of s sides around a splat with covariance C has a rim with sum_j (r_j - c) (r_j - c)^T = s / 2 R^2
     C, where R is the radius of the rim in standard deviations; C is found from that of the rim. Positions and
@@ -42,6 +42,8 @@ def splats_of_fans(mesh: SplatMesh) -> GaussianCloud:
     rgb = (colors[:, 0, :3] + colors[:, 1:, :3].mean(axis=1)) / 2
     opacity = np.clip(colors[:, 0, 3] / profile.opacities[0], 0, 1)
     sh = (rgb[:, None] - 0.5) / SH_C0
+    if mesh.harmonics is not None:
+        sh = np.concatenate([sh, mesh.harmonics], axis=1)
     return GaussianCloud(middle, quaternions_of(axes), sigma, opacity, sh, origin=mesh.origin)
 
 

@@ -41,6 +41,8 @@ class TrainConfig(FinetuneConfig):
     """Largest number of fans."""
     start_splats: Annotated[int, Range(1, 10**7)] = 40_000
     """About the number of fans at the start, at most max_splats."""
+    sh_degree: Annotated[int, Range(0, 3)] = 2
+    """Degree of the spherical harmonics by which the colour of a fan depends on the view. 0: it does not."""
     sides: Annotated[int, Range(3, 16)] = 6
     """Triangles of a fan."""
     shape_decay: Annotated[float, Range(0, 1), Advanced] = 0.5

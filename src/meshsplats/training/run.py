@@ -18,7 +18,7 @@ from meshsplats.datasets.views import Dataset, ImageCache
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal
-from meshsplats.finetuning.memory import check_bytes, estimate_bytes
+from meshsplats.finetuning.memory import HARMONIC_BYTES, SHADED_BYTES, check_bytes, estimate_bytes
 from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
@@ -120,7 +120,11 @@ def train(
 def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
     """Estimated peak memory in bytes of a process that trains. MemoryError if there is less."""
     fans = max(config.max_splats, config.start_splats)
-    needed = estimate_bytes(fans * (1 + config.sides), fans * config.sides, dataset, cache_bytes)
+    vertices = fans * (1 + config.sides)
+    needed = estimate_bytes(vertices, fans * config.sides, dataset, cache_bytes)
+    if config.sh_degree:
+        coefficients = 3 * ((config.sh_degree + 1) ** 2 - 1)
+        needed += vertices * SHADED_BYTES + fans * coefficients * HARMONIC_BYTES
     views, store = dataset.train, ImageCache(0)
     reduced = [*reduced_views(views, 0.25, store), *reduced_views(views, 0.5, store)]
     needed += min(sum(view.source.nbytes for view in reduced), cache_bytes // REDUCED_PART)
@@ -145,7 +149,10 @@ def starting_fans(
     chosen = np.linspace(0, count - 1, min(count, config.max_splats)).astype(int)
     mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
     up = guess_up(cameras=[view.camera for view in views])
-    mesh = replace(mesh, up=up, origin=dataset.origin)
+    harmonics = None
+    if config.sh_degree:
+        harmonics = np.zeros((len(chosen), (config.sh_degree + 1) ** 2 - 1, 3), np.float32)
+    mesh = replace(mesh, up=up, origin=dataset.origin, harmonics=harmonics)
     if shell is None:
         return colored(mesh, views, threads)
     in_shell = np.repeat(chosen >= count - len(shell.points), 1 + config.sides)

@@ -92,6 +92,7 @@ def make_page(
     need_all(Camera, cameras=cameras)
     need(PageOptions, options=options, optional=True)
     options = options or PageOptions()
+    mesh, coarse = mesh.plain, None if coarse is None else coarse.plain
     packed = quantise_mesh(mesh)
     views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
