@@ -87,6 +87,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
             {"cloud": "cloud", "cameras": "optional cameras", "options": "options"},
         ),
         ("cut_mesh", {"mesh": MESH}, {"mesh": "mesh"}),
+        (
+            "plain_colors_of",
+            {"mesh": MESH, "cameras": CAMERAS},
+            {"mesh": "mesh", "cameras": "cameras"},
+        ),
         ("gaussians_to_tensors", {}, {"cloud": "cloud"}),
         ("dome", {"scene": CLOUD}, {"scene": "scene"}),
         ("orbit", {"scene": CLOUD}, {"scene": "scene"}),

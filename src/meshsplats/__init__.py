@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.ordering import drawing_order
+    from meshsplats.rendering.plain_colors import plain_colors_of
     from meshsplats.rendering.samples import needed_samples
     from meshsplats.tiles.building import build_tiles
     from meshsplats.tiles.drawing import render_tiles, tiles_mesh
@@ -102,6 +103,7 @@ _HOME = {
     "meshsplats.rendering": ("Rendering", "render", "render_splats"),
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.ordering": ("drawing_order",),
+    "meshsplats.rendering.plain_colors": ("plain_colors_of",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
     "meshsplats.tiles.building": ("build_tiles",),
@@ -173,6 +175,7 @@ __all__ = [
     "needed_samples",
     "open_workers",
     "orbit",
+    "plain_colors_of",
     "psnr",
     "rasterize",
     "render",

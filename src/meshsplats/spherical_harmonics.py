@@ -7,6 +7,9 @@ import numpy as np
 ODD_AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 """Axes with whose sign each harmonic, a polynomial of degree up to 3, changes its own."""
 
+TERMS = (3, 8, 15)
+"""Counts of harmonics of degree 1, 2 and 3, without the constant one."""
+
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """(n, (degree + 1)^2) values at unit ``directions`` (n, 3), camera to splat, in the input's float type.

@@ -10,8 +10,19 @@ import pytest
 from _rendering import assert_close, camera, splats
 from test_fan_filter import covariance, fans
 
-from meshsplats import DataWarning, SplatMesh, bake_filter, convert, load_mesh, orbit, render, save_mesh
+from meshsplats import (
+    DataWarning,
+    SplatMesh,
+    bake_filter,
+    convert,
+    load_mesh,
+    orbit,
+    plain_colors_of,
+    render,
+    save_mesh,
+)
 from meshsplats.cli import main
+from meshsplats.demo_scene import make_scene
 
 
 def one_splat(mode: str, quaternion=(1, 0, 0, 0), **options) -> SplatMesh:
@@ -130,3 +141,28 @@ def test_blender_gets_it_baked(tmp_path, monkeypatch):
     np.testing.assert_array_equal(jobs[0][0][0]["vertices"], bake_filter(mesh, [view]).vertices)
     with pytest.warns(DataWarning, match="bake_filter"):
         save_mesh(mesh, tmp_path / "m.glb")
+
+
+def test_command_for_colours(tmp_path, capsys):
+    mesh = convert(make_scene(800), footprint="filter")
+    save_mesh(mesh, tmp_path / "m.npz")
+    views = ["--orbit", "2", "--width", "50"]
+    assert main(["bake", str(tmp_path / "m.npz"), "-o", str(tmp_path / "b.npz"), "--colors", *views]) == 0
+    assert "a filter of 0.3 px^2 and colours of degree 3" in capsys.readouterr().out
+    baked = load_mesh(tmp_path / "b.npz")
+    assert (baked.harmonics, baked.plain_colors, baked.filter_px2) == (None, None, 0)
+    np.testing.assert_array_equal(
+        baked.colors[:, :3], plain_colors_of(mesh, orbit(mesh, 2, width=50, height=50))
+    )
+    again = ["bake", str(tmp_path / "b.npz"), "-o", str(tmp_path / "c.npz")]
+    assert main([*again, "--colors"]) == 1
+    assert "leave out --colors" in capsys.readouterr().err
+    # Without the option colours stay as they are, and are all there is to bake without a filter.
+    assert main(["bake", str(tmp_path / "m.npz"), "-o", str(tmp_path / "c.npz"), *views]) == 0
+    np.testing.assert_array_equal(load_mesh(tmp_path / "c.npz").harmonics, mesh.harmonics)
+    assert main(["bake", str(tmp_path / "c.npz"), "-o", str(tmp_path / "d.npz"), *views]) == 1
+    assert "--colors bakes its colours" in capsys.readouterr().err
+    assert main(["bake", str(tmp_path / "c.npz"), "-o", str(tmp_path / "d.npz"), "--colors", *views]) == 0
+    np.testing.assert_array_equal(
+        load_mesh(tmp_path / "d.npz").vertices, load_mesh(tmp_path / "c.npz").vertices
+    )

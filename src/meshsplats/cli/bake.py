@@ -1,10 +1,10 @@
-"""``meshsplats bake``: the low-pass filter of a mesh, for programs that have none."""
+"""``meshsplats bake``: what other programs do not have, filter and colours of views, as part of a mesh."""
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import tyro
@@ -26,15 +26,15 @@ from meshsplats.formats.outputs import check_outputs
 @dataclass(frozen=True)
 class Bake(Command):
     """Applies the low-pass filter of a mesh to its triangles, for viewers, engines and Blender, which have no
-    such filter.
+    such filter; with --colors, also gives each vertex one colour instead of one for each view.
 
-    'convert --set footprint=filter' makes such meshes. The result is right for these views and this image
-    size; nearer it is soft, farther away thin.
+    'convert --set footprint=filter' makes meshes with a filter. The result is right for these views and this
+    image size; nearer it is soft, farther away thin.
     """
 
     COMMON = (
         *("input", "output", "orbit", "cameras", "data"),
-        *("distance", "width", "filter_px2", "json", "force"),
+        *("distance", "width", "colors", "filter_px2", "json", "force"),
     )
 
     input: tyro.conf.Positional[Path]
@@ -42,6 +42,9 @@ class Bake(Command):
     output: Output
     """The mesh to write: .glb, .usdc, .ply, .npz, .obj."""
     views: ViewOptions = field(default_factory=ViewOptions)
+    colors: bool = False
+    """Replace colours that depend on the view by their mean over these views, for programs that show them the
+    same from everywhere."""
     filter_px2: Number = None
     """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""
     origin: Origin = "keep"
@@ -55,6 +58,7 @@ class Bake(Command):
         from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
         from meshsplats.evaluation.viewers import alpha_for_viewers
         from meshsplats.formats.meshes import load_mesh, save_mesh
+        from meshsplats.rendering.plain_colors import plain_colors_of
 
         start = time.perf_counter()
         check_mesh_suffix(self.output)
@@ -62,11 +66,18 @@ class Bake(Command):
         check_outputs([self.output], self.force, inputs=[self.input])
         mesh = load_mesh(self.input)
         px2 = mesh.filter_px2 if self.filter_px2 is None else self.filter_px2
-        if px2 == 0:
+        degree = mesh.sh_degree if self.colors else 0
+        if self.colors and not degree:
+            raise ValueError(f"{self.input}: its colours are the same from everywhere: leave out --colors")
+        if not (px2 or degree):
+            more = "; --colors bakes its colours" if mesh.sh_degree else ""
             raise ValueError(
                 f"{self.input}: the mesh has no filter, there is nothing to bake; --filter-px2 gives it one"
+                + more
             )
         cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
+        if degree:  # with the filter, which shows how much of each vertex a view sees
+            mesh = replace(mesh, plain_colors=plain_colors_of(mesh, cameras)).plain
         baked = bake_filter(mesh, cameras, filter_px2=px2)
         save_mesh(written(baked, self.origin), self.output, **alpha_for_viewers(baked, self.output))
         seconds = time.perf_counter() - start
@@ -75,11 +86,15 @@ class Bake(Command):
                 "mesh": str(self.output),
                 "triangles": len(baked.faces),
                 "filter_px2": px2,
+                "colors_of_degree": degree,
                 "views": len(cameras),
                 "seconds": round(seconds, 3),
             }
             print(json.dumps(result, indent=1))
             return
         views = f"{plural(len(cameras), 'view')} of {cameras[0].width} x {cameras[0].height}"
-        print(f"{self.output} ({plural(len(baked.faces), 'triangle')}, {size_of(self.output)}): a filter of")
-        print(f"{px2:g} px^2 for {views}, in {seconds:.1f} s")
+        what = " and ".join(
+            [f"a filter of {px2:g} px^2"] * (px2 > 0) + [f"colours of degree {degree}"] * (degree > 0)
+        )
+        print(f"{self.output} ({plural(len(baked.faces), 'triangle')}, {size_of(self.output)}):")
+        print(f"{what} for {views}, in {seconds:.1f} s")

@@ -80,12 +80,12 @@ def warn_of_lost_detail(sample: np.ndarray, where: object) -> None:
         warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 
-def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
-    """(v, 4) float32 RGBA in [0, 1] from stored colours (v, 4), (v, 3) or (v, 0).
+def straight_colors(colors: np.ndarray, path: Path, brightest: float = 1) -> np.ndarray:
+    """(v, 4) float32 RGBA from stored colours (v, 4), (v, 3) or (v, 0): RGB in [0, ``brightest``], opacity in
+    [0, 1].
 
-    Integers are divided by the largest value of their type, a missing alpha becomes 1, float values
-    beyond [0, 1] are clipped with a counted DataWarning. Without colours the mesh is mid grey, with a
-    DataWarning.
+    Integers are divided by the largest value of their type, a missing alpha becomes 1, float values out of
+    range are clipped with a counted DataWarning. Without colours the mesh is mid grey, with a DataWarning.
     """
     result = np.ones((len(colors), 4), np.float32)
     if colors.shape[1] == 0:
@@ -100,17 +100,18 @@ def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
         raise FileFormatError(f"{path}: colours must be floats or unsigned integers, got {colors.dtype}")
     with np.errstate(over="ignore"):
         result[:, : colors.shape[1]] = colors
-    low, high = (result.min(), result.max()) if result.size else (0, 1)
+    most = np.float32([brightest, brightest, brightest, 1])
     # Values that are not finite are left to the check of SplatMesh, which names their row.
-    if (low < 0 or high > 1) and np.isfinite(result).all():
-        if low < -1e-6 or high > 1 + 1e-6:  # a rounding error needs no warning
-            outside = int(((result < 0) | (result > 1)).any(axis=1).sum())
+    if ((result < 0) | (result > most)).any() and np.isfinite(result).all():
+        # A rounding error needs no warning.
+        outside = int(((result < -1e-6) | (result > most + np.float32(1e-6))).any(axis=1).sum())
+        if outside:
             warnings.warn(
-                f"{path}: {outside:,} vertex colours lay outside [0, 1] and were clipped",
+                f"{path}: {outside:,} vertex colours lay outside [0, {brightest:g}] and were clipped",
                 DataWarning,
                 stacklevel=2,
             )
-        np.clip(result, 0, 1, out=result)
+        np.clip(result, 0, most, out=result)
     return result
 
 

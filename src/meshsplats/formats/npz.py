@@ -1,12 +1,13 @@
 """Meshes as `.npz`: NumPy arrays in a zip archive, nothing lost and nothing pickled.
 
 Arrays: ``vertices`` (v, 3) float32, ``faces`` (f, 3) int32, ``vertex_colors`` (v, 4) float32 straight RGBA;
-where the mesh has them ``normals``, ``face_splat``, ``depth_group`` and one ``attribute_NAME`` for each
-attribute; ``up`` (3,), ``blending`` (a text) and, if they are not 0, ``filter_px2`` and the float64
-``origin`` (3,) that positions are relative to; ``order`` (a text), if it is that by the splat; for a mesh
-prior its ``binding_base_vertices`` (n, 3), ``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,),
-``binding_weights`` (v, 3), ``binding_layers`` (v,) and ``binding_lift``, as ``Binding`` names them. The first
-three names are those of the published MeshSplats code, whose files are read as well.
+where the mesh has them ``normals``, ``face_splat``, ``depth_group``, ``harmonics`` (s, k, 3),
+``plain_colors`` (v, 3) and one ``attribute_NAME`` for each attribute; ``up`` (3,), ``blending`` (a text) and,
+if they are not 0, ``filter_px2`` and the float64 ``origin`` (3,) that positions are relative to; ``order`` (a
+text), if it is that by the splat; for a mesh prior its ``binding_base_vertices`` (n, 3),
+``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,), ``binding_weights`` (v, 3), ``binding_layers``
+(v,) and ``binding_lift``, as ``Binding`` names them. The first three names are those of the published
+MeshSplats code, whose files are read as well.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from meshsplats.formats._validation import (
     straight_colors,
 )
 from meshsplats.formats._zipped import BoundedReader
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import MAX_COLOR, SplatMesh
+from meshsplats.spherical_harmonics import TERMS
 
 _ATTRIBUTE = "attribute_"
 _MAX_HEADER = 10_000
@@ -118,8 +120,9 @@ def _read(archive: zipfile.ZipFile, path: Path, origin: np.ndarray | None) -> Sp
     for name, member in members.items():
         budget.spend(member.info.file_size, f"array {name!r}")
     arrays = {name: _load(archive, member, name, path) for name, member in members.items()}
-    arrays["vertex_colors"] = straight_colors(arrays["vertex_colors"], path)
-    if "blending" not in arrays and "origin" not in arrays:  # of another program
+    own = "blending" in arrays or "origin" in arrays  # not of another program
+    arrays["vertex_colors"] = straight_colors(arrays["vertex_colors"], path, MAX_COLOR if own else 1)
+    if not own:
         arrays["vertices"], arrays["origin"] = local_positions(arrays["vertices"], origin, path)
     named = {_NAMES.get(name) or name.replace("_", ".", 1): array for name, array in arrays.items()}
     try:
@@ -210,10 +213,9 @@ def _check_shapes(members: dict[str, _Member], path: Path) -> None:
     }
     for prefix, fields in (("", SplatMesh.FIELDS), ("binding_", Binding.FIELDS)):
         wanted |= {prefix + field.name: (field.shape(counts),) for field in fields}
-    for field in SplatMesh.FIELDS:
-        if field.per == "splat":  # how many there are is in face_splat, which is not read yet
-            rows = min(rows_of(field.name), rows_of("face_splat"))
-            wanted[field.name] = (field.shape({"splat": rows}),)
+    # How many splats there are is in face_splat, which is not read yet.
+    splats = min(rows_of("harmonics"), rows_of("face_splat"))
+    wanted["harmonics"] = tuple((splats, k, 3) for k in TERMS)
     for name, shape in shapes.items():
         if name.startswith(_ATTRIBUTE):
             fits = len(shape) in (1, 2) and shape[0] == v

@@ -1,0 +1,48 @@
+"""plain_colors_of: colours of vertices that are the same from everywhere, for programs without harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats._kinds import need, need_all
+from meshsplats.camera import Camera
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.devices import engine
+from meshsplats.rendering.engine import visible_pixels
+from meshsplats.rendering.shading import shaded
+
+_HIDDEN_PIXELS = 1e-6
+"""Weight in a view of a vertex that the view does not show, so that one that none shows has a mean, too."""
+
+
+def plain_colors_of(mesh: SplatMesh, cameras: Sequence[Camera], *, threads: int | None = None) -> np.ndarray:
+    """The colours of ``mesh`` for programs that draw no harmonics, as ``SplatMesh.plain_colors``.
+
+    The colour of a vertex is the mean of its colours in all views, each weighted by the pixels that the
+    vertex fills there: were there no other vertices, the colour of least squared error in these images. A
+    vertex that no view shows has the plain mean.
+
+    Args:
+        mesh: the mesh.
+        cameras: the views, at least one.
+        threads: at most so many; None: all processors.
+
+    Returns:
+        (v, 3) float32 in [0, 1].
+    """
+    need(SplatMesh, mesh=mesh)
+    need_all(Camera, cameras=cameras)
+    if not len(cameras):
+        raise ValueError("cameras must be at least one view that colours are taken from, got none")
+    if mesh.harmonics is None:
+        return mesh.plain.colors[:, :3].copy()
+    drawing = engine("cpu", threads)
+    sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros((len(mesh.vertices), 1))
+    for camera in cameras:
+        triangles = shaded(mesh.triangles, camera, threads=threads)
+        pixels = visible_pixels(drawing, triangles, camera)[:, None] + _HIDDEN_PIXELS
+        sums += pixels * triangles.colors[:, :3]
+        weights += pixels
+    return np.clip(sums / weights, 0, 1).astype(np.float32)
