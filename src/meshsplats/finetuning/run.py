@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import checked_array, subsample
 from meshsplats._kinds import described, need, need_path
 from meshsplats._options import Range, check_options
 from meshsplats._origin import need_one_origin
@@ -38,6 +38,7 @@ from meshsplats.finetuning.step import make_step
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Device
+from meshsplats.rendering.plain_colors import plain_colors_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -321,7 +322,7 @@ class TrainingLoop:
             self._notify()
             if signals.received is not None:
                 raise Interrupted(clock.step, signals.received)
-        return self.result()
+        return self.finished()
 
     def _step(self) -> None:
         clock, phase = self.clock, self.phase
@@ -329,6 +330,8 @@ class TrainingLoop:
         views = phase.views(self.dataset.train, fraction)
         loss = make_step(self.state, views, clock.step, fraction, phase, self.loss)
         clock.step_cost = time.perf_counter() - start
+        if self.state.harmonics is not None:
+            clock.plan_plain_views()
         clock.step += 1
         if loss is not None:
             self.losses.append(loss)
@@ -351,6 +354,15 @@ class TrainingLoop:
     def result(self) -> SplatMesh:
         """The current mesh, as the phase hands it over."""
         return self.phase.result(self.state)
+
+    def finished(self) -> SplatMesh:
+        """``result``, with plain colours for programs that draw no harmonics."""
+        mesh = self.result()
+        if mesh.harmonics is None or not self.clock.plain_views:
+            return mesh
+        views = subsample(self.dataset.train, self.clock.plain_views)
+        cameras = [view.camera for view in views]
+        return replace(mesh, plain_colors=plain_colors_of(mesh, cameras, threads=self.options.threads))
 
     def _report(self) -> None:
         """Scores the held-out views and writes a line of the metrics."""

@@ -102,7 +102,7 @@ def train(
         mesh = loop.run()
     except Interrupted:
         if journal is not None:
-            save_mesh(loop.result(), journal.folder / SO_FAR)
+            save_mesh(loop.finished(), journal.folder / SO_FAR)
         raise
     if journal is not None:
         (journal.folder / SO_FAR).unlink(missing_ok=True)
