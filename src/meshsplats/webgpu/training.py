@@ -201,7 +201,7 @@ class Trainer:
         """Makes room for an image, and uploads its target."""
         pixels = camera.width * camera.height
         assert pixels <= MAX_PIXELS
-        self._frames.prepare_filter(settings)
+        self._frames.prepare(settings)
         self._frames.allocate("image", 16 * pixels)
         self._frames.allocate("image_gradient", 16 * pixels)
         self._frames.allocate("derivatives", DERIVATIVE_BYTES * pixels)
