@@ -13,7 +13,7 @@ from test_splat_order import SCENES, crossed
 from test_webgpu_gradients import CPU, GPU, bits, descend, large_fan, of_mesh, random_gradient, renderer_of
 from test_webgpu_gradients import assert_same_gradients as assert_same_gradients_of
 from test_webgpu_render import bits as image_bits
-from test_webgpu_render import draw, random_fans
+from test_webgpu_render import crossing_planes, draw, random_fans
 
 from meshsplats import Camera, SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.errors import DeviceError
@@ -71,6 +71,14 @@ def test_centres_decide_and_of_equal_ones_the_later(second, nearer):
     mesh, view = crossed(2.0, second), camera(8, 8, fx=8, fy=8, cx=4, cy=4)
     drawn = render(mesh, view, device="gpu").color
     np.testing.assert_allclose(drawn, np.broadcast_to(np.eye(3)[nearer], drawn.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_samples_within_rounding_of_an_edge_are_on_the_side_that_the_core_sees(seed):
+    """The core's tiles are larger than in the exact order, and so rounding is another."""
+    mesh, view = crossing_planes(seed)
+    mesh = replace(mesh, face_splat=np.arange(len(mesh.faces)), order="splat")
+    assert_same_image(*both(mesh, view))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])

@@ -245,7 +245,7 @@ class GradientRenderer:
                 area = waiting.pop()
                 window = self.mark_window(tape, area, limit or self.limit)
                 if window is None:
-                    waiting += halves(area)
+                    waiting += halves(area, settings.order)
                     continue
                 tape.windows.append(window)
                 images.work.add(window.tiles, window.counters)

@@ -23,6 +23,9 @@ TILE = 8
 RUN = 8
 """Most triangles of a run."""
 
+CORE_TILES: dict[Order, int] = {"fragment": 16, "splat": 32}
+"""Samples along each side of a tile of the core, from whose corners the core's numbers are rounded."""
+
 MAX_TILES = 65535
 """Tiles of one frame: their indices have 16 bits, and 65535 stands for none."""
 
@@ -81,7 +84,7 @@ def _raster_source(queue: int, output: Output, groups: bool, order: Order) -> st
     text = _text("raster.wgsl") + _text("triangles.wgsl")
     text = text.replace("$OUTPUT", str(OUTPUTS.index(output)))
     text = text.replace("$GROUPS", str(groups).lower()).replace("$K", str(queue))
-    text = text.replace("$BY_SPLAT", str(by_splat).lower())
+    text = text.replace("$BY_SPLAT", str(by_splat).lower()).replace("$CORE_TILE", str(CORE_TILES[order]))
     return _text("common.wgsl") + text
 
 

@@ -6,11 +6,9 @@ import numpy as np
 
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
-
-CORE_TILE = 16
-"""Samples along each side of a tile of the core, from whose corners the core's depths are rounded."""
 
 
 def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
@@ -91,14 +89,16 @@ def tiles_of(samples: int) -> int:
     return -(-samples // kernels.TILE)
 
 
-def halves(window: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
-    """Two windows (x, y, width, height) in pixels; large ones begin at a tile of the core."""
+def halves(window: tuple[int, int, int, int], order: Order) -> list[tuple[int, int, int, int]]:
+    """Two windows (x, y, width, height) in pixels; large ones begin at a tile of the core, whose size
+    depends on the ``order`` of blending."""
     x, y, w, h = window
     if max(w, h) == 1:
         raise MemoryError("the GPU cannot hold the triangles of a single pixel: use device='cpu'")
     half = max(w, h) // 2
-    if half >= 4 * CORE_TILE:
-        half -= half % CORE_TILE
+    side = kernels.CORE_TILES[order]
+    if half >= 4 * side:
+        half -= half % side
     if w >= h:
         return [(x, y, half, h), (x + half, y, w - half, h)]
     return [(x, y, w, half), (x, y + half, w, h - half)]

@@ -118,7 +118,7 @@ class MeshRenderer:
             while waiting:
                 window = waiting.pop()
                 if not fits(self._frames.device, window, settings.samples):
-                    waiting += halves(window)
+                    waiting += halves(window, settings.order)
                     continue
                 for budget in budgets:
                     try:
@@ -130,7 +130,7 @@ class MeshRenderer:
                         if budget == budgets[-1]:
                             raise
                 if not drawn:
-                    waiting += halves(window)
+                    waiting += halves(window, settings.order)
             images.work.bytes = self._frames.bytes
         return images
 

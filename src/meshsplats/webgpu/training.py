@@ -157,7 +157,7 @@ class Trainer:
                 area = waiting.pop()
                 window = self._taping.mark_window(tape, area, self._limit)
                 if window is None:
-                    waiting += halves(area)
+                    waiting += halves(area, settings.order)
                     continue
                 tape.windows.append(window)
                 self._write_step(tape, window.area, 0, background, rates)
