@@ -1,6 +1,7 @@
 """Work and time of the GPU on random fans, beside the core.
 
     python benchmarks/webgpu.py [--scenes 160k 1M 4M] [--mesh FILE --side 400] [--repeat 3] [--gradients]
+                                [--order fragment splat]
 
 Difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at a sample per blended
 fragment, walks through a tile list per tile, samples whose first queue was too short, dispatches of a frame,
@@ -16,12 +17,15 @@ the core.
 from __future__ import annotations
 
 import statistics
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from _common import FANS, Report, Stopwatch, arguments, random_fans
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
+from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.gpu import GpuRendering, gpu_engine
@@ -31,7 +35,7 @@ from meshsplats.webgpu.frames import DrawSettings
 
 
 def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> tuple[str, ...]:
-    settings = DrawSettings(filter_px2=mesh.filter_px2)
+    settings = DrawSettings(filter_px2=mesh.filter_px2, order=mesh.order)
     drawn = gpu_engine().renderer_of(mesh).draw(view, settings)  # compiles
     walls, processors, cores = [], [], []
     for _ in range(repeat):
@@ -81,7 +85,8 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> tuple[str, ..
         for gpu, core in zip(found[1], found[2], strict=True)
     ]
     renderer = gpu_engine().gradients_of(mesh.triangles)
-    steps = [*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps(), *kernels.gradient_steps(0)]
+    steps = [*kernels.list_steps(mesh.order), *kernels.mark_steps(), *kernels.place_steps()]
+    steps += kernels.gradient_steps(0)
     skipped = ("fans",) * (not mesh.filter_px2) + ("groups",) * (mesh.depth_group is None)
     same = all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))
     return (
@@ -106,6 +111,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=400)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--gradients", action="store_true")
+    parser.add_argument("--order", nargs="+", default=["fragment"], choices=get_args(Order))
     asked = parser.parse_args()
     columns: tuple[str, ...] = (
         *("scene", "triangles", "image", "dB", "> 1e-3", "tests a fragment", "walks a tile", "overflowed"),
@@ -121,10 +127,13 @@ def main() -> None:
         report.table(*columns)
 
         def show(name: str, mesh: SplatMesh, view: Camera) -> None:
-            if asked.gradients:
-                report.row(*measure_gradients(name, mesh, view))
-            else:
-                report.row(*measure(name, mesh, view, asked.repeat))
+            for order in asked.order:
+                title = name if asked.order == ["fragment"] else f"{name}, {order}"
+                ordered = replace(mesh, order=order)
+                if asked.gradients:
+                    report.row(*measure_gradients(title, ordered, view))
+                else:
+                    report.row(*measure(title, ordered, view, asked.repeat))
 
         for name in asked.scenes:
             show(name, *random_fans(*FANS[name]))

@@ -168,8 +168,6 @@ def test_what_has_no_order_by_the_splat():
         render(known, view, order="splat", cutoff=0.5)
     with pytest.raises(ValueError, match=r"ramp .*order='fragment'"):
         TapedRendering(known.triangles, view, TapeOptions(ramp=OpacityRamp(0.5)))
-    with pytest.raises(ValueError, match="order='splat' needs device='cpu'"):
-        render(known, view, device="gpu")
 
 
 def test_cut_triangles_have_a_depth_buffer():

@@ -37,10 +37,13 @@ COMPILE = """(async (source, entries) => {
     [
         (kernels.gradients_source(4), ("raster", *kernels.GRADIENT_KERNELS)),
         (kernels.gradients_source(4, groups=True), ("raster",)),
+        (kernels.gradients_source(order="splat"), ("raster", *kernels.GRADIENT_KERNELS)),
+        (kernels.raster_source(order="splat"), ("raster",)),
+        (kernels.lists_source(), ("find_depths", "plan_runs", "order_runs")),
         (kernels.filter_source(), ("widen", "widen_backward")),
         (kernels.training_source(), kernels.TRAINING_KERNELS),
     ],
-    ids=["gradients", "groups", "filter", "training"],
+    ids=["gradients", "groups", "by splat", "images by splat", "order of splats", "filter", "training"],
 )
 def test_kernels_of_gradients_and_training_compile(browser, tmp_path, source, entries):
     (tmp_path / "empty.html").write_text("<!doctype html><title>empty</title>")

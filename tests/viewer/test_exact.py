@@ -125,7 +125,7 @@ def test_splats_stand_left_of_the_divider_and_the_exact_mesh_right_of_it(page, m
 def test_the_page_writes_the_uniform_of_the_python_host(browser, cameras):
     """Bit for bit, with the parts of positions that float32 rounds off."""
     view = cameras[1]
-    counts = {"vertices": 70, "faces": 60, "runs": 10, "fans": 9, "groups": 8}
+    counts = {"vertices": 70, "faces": 60, "runs": 10, "splats": 9, "groups": 8}
     pinhole = {"rows": view.world_to_camera[:3].tolist(), "center": view.center.tolist()} | {
         name: getattr(view, name) for name in ("fx", "fy", "cx", "cy", "near", "width", "height")
     }
@@ -173,6 +173,26 @@ def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud
     page = open_page(browser, write_page(odd, "odd", cameras=cameras))
     difference = np.abs(page.screenshot().astype(int) - expected)
     assert (difference > 1).any(axis=-1).mean() < 0.002
+    assert page.problems() == []
+    page.close()
+
+
+def test_meshes_in_the_order_of_their_splats(browser, write_page, cloud, cameras):
+    """With thick splats, whose planes cross, and with depth groups, which have no effect."""
+    splats = cloud.take(np.arange(0, len(cloud), 2))
+    mesh = replace(ms.convert(splats, mode="3d"), order="splat")
+    mesh = replace(mesh, depth_group=mesh.face_splat)
+    image = ms.render(mesh, cameras[0])
+    exact = levels(ms.render(mesh, cameras[0], order="fragment").color)
+    assert (np.abs(exact - levels(image.color)) > 2).any(axis=-1).mean() > 0.1
+    page = open_page(browser, write_page(mesh, "by splat", cameras=cameras))
+    assert_within_one_level(page, image.color)
+    page.choose("#crop-x0", "90")
+    page.still(PATIENCE)
+    words = page.text("#cropText").split()
+    part = cropped(mesh, tuple(float(word) for word in words[1:]))
+    assert 0 < len(part.faces) < len(mesh.faces)
+    assert_within_one_level(page, ms.render(part, cameras[0]).color)
     assert page.problems() == []
     page.close()
 

@@ -48,6 +48,19 @@ def test_the_kernels_are_in_the_page_word_for_word(mesh):
     assert text["lists"] == kernels.list_steps()
     grouped = replace(mesh, depth_group=np.zeros(len(mesh.faces), np.int32))
     assert "GROUPS = true" in json.loads(block(make_page(grouped).html, "kernels"))["sources"]["raster"]
+    by_splat = replace(grouped, order="splat")
+    text = json.loads(block(make_page(by_splat, coarse=mesh.take(slice(60))).html, "kernels"))
+    assert text["lists"] == kernels.list_steps("splat")
+    for name, queue in (("raster", kernels.QUEUE), ("again", kernels.LONG_QUEUE)):
+        assert text["sources"][name] == kernels.raster_source(queue, order="splat")
+
+
+def test_both_levels_of_a_page_have_one_order(mesh):
+    part = mesh.take(slice(60))
+    for fine, coarse in ((replace(mesh, order="splat"), part), (mesh, replace(part, order="splat"))):
+        text = make_page(fine, coarse=coarse).html
+        orders = [unpack_mesh(base64.b64decode(block(text, name))).order for name in ("mesh", "coarse")]
+        assert orders == [fine.order] * 2
 
 
 def test_only_the_script_and_the_style_of_the_page_may_run(mesh):

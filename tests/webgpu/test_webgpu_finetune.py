@@ -75,6 +75,11 @@ OPTIONS = [
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda options: ", ".join(options) or "default")
 def test_steps_are_those_of_the_cpu(scene, options):
     need_gpu()
+    assert_same_steps(scene, **options)
+
+
+def assert_same_steps(scene, **options) -> State:
+    """Compares steps of the GPU with those of the core, whose state it returns."""
     losses, state = steps(scene, "gpu", **options)
     expected, known = steps(scene, "cpu", **options)
     assert np.allclose(losses, expected, rtol=TOLERANCE)
@@ -84,6 +89,16 @@ def test_steps_are_those_of_the_cpu(scene, options):
         assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
         difference = np.sort(np.abs(getattr(state, name) - after), axis=None)[:-DECIDED_BY_ROUNDING]
         assert np.linalg.norm(difference) <= CHANGES * change
+    return known
+
+
+def test_steps_in_the_order_of_the_splats_are_those_of_the_cpu(scene):
+    need_gpu()
+    dataset, mesh = scene
+    known = assert_same_steps((dataset, replace(mesh, order="splat")))
+    exact = steps(scene, "cpu")[1]
+    change = np.linalg.norm(known.colors - mesh.colors)
+    assert np.linalg.norm(known.colors - exact.colors) > 20 * CHANGES * change  # the order matters here
 
 
 @pytest.mark.parametrize("options", [{}, {"exposure": True}], ids=["default", "exposure"])

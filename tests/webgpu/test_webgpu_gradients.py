@@ -275,7 +275,7 @@ def test_a_sample_with_too_many_fragments_is_an_error(monkeypatch):
     monkeypatch.setattr(
         kernels,
         "gradients_source",
-        lambda queue, groups: source.replace("MOST_FRAGMENTS = 60000u", "MOST_FRAGMENTS = 20u"),
+        lambda queue, **options: source.replace("MOST_FRAGMENTS = 60000u", "MOST_FRAGMENTS = 20u"),
     )
     monkeypatch.setattr(open_device(), "_pipelines", {})
     monkeypatch.setattr(open_device(), "_modules", {})

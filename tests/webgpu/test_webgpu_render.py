@@ -332,7 +332,8 @@ def test_the_kernels_need_core_limits_only():
     assert limits["max-storage-buffer-binding-size"] == 128 << 20
     assert not open_device().device.features
     gradients = (kernels.gradients_source(), kernels.filter_source(), kernels.training_source())
-    for text in (kernels.lists_source(), kernels.raster_source(groups=True), *gradients):
+    images = (kernels.raster_source(groups=True), kernels.raster_source(order="splat"))
+    for text in (kernels.lists_source(), *images, *gradients):
         assert not re.search(r"^\s*(enable|requires)\b", text, re.M)
 
 

@@ -106,7 +106,7 @@ def render(
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
         filter_px2: overrides ``mesh.filter_px2``; 0 draws the triangles as they are.
         cutoff: least opacity that is drawn, as opaque; 0 to 1. None: blended with the opacity.
-        order: 'fragment' or 'splat' (on the CPU), overrides ``mesh.order``. With a cutoff always 'fragment'.
+        order: 'fragment' or 'splat', overrides ``mesh.order``. With a cutoff always 'fragment'.
         threads: at most this many, of the CPU; all processors by default. The result does not depend on it.
         device: 'cpu' or 'gpu'.
 

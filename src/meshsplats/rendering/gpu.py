@@ -12,7 +12,6 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, Triangles, checked_filter
-from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, checked_options
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
@@ -45,12 +44,6 @@ from here; so do those with images of more than ``MAX_PIXELS`` pixels. Meshes th
 ``gradients.check_limits``."""
 
 
-def _check_order(order: Order) -> None:
-    """ValueError for an order in which the GPU does not blend."""
-    if order == "splat":
-        raise ValueError("the GPU sorts fragments: order='splat' needs device='cpu'; else take 'fragment'")
-
-
 class GpuEngine:
     """Draws on the best GPU of this machine. The last mesh that was drawn stays there, and so do the last
     triangles with gradients."""
@@ -66,20 +59,18 @@ class GpuEngine:
         for need in needs:
             if need in CANNOT:
                 raise ValueError(CANNOT[need])
-        if mesh is not None:
-            _check_order(mesh.order)
         device = open_device()
         if mesh is not None:
             check_limits(device, mesh)
 
     def render(self, mesh: SplatMesh, camera: Camera, options: ImageOptions) -> Drawn:
-        _check_order(options.order)
         settings = DrawSettings(
             samples=options.samples,
             max_layers=options.max_layers,
             min_transmittance=options.min_transmittance,
             cutoff=-1.0 if options.cutoff is None else options.cutoff,
             filter_px2=options.filter_px2,
+            order=options.order,
         )
         with self.errors():
             drawn = self.renderer_of(seen_from(mesh, camera)).draw(
@@ -109,7 +100,6 @@ class GpuEngine:
         Args:
             limit: of windows; by default that of all images of these triangles that have none.
         """
-        _check_order(triangles.order)
         return GpuRendering(self, triangles, camera, options or TapeOptions(), limit)
 
     def session(self, mesh: SplatMesh) -> GpuSession:
@@ -157,6 +147,7 @@ class GpuEngine:
                 known is None
                 or known.device is not device
                 or len(known.mesh.vertices) != len(triangles.vertices)
+                or known.mesh.order != triangles.order
                 or not all(map(_same, self._taped, arrays))
             ):
                 known = self._taping = None  # frees its buffers first
@@ -221,6 +212,7 @@ class GpuRendering:
             samples=checked.samples,
             min_transmittance=options.min_transmittance,
             filter_px2=checked_filter(triangles.filter_px2, triangles.face_splat),
+            order=triangles.order,
         )
         with engine.errors():
             self._renderer = engine.gradients_of(triangles)
@@ -309,6 +301,7 @@ class GpuSession:
             samples=options.samples,
             min_transmittance=options.min_transmittance,
             filter_px2=self._mesh.filter_px2,
+            order=self._mesh.order,
         )
         red, green, blue = map(float, options.background)
         with self._engine.errors():

@@ -13,7 +13,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 
 import numpy as np
@@ -25,6 +25,7 @@ from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order, checked_order
 from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_mesh
 from meshsplats.webgpu import device, frames, kernels
@@ -80,7 +81,8 @@ def make_page(
     Args:
         mesh: the triangles. Normals, attributes and bindings are left out.
         splats: shown beside the mesh or in its place, with colours of degree 0.
-        coarse: the same scene with few triangles: drawn first, while the view moves, and on phones.
+        coarse: the same scene with few triangles: drawn first, while the view moves, and on phones. In the
+            order of ``mesh``.
         cameras: viewpoints to choose from. The first is where the page begins; without any, it begins before
             the subject.
         options: title, background, up.
@@ -115,10 +117,13 @@ def make_page(
             "colour error": f"{packed.color_error:.2g} of 255",
         },
     }
-    groups = mesh.depth_group is not None and bool((mesh.depth_group >= 0).any())
+    grouped = mesh.depth_group is not None and bool((mesh.depth_group >= 0).any())
+    groups = grouped and mesh.order == "fragment"
+    if coarse is not None and coarse.order != mesh.order:
+        coarse = replace(coarse, order=checked_order(mesh.order, coarse.face_splat))
     blocks = {
         "settings": ("application/json", _json(settings)),
-        "kernels": ("application/json", _json(_kernels(groups))),
+        "kernels": ("application/json", _json(_kernels(groups, mesh.order))),
         "mesh": ("text/plain", _base64(packed.data)),
     }
     if coarse is not None:
@@ -134,14 +139,15 @@ def estimated_size(
     """About how many bytes the page of these will have; known in a fraction of a second."""
     data = estimated_bytes(mesh, splats) + (0 if coarse is None else estimated_bytes(coarse))
     texts = [_read(name) for name in (*MODULES, "style.css", "index.html")]
-    return len(_json(_kernels(False))) + sum(map(len, texts)) + 4 * data // 3
+    return len(_json(_kernels(False, mesh.order))) + sum(map(len, texts)) + 4 * data // 3
 
 
-def _kernels(groups: bool) -> dict[str, object]:
+def _kernels(groups: bool, order: Order) -> dict[str, object]:
     """The text of the kernels, their limits and the steps of a frame, for ``page/exact.js``. ``groups``:
-    whether the mesh has depth groups."""
+    whether the mesh has depth groups that count in the ``order`` of the page's meshes."""
     return {
         "groups": groups,
+        "order": order,
         "limits": {
             "window": frames.WINDOW_SAMPLES,
             "firstPairs": frames.FIRST_PAIRS,
@@ -152,13 +158,13 @@ def _kernels(groups: bool) -> dict[str, object]:
             "budgets": [*device.SOFTWARE_BUDGETS, device.BUDGET],
         },
         "digits": kernels.DIGITS,
-        "lists": kernels.list_steps(),
+        "lists": kernels.list_steps(order),
         "raster": kernels.raster_steps(),
         "again": kernels.again_steps(),
         "sources": {
             "lists": kernels.lists_source(),
-            "raster": kernels.raster_source(kernels.QUEUE, groups=groups),
-            "again": kernels.raster_source(kernels.LONG_QUEUE, groups=groups),
+            "raster": kernels.raster_source(kernels.QUEUE, groups=groups, order=order),
+            "again": kernels.raster_source(kernels.LONG_QUEUE, groups=groups, order=order),
         },
     }
 

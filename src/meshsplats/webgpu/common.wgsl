@@ -9,7 +9,8 @@ struct Frame {
   filter_variance: f32,                       // square samples; 0: none
   width: u32, height: u32,                    // in samples
   tiles_x: u32, tiles_y: u32,
-  vertices: u32, faces: u32, runs: u32, fans: u32,
+  vertices: u32, faces: u32, runs: u32,
+  splats: u32,                                // with a filter, or in the order of the splats
   groups: u32,                                // depth groups
   capacity: u32,                              // pairs that the lists can hold
   max_layers: u32,                            // 0: no limit

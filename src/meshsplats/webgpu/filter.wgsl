@@ -35,7 +35,7 @@ fn to_position(g: vec2f, p: vec2f, w: f32) -> vec3f { return vec3f(frame.lens.xy
 
 @compute @workgroup_size(64)
 fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= frame.fans) { return; }
+  if (id.x >= frame.splats) { return; }
   let begin = fans[id.x];
   let end = fans[id.x + 1u];
   var reached = false;

@@ -12,9 +12,10 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh
+from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET, Device
-from meshsplats.webgpu.layout import check_size, checked_fans, find_groups, find_runs, tiles_of
+from meshsplats.webgpu.layout import check_fans, check_size, find_fans, find_groups, find_runs, tiles_of
 
 WINDOW_SAMPLES = 1 << 22
 """Largest number of samples of a frame; larger images are drawn in windows."""
@@ -23,7 +24,8 @@ FIRST_PAIRS = 1 << 18
 """Room for pairs of a run and a tile, until a frame needs more."""
 
 MAX_FAN = 8192
-"""Most triangles of a splat with a low-pass filter: one invocation goes through all of them three times."""
+"""Most triangles of a splat with a low-pass filter or in the order of the splats: one invocation goes through
+all of them, for the filter three times."""
 
 Output = Literal[kernels.Output, "values"]
 """What a frame blends: the outputs of ``raster``, and other values than the colours."""
@@ -43,6 +45,7 @@ class DrawSettings:
     min_transmittance: float = MIN_TRANSMITTANCE
     cutoff: float = -1.0
     filter_px2: float = 0.0
+    order: Order = "fragment"
     queue: int = kernels.QUEUE
     long_queue: int = kernels.LONG_QUEUE
     budget: int | None = None
@@ -116,11 +119,12 @@ class MeshFrames:
         self._program = program
         self._buffers: dict[str, Any] = {}
         self._bind_groups: dict[tuple[Any, ...], Any] = {}
-        self._fans = 0
-        runs = find_runs(mesh.faces, mesh.face_splat)
+        self._runs = runs = find_runs(mesh.faces, mesh.face_splat)
+        self._by_splat = False
+        """Whether the runs on the GPU are in the order of the splats of a frame."""
         parts = [mesh.faces.view(np.uint32).ravel(), runs]
         self.counts = {"one": 1, "vertices": len(mesh.vertices), "faces": len(mesh.faces), "runs": len(runs)}
-        self.counts |= {"fans": 0, "groups": 0}
+        self.counts |= {"splats": 0, "groups": 0}
         self.offsets = (3 * len(mesh.faces), 0, 0)
         if mesh.depth_group is not None and (mesh.depth_group >= 0).any():
             of_face, largest = find_groups(mesh)
@@ -206,12 +210,22 @@ class MeshFrames:
         """Bytes of all buffers."""
         return sum(buffer.size for buffer in self._buffers.values())
 
-    def prepare_filter(self, settings: DrawSettings) -> None:
-        if not settings.filter_px2 or "fans" in self._buffers:
-            return
-        starts = checked_fans(self.mesh, self._program.most_fan)
-        self.upload("fans", starts)
-        self._fans = len(starts) - 1
+    def prepare(self, settings: DrawSettings) -> None:
+        """Uploads what a filter and the order of blending need.
+
+        Raises DeviceError and ValueError as ``check_fans``.
+        """
+        by_splat = settings.order == "splat"
+        if settings.filter_px2:
+            check_fans(self.mesh, self._program.most_fan, filtered=True)
+        if by_splat:
+            check_fans(self.mesh, MAX_FAN, filtered=False)
+        if (settings.filter_px2 or by_splat) and "fans" not in self._buffers:
+            self.upload("fans", find_fans(self.mesh))
+            self.counts["splats"] = len(self.mesh.splats)
+        if self._by_splat and not by_splat:
+            self.write("mesh", self._runs, 4 * self.offsets[0])
+        self._by_splat = by_splat
 
     # ---- Frames
 
@@ -232,11 +246,14 @@ class MeshFrames:
             "width": w,
             "height": h,
         }
-        if settings.filter_px2:
-            counts["fans"] = self._fans
-        blocks = -(-self.capacity // 2048)
-        self.allocate("pairs_a", 8 * self.capacity)
-        self.allocate("pairs_b", 8 * self.capacity)
+        counts["fans"] = counts["splats"] if settings.filter_px2 else 0
+        room = self.capacity
+        if settings.order == "splat":
+            counts["groups"] = 0
+            room = max(room, counts["runs"])
+        blocks = -(-room // 2048)
+        self.allocate("pairs_a", 8 * room)
+        self.allocate("pairs_b", 8 * room)
         self.allocate("table", 4 * 256 * blocks)
         self.allocate("sums", 4 * (2 + max(-(-256 * blocks // 2048), -(-counts["runs"] // 2048))))
         self.allocate("lists", 16 * (counts["tiles"] + 1))
@@ -314,7 +331,7 @@ class MeshFrames:
                 continue
             if compute is None:
                 compute = encoder.begin_compute_pass()
-            groups = self.counts["groups"] > 0
+            groups = self.counts["groups"] > 0 and settings.order == "fragment"
             pipeline = self._program.pipeline(self.device, step["kernel"], output, settings, groups)
             compute.set_pipeline(pipeline)
             compute.set_bind_group(0, self._bind_group(pipeline, step["bind"], output))
@@ -375,7 +392,7 @@ def frame_uniform(
     assert camera.near is not None
     data[24:28] = camera.near, settings.min_transmittance, settings.cutoff, settings.filter_px2 * s * s
     words[28:32] = w, h, tiles_of(w), tiles_of(h)
-    words[32:36] = counts["vertices"], counts["faces"], counts["runs"], counts["fans"]
+    words[32:36] = counts["vertices"], counts["faces"], counts["runs"], counts["splats"]
     words[36:39] = counts["groups"], capacity, settings.max_layers
     words[39] = BUDGET if settings.budget is None else settings.budget
     words[40:43] = offsets

@@ -8,17 +8,18 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, Triangles
-from meshsplats.webgpu import kernels
+from meshsplats.order import Order
+from meshsplats.webgpu import frames, kernels
 from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings, MeshFrames, Output, Program, Work
-from meshsplats.webgpu.layout import check_size, checked_fans, find_groups, halves
+from meshsplats.webgpu.layout import check_fans, check_size, find_groups, halves
 from meshsplats.webgpu.renderer import DRAWING, Images, drawing_pipeline, fits
 
 PAIR_BYTES = 100
@@ -33,7 +34,10 @@ MAX_VALENCE = 16_384
 ROWS = 32_768
 """Workgroups in each row of a dispatch that is larger than one dimension."""
 
-_MARK_STEPS = (*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps())
+_MARK_STEPS = {
+    order: (*kernels.list_steps(order), *kernels.mark_steps(), *kernels.place_steps())
+    for order in get_args(Order)
+}
 _MARK_AGAIN_STEPS = (*kernels.mark_again_steps(), *kernels.place_steps())
 _FILTER_STEPS = tuple(kernels.filter_steps())
 _gradient_steps = functools.lru_cache(maxsize=64)(kernels.gradient_steps)
@@ -103,12 +107,15 @@ def check_limits(device: Device, mesh: SplatMesh) -> None:
             " Use device='cpu'"
         )
     if mesh.filter_px2 and faces:
-        checked_fans(mesh, MAX_FAN)
+        check_fans(mesh, MAX_FAN, filtered=True)
+    if mesh.order == "splat":
+        check_fans(mesh, frames.MAX_FAN, filtered=False)
 
 
 def changing_mesh(triangles: Triangles) -> SplatMesh:
     """The mesh of a ``GradientRenderer`` for these triangles, wherever their vertices lie. Consecutive
-    triangles of one splat have the same ``face_splat``, which need not ascend."""
+    triangles of one splat have the same ``face_splat``, which need not ascend. Depth groups are left out
+    where they have no effect, in the order of the splats."""
     face_splat, depth_group = triangles.face_splat, triangles.depth_group
     splat = None
     if face_splat is not None and len(face_splat):
@@ -119,7 +126,8 @@ def changing_mesh(triangles: Triangles) -> SplatMesh:
         triangles.faces.copy(),
         np.zeros((vertices, 4), np.float32),
         face_splat=splat,
-        depth_group=None if depth_group is None else depth_group.copy(),
+        depth_group=None if depth_group is None or triangles.order == "splat" else depth_group.copy(),
+        order=triangles.order,
     )
 
 
@@ -142,7 +150,9 @@ def gradient_pipeline(
         queue = settings.long_queue if kernel == "tape_again" else settings.queue
         entry = "raster" if kernel in ("tape", "tape_again") else kernel
         return device.pipeline(
-            entry, ("tape", queue, groups), lambda: kernels.gradients_source(queue, groups=groups)
+            entry,
+            ("tape", queue, groups, settings.order),
+            lambda: kernels.gradients_source(queue, groups=groups, order=settings.order),
         )
     if kernel == "widen_backward":
         return device.pipeline(kernel, ("filter",), kernels.filter_source)
@@ -235,7 +245,7 @@ class GradientRenderer:
                 area = waiting.pop()
                 window = self.mark_window(tape, area, limit or self.limit)
                 if window is None:
-                    waiting += halves(area)
+                    waiting += halves(area, settings.order)
                     continue
                 tape.windows.append(window)
                 images.work.add(window.tiles, window.counters)
@@ -259,7 +269,7 @@ class GradientRenderer:
     def _load(self, tape: Tape) -> None:
         """Uploads positions and colours."""
         self._loaded, self.marked = None, None
-        self.frames.prepare_filter(tape.settings)
+        self.frames.prepare(tape.settings)
         self.frames.upload("vertices", tape.triangles.vertices)
         self.frames.upload("values", tape.triangles.colors)
         self._load_values(tape.triangles.colors)
@@ -309,7 +319,7 @@ class GradientRenderer:
         work = tape.work
         while True:
             rounds, counters = self.frames.repeat(
-                _MARK_STEPS, _MARK_AGAIN_STEPS, "color", counts, settings, work
+                _MARK_STEPS[settings.order], _MARK_AGAIN_STEPS, "color", counts, settings, work
             )
             needed = int(counters[0])
             if needed <= self.frames.capacity:

@@ -9,23 +9,18 @@ const TRANSPARENT = false;     // whether fragments without opacity count
 fn begin_sample(t: u32, x: u32, y: u32) {}
 fn keep_source(at: u32, source: u32) {}
 fn move_source(to: u32, at: u32) {}
+fn source_at(at: u32) -> u32 { return 0u; }
 
 fn is_open() -> bool {
   return through > 0.0 && through >= frame.min_transmittance &&
     (frame.max_layers == 0u || layers < frame.max_layers);
 }
 
-fn blend_front() {
-  let value = queue_value[head];
+fn blend(value: vec4f, source: u32) {
   let weight = through * value.w;
   rgb = fma(vec3f(weight), value.xyz, rgb);
   through = fma(-through, value.w, through);
   if (weight > 0.0) { layers++; blended++; }
-  floor_q = queue_key[head];
-  floor_face = queue_face[head];
-  advanced = true;
-  head = place(1u);
-  count--;
 }
 
 // Whether nothing behind the whole queue can be blended. Rounding is why half of the limit is safe.

@@ -5,8 +5,11 @@ Any host can run it, in Python or in a browser: docs/webgpu.md describes what a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any, Literal
+
+from meshsplats.order import Order
 
 QUEUE = 16
 """Default length of the fragment queue of each sample, in the first walk through a tile list."""
@@ -19,6 +22,9 @@ TILE = 8
 
 RUN = 8
 """Most triangles of a run."""
+
+CORE_TILES: dict[Order, int] = {"fragment": 16, "splat": 32}
+"""Samples along each side of a tile of the core, from whose corners the core's numbers are rounded."""
 
 MAX_TILES = 65535
 """Tiles of one frame: their indices have 16 bits, and 65535 stands for none."""
@@ -34,27 +40,30 @@ OUTPUTS: tuple[Output, ...] = ("color", "depth", "vertex_normals", "face_normals
 
 def lists_source() -> str:
     """WGSL of the kernels that make the tile lists, and of ``resolve``."""
-    return _text("common.wgsl") + _text("lists.wgsl") + _text("sorting.wgsl")
+    return _text("common.wgsl") + _text("lists.wgsl") + _text("sorting.wgsl") + _text("splat_order.wgsl")
 
 
-def raster_source(queue: int = QUEUE, *, output: Output = "color", groups: bool = False) -> str:
+def raster_source(
+    queue: int = QUEUE, *, output: Output = "color", groups: bool = False, order: Order = "fragment"
+) -> str:
     """WGSL of ``raster``.
 
     Args:
         queue: fragments that each sample keeps at a time, at least 2. The image does not depend on it.
         output: what is blended: the values of the vertices, the depth of the fragment, or unit normals that
             face the camera, from those of the vertices or from their positions.
-        groups: whether the mesh has depth groups.
+        groups: whether the mesh has depth groups; the order 'fragment' alone knows them.
+        order: of blending. 'splat' has no queue.
     """
-    return _raster_source(queue, output, groups) + _text("image.wgsl")
+    return _raster_source(queue, output, groups, order) + _text("image.wgsl")
 
 
-def gradients_source(queue: int = QUEUE, *, groups: bool = False) -> str:
+def gradients_source(queue: int = QUEUE, *, groups: bool = False, order: Order = "fragment") -> str:
     """WGSL of ``raster`` with a tape, and of the kernels from the tape to gradients.
 
     Arguments are those of ``raster_source``.
     """
-    return _raster_source(queue, "color", groups) + _text("tape.wgsl") + _text("gradients.wgsl")
+    return _raster_source(queue, "color", groups, order) + _text("tape.wgsl") + _text("gradients.wgsl")
 
 
 def filter_source() -> str:
@@ -67,12 +76,15 @@ def training_source() -> str:
     return _text("common.wgsl") + _text("training.wgsl")
 
 
-def _raster_source(queue: int, output: Output, groups: bool) -> str:
+def _raster_source(queue: int, output: Output, groups: bool, order: Order) -> str:
     if queue < 2:
         raise ValueError(f"queue must be at least 2, got {queue}")
+    by_splat = order == "splat"
+    queue = 1 if by_splat else queue
     text = _text("raster.wgsl") + _text("triangles.wgsl")
     text = text.replace("$OUTPUT", str(OUTPUTS.index(output)))
     text = text.replace("$GROUPS", str(groups).lower()).replace("$K", str(queue))
+    text = text.replace("$BY_SPLAT", str(by_splat).lower()).replace("$CORE_TILE", str(CORE_TILES[order]))
     return _text("common.wgsl") + text
 
 
@@ -83,9 +95,15 @@ def _text(name: str) -> str:
 DIGITS = ((0, 0), (8, 0), (16, 0), (24, 0), (24, 1))
 """Shift and word of each digit of the sort: the depth key from its lowest byte on, then the tile."""
 
+TILE_DIGITS = (3, 4)
+RUN_DIGITS = (0, 1, 2, 3)
+"""Of ``DIGITS``: those of the tile, and those of the depth of a run's splat, which has 32 bits."""
 
-def list_steps() -> list[dict[str, Any]]:
+
+def list_steps(order: Order = "fragment") -> list[dict[str, Any]]:
     """The steps from vertices to sorted tile lists, in their order, as JSON values.
+
+    In the order 'splat', runs are sorted first, and pairs by their tiles alone.
 
     A step ``{"kernel": name, "bind": {binding: buffer}, ...}`` is a dispatch. Its size is ``"count": [name,
     n]``, the quotient of a count and n, rounded up, or ``"indirect": [buffer, byte]``. With ``"if": name`` it
@@ -106,6 +124,16 @@ def list_steps() -> list[dict[str, Any]]:
         add("scan_sums", common, count=["one", 1])
         add("scan_add", {**common, 10: data}, **size)
 
+    def sort(source: str, target: str, indices: Sequence[int]) -> None:
+        for i in indices:
+            digit = f"digits.{i}"
+            counted = {10: "table", 13: "plan", 16: source, 17: digit}
+            add("count_digits", counted, indirect=["plan", 0])
+            scan(digit, "table", indirect=["plan", 12])
+            add("scatter", counted | {15: target}, indirect=["plan", 0])
+            source, target = target, source
+
+    by_splat = order == "splat"
     add("project", {0: "frame", 1: "vertices", 6: "projected"}, count=["vertices", 256])
     filtered = {0: "frame", 1: "vertices", 2: "values", 3: "mesh", 4: "fans", 6: "projected"}
     add("widen", filtered, count=["fans", 64], only_if="fans")
@@ -113,20 +141,21 @@ def list_steps() -> list[dict[str, Any]]:
     add("bound_groups", bounds, count=["faces", 256], only_if="groups")
     planes = {0: "frame", 3: "mesh", 6: "projected", 7: "group_bounds"}
     add("find_planes", planes, count=["groups", 64], only_if="groups")
+    if by_splat:
+        splats = {0: "frame", 1: "vertices", 3: "mesh", 4: "fans", 15: "pairs_a"}
+        add("find_depths", splats, count=["splats", 256])
+        add("plan_runs", {0: "frame", 12: "plan"}, count=["one", 1])
+        sort("pairs_a", "pairs_b", RUN_DIGITS)
+        add("order_runs", {0: "frame", 16: "pairs_a", 24: "mesh"}, count=["runs", 256])
     boxes = {0: "frame", 3: "mesh", 5: "projected", 8: "boxes", 10: "offsets"}
     add("bound_runs", boxes, count=["runs", 256])
     scan(f"digits.{len(DIGITS)}", "offsets", count=["runs", 2048])
     add("make_plan", {0: "frame", 11: "sums", 12: "plan", 19: "counters"}, count=["one", 1])
-    pairs = {0: "frame", 3: "mesh", 5: "projected", 9: "boxes", 13: "plan", 14: "offsets", 15: "pairs_a"}
+    # The sorted pairs are to be in pairs_b.
+    start, other = ("pairs_b", "pairs_a") if by_splat else ("pairs_a", "pairs_b")
+    pairs = {0: "frame", 3: "mesh", 5: "projected", 9: "boxes", 13: "plan", 14: "offsets", 15: start}
     add("emit", pairs, indirect=["plan", 24])
-    source, target = "pairs_a", "pairs_b"
-    for i in range(len(DIGITS)):
-        digit = f"digits.{i}"
-        add("count_digits", {10: "table", 13: "plan", 16: source, 17: digit}, indirect=["plan", 0])
-        scan(digit, "table", indirect=["plan", 12])
-        add("scatter", {10: "table", 13: "plan", 15: target, 16: source, 17: digit}, indirect=["plan", 0])
-        source, target = target, source
-    assert source == "pairs_b"
+    sort(start, other, TILE_DIGITS if by_splat else range(len(DIGITS)))
     return steps
 
 

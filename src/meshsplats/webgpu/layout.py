@@ -6,11 +6,9 @@ import numpy as np
 
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
-
-CORE_TILE = 16
-"""Samples along each side of a tile of the core, from whose corners the core's depths are rounded."""
 
 
 def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
@@ -46,23 +44,29 @@ def check_size(device: Device, name: str, size: int) -> None:
         )
 
 
-def checked_fans(mesh: SplatMesh, most: int) -> np.ndarray:
-    """(s + 1,) uint32 first triangle of each splat, and their count, for the filter.
+def check_fans(mesh: SplatMesh, most: int, *, filtered: bool) -> None:
+    """Checks the splats of a mesh for the order of the splats, or for the low-pass filter.
 
     Raises:
         DeviceError: a splat of more than ``most`` triangles.
-        ValueError: two splats share a vertex.
+        ValueError: two splats share a vertex, and there is a filter.
     """
-    splats = mesh.splats
-    starts = np.append(splats.starts, len(mesh.faces)).astype(np.uint32)
-    if np.diff(starts).max() > most:
+    largest = int(mesh.splats.counts.max(initial=0))
+    if largest > most:
+        what = "filter" if filtered else "order of the splats"
         raise DeviceError(
-            f"the filter of the GPU takes splats of up to {most:,} triangles; one has"
-            f" {np.diff(starts).max():,}. Use device='cpu'"
+            f"the {what} of the GPU takes splats of up to {most:,} triangles; one has {largest:,}."
+            " Use device='cpu'"
         )
-    if splats.share_vertices:
+    if filtered and mesh.splats.share_vertices:
         raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
-    return starts
+
+
+def find_fans(mesh: SplatMesh) -> np.ndarray:
+    """(2 s + 1,) uint32 first triangle of each splat, and their count; then the first run of each splat."""
+    runs = -(-mesh.splats.counts // kernels.RUN)
+    parts = [mesh.splats.starts, [len(mesh.faces)], np.cumsum(runs) - runs]
+    return np.concatenate(parts).astype(np.uint32)
 
 
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -85,14 +89,16 @@ def tiles_of(samples: int) -> int:
     return -(-samples // kernels.TILE)
 
 
-def halves(window: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
-    """Two windows (x, y, width, height) in pixels; large ones begin at a tile of the core."""
+def halves(window: tuple[int, int, int, int], order: Order) -> list[tuple[int, int, int, int]]:
+    """Two windows (x, y, width, height) in pixels; large ones begin at a tile of the core, whose size
+    depends on the ``order`` of blending."""
     x, y, w, h = window
     if max(w, h) == 1:
         raise MemoryError("the GPU cannot hold the triangles of a single pixel: use device='cpu'")
     half = max(w, h) // 2
-    if half >= 4 * CORE_TILE:
-        half -= half % CORE_TILE
+    side = kernels.CORE_TILES[order]
+    if half >= 4 * side:
+        half -= half % side
     if w >= h:
         return [(x, y, half, h), (x + half, y, w - half, h)]
     return [(x, y, w, half), (x, y + half, w, h - half)]

@@ -3,7 +3,7 @@
 @group(0) @binding(1) var<storage, read> vertices: array<f32>;             // (vertices, 3) world space
 @group(0) @binding(2) var<storage, read> values: array<vec4f>;             // by vertex: RGB and opacity
 @group(0) @binding(3) var<storage, read> mesh: array<u32>;
-@group(0) @binding(4) var<storage, read> fans: array<u32>;  // (fans + 1) first face of each fan
+@group(0) @binding(4) var<storage, read> fans: array<u32>;  // first faces of splats, their end; first runs
 @group(0) @binding(5) var<storage, read> projected: array<vec4u>;
 @group(0) @binding(6) var<storage, read_write> projected_out: array<vec4u>;
 // by group: largest 1 / z, complement of the least
@@ -185,7 +185,7 @@ fn fan_of(begin: u32, end: u32) -> Fan {
 
 @compute @workgroup_size(64)
 fn widen(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= frame.fans) { return; }
+  if (id.x >= frame.splats) { return; }
   let begin = fans[id.x];
   let end = fans[id.x + 1u];
   let fan = fan_of(begin, end);
@@ -329,9 +329,12 @@ fn bound_runs(@builtin(global_invocation_id) id: vec3u) {
 fn make_plan() {
   let needed = sums[blocks(frame.runs)];
   let n = select(0u, needed, needed <= frame.capacity);
-  let b = blocks(n);
   atomicStore(&counters[0], needed);
   atomicStore(&counters[1], n);
+  write_plan(n);
+}
+fn write_plan(n: u32) {
+  let b = blocks(n);
   plan_out[0] = b;
   plan_out[3] = blocks(256u * b);
   plan_out[6] = (n + 255u) / 256u;

@@ -7,7 +7,11 @@
 // blended yet, sorted. One that is nearer than all runs to come is blended. If there are more than K, the
 // farthest is dropped, and the list is walked again, behind the last fragment that was blended: the result is
 // exact for any K.
+//
+// In the order of the splats nothing waits: fragments are blended in the order of the list, those of a run from
+// its last triangle to the first.
 
+const BY_SPLAT = $BY_SPLAT;    // the order of the splats
 const K = $Ku;                 // fragments of the queue of each sample
 const OUTPUT = $OUTPUTu;       // 0: RGB of the vertices; 1: depth; 2: normals of vertices; 3: of faces
 const GROUPS = $GROUPS;        // whether the mesh has depth groups
@@ -136,7 +140,8 @@ fn drop(q: f32, face: u32) {
 // -------------------------------------------------------------------------------- fragments
 
 // The fragment of the triangle in a slot at the sample p, which it covers: adds it to the queue unless it is
-// blended already or lies behind what was dropped. `key` bounds it; `source` says where the triangle is from.
+// blended already or lies behind what was dropped; in the order of the splats, blends it. `key` bounds it;
+// `source` says where the triangle is from.
 fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32, source: u32) {
   let e = edges_at(slot, p);
   let scale = scales[slot];
@@ -160,8 +165,10 @@ fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32, source: u32) {
   }
   q = min(q, key);
   let face = ids[slot] & FACE;
-  if (!(q < floor_q || (q == floor_q && face > floor_face))) { return; }
-  if (q < limit_q || (q == limit_q && face > limit_face)) { return; }
+  if (!BY_SPLAT) {
+    if (!(q < floor_q || (q == floor_q && face > floor_face))) { return; }
+    if (q < limit_q || (q == limit_q && face > limit_face)) { return; }
+  }
   let w = b / sum;
   let v0 = corners[3u * slot];
   let v1 = corners[3u * slot + 1u];
@@ -176,7 +183,17 @@ fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32, source: u32) {
   if (!(value.w > 0.0) && !TRANSPARENT) { return; }
   if (OUTPUT == 1u) { value = vec4f(1.0 / depth, 0.0, 0.0, value.w); }
   if (OUTPUT >= 2u) { value = vec4f(facing(value.xyz, tile + p), value.w); }
-  insert(q, face, value, source);
+  if (BY_SPLAT) { blend(value, source); } else { insert(q, face, value, source); }
+}
+
+// Blends the nearest of the queue.
+fn blend_front() {
+  blend(queue_value[head], source_at(head));
+  floor_q = queue_key[head];
+  floor_face = queue_face[head];
+  advanced = true;
+  head = place(1u);
+  count--;
 }
 
 // The unit normal that faces the camera at the position p of the image; 0 for one without direction.
@@ -190,6 +207,9 @@ fn facing(n: vec3f, p: vec2f) -> vec3f {
 }
 
 // -------------------------------------------------------------------------------- tiles
+
+// Which triangle of its run is in a slot.
+fn face_of_slot(slot: u32) -> u32 { return select(slot % RUN, RUN - 1u - slot % RUN, BY_SPLAT); }
 
 fn add_wide(at: u32, value: u32) {  // to a counter of 64 bits
   let old = atomicAdd(&counters[at], value);
@@ -248,15 +268,19 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
     // No fragment to come is nearer than this.
     let nearest_to_come = unpack_depth(pairs[at].x);
     if (open) {
-      while (count > 0u && open && queue_key[head] > nearest_to_come) { blend_front(); open = is_open(); }
-      if (count == 0u && limit_q < 0.0) { clean = at; }
+      if (BY_SPLAT) {
+        clean = at;
+      } else {
+        while (count > 0u && open && queue_key[head] > nearest_to_come) { blend_front(); open = is_open(); }
+        if (count == 0u && limit_q < 0.0) { clean = at; }
+      }
       if (open) { atomicAdd(&open_count, 1u); }
     }
     let pair_at = at + t / RUN;
     if (pair_at < end) {
       let pair = pairs[pair_at];
       let run = unpack_run(mesh[frame.runs_at + (pair.y & 0xffffffu)]);
-      let k = t % RUN;
+      let k = face_of_slot(t);
       if (k == 0u) { keys[t / RUN] = unpack_depth(pair.x); }
       if (k < run.count) {
         if (set_up(t, run.first + k, o)) { atomicOr(&ready[t / 32u], 1u << (t % 32u)); }
@@ -302,15 +326,16 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
         if (hits.x != 0u) { slot = firstTrailingBit(hits.x); hits.x &= hits.x - 1u; }
         else { slot = 32u + firstTrailingBit(hits.y); hits.y &= hits.y - 1u; }
         let key = keys[slot / RUN];
-        if (count == K && queue_key[head] > key) { blend_front(); open = is_open(); }
-        if (open) { add_fragment(slot, p, o, key, RUN * at + slot); }
+        if (!BY_SPLAT && count == K && queue_key[head] > key) { blend_front(); open = is_open(); }
+        if (open) { add_fragment(slot, p, o, key, RUN * (at + slot / RUN) + face_of_slot(slot)); }
+        if (BY_SPLAT) { open = is_open(); }
       }
       atomicAdd(&efforts[t / 16u], effort);
       whole = whole && (rest.x | rest.y | near.x | near.y) == 0u && ((hits.x | hits.y) == 0u || !open);
     }
     at += RUN;
   }
-  if (open && !cut) {
+  if (!BY_SPLAT && open && !cut) {
     while (count > 0u && open) { blend_front(); open = is_open(); }
     whole = whole && (count == 0u || !open);
   }

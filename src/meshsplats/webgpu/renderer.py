@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 from meshsplats.webgpu import frames, kernels
 from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.frames import DrawSettings, MeshFrames, Output, Program, Work
 from meshsplats.webgpu.layout import halves, tiles_of
 
-_LIST_STEPS, _RASTER_STEPS = tuple(kernels.list_steps()), tuple(kernels.raster_steps())
+_LIST_STEPS = {order: tuple(kernels.list_steps(order)) for order in get_args(Order)}
+_RASTER_STEPS = tuple(kernels.raster_steps())
 _AGAIN_STEPS = tuple(kernels.again_steps())
 
 
@@ -54,8 +56,8 @@ def drawing_pipeline(
         queue = settings.queue if kernel == "raster" else settings.long_queue
         return device.pipeline(
             "raster",
-            ("raster", queue, blended, groups),
-            lambda: kernels.raster_source(queue, output=blended, groups=groups),
+            ("raster", queue, blended, groups, settings.order),
+            lambda: kernels.raster_source(queue, output=blended, groups=groups, order=settings.order),
         )
     return device.pipeline(kernel, ("lists",), kernels.lists_source)
 
@@ -110,13 +112,13 @@ class MeshRenderer:
             return images
         budgets = self._frames.device.budgets if settings.budget is None else (settings.budget,)
         with self._frames.lock:
-            self._frames.prepare_filter(settings)
+            self._frames.prepare(settings)
             passes = list(self._passes(images, values))
             waiting = [(0, 0, w, h)]
             while waiting:
                 window = waiting.pop()
                 if not fits(self._frames.device, window, settings.samples):
-                    waiting += halves(window)
+                    waiting += halves(window, settings.order)
                     continue
                 for budget in budgets:
                     try:
@@ -128,7 +130,7 @@ class MeshRenderer:
                         if budget == budgets[-1]:
                             raise
                 if not drawn:
-                    waiting += halves(window)
+                    waiting += halves(window, settings.order)
             images.work.bytes = self._frames.bytes
         return images
 
@@ -188,5 +190,5 @@ class MeshRenderer:
         self, output: Output, counts: dict[str, int], settings: DrawSettings, work: Work | None
     ) -> np.ndarray:
         """Renders one frame to the samples, until all tiles are finished; returns the counters."""
-        steps = (*_LIST_STEPS, *_RASTER_STEPS) if output == "color" else _RASTER_STEPS
+        steps = (*_LIST_STEPS[settings.order], *_RASTER_STEPS) if output == "color" else _RASTER_STEPS
         return self._frames.repeat(steps, _AGAIN_STEPS, output, counts, settings, work)[1]

@@ -44,6 +44,7 @@ fn begin_sample(t: u32, x: u32, y: u32) {
 }
 fn keep_source(at: u32, source: u32) { queue_source[at] = source; }
 fn move_source(to: u32, at: u32) { queue_source[to] = queue_source[at]; }
+fn source_at(at: u32) -> u32 { return queue_source[at]; }
 
 fn is_open() -> bool { return capped >= frame.min_transmittance; }
 
@@ -75,10 +76,9 @@ fn record(source: u32, value: vec4f, visible: f32) {
   last = place;
 }
 
-fn blend_front() {
-  let value = queue_value[head];
+fn blend(value: vec4f, source: u32) {
   let visible = select(0.0, through, through >= frame.min_transmittance);
-  record(queue_source[head], value, visible);
+  record(source, value, visible);
   if (visible > 0.0) {
     let weight = through * value.w;
     rgb = fma(vec3f(weight), value.xyz, rgb);
@@ -86,11 +86,6 @@ fn blend_front() {
     if (weight > 0.0) { blended++; }
   }
   capped = fma(-capped, min(value.w, MAX_ALPHA), capped);
-  floor_q = queue_key[head];
-  floor_face = queue_face[head];
-  advanced = true;
-  head = place(1u);
-  count--;
 }
 
 // Whether the sample ends within its queue. Rounding is why half of the limit is safe.

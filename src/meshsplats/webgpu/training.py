@@ -157,7 +157,7 @@ class Trainer:
                 area = waiting.pop()
                 window = self._taping.mark_window(tape, area, self._limit)
                 if window is None:
-                    waiting += halves(area)
+                    waiting += halves(area, settings.order)
                     continue
                 tape.windows.append(window)
                 self._write_step(tape, window.area, 0, background, rates)
@@ -201,7 +201,7 @@ class Trainer:
         """Makes room for an image, and uploads its target."""
         pixels = camera.width * camera.height
         assert pixels <= MAX_PIXELS
-        self._frames.prepare_filter(settings)
+        self._frames.prepare(settings)
         self._frames.allocate("image", 16 * pixels)
         self._frames.allocate("image_gradient", 16 * pixels)
         self._frames.allocate("derivatives", DERIVATIVE_BYTES * pixels)

@@ -6,7 +6,7 @@
 // then, without contraction, the value at the corner of a block of 4 x 4 samples plus that of the sample from
 // there.
 
-const CORE_TILE = 16u;
+const CORE_TILE = $CORE_TILEu;
 const NO_CONSTANT = 1e38;      // of an edge with an end nearer than the near plane
 
 // For the sample at `sample` in the tile with the corner o. Tiles of the core hold whole pixels.
@@ -178,7 +178,7 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
       line.x = flip * between(places[l].y, places[j].y).x;
       line.y = flip * between(places[j].x, places[l].x).x;
       constant[k] = flip * cross_of(places[j].x, places[l].y, places[l].x, places[j].y).x;
-      room = 2.5e-7 * (abs(line.x) + abs(line.y)) * (32.0 + abs(line.z) + abs(line.w));
+      room = 2.5e-7 * (abs(line.x) + abs(line.y)) * (2.0 * f32(CORE_TILE) + abs(line.z) + abs(line.w));
     }
     let far = f32(TILE) - 0.5;
     let best = edge_at(line, vec2f(select(0.5, far, line.x > 0.0), select(0.5, far, line.y > 0.0)), c);

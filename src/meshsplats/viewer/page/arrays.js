@@ -22,7 +22,8 @@ export function fitting(mesh, most, runs, groups) {
   const mostVertices = Math.min(room, 256 * DISPATCH);
   const mostFaces = Math.min(most / 4 / words, groups ? Math.min(room, 64 * DISPATCH) : Infinity,
     F * Math.min(1, (runs - 1) / all));
-  const mostFans = mesh.filter > 0 ? Math.min(64 * DISPATCH, most / 4 - 1) : Infinity;
+  const mostFans = mesh.filter > 0 ? Math.min(64 * DISPATCH, (most / 4 - 1) / 2)
+    : mesh.order === "splat" ? Math.min(256 * DISPATCH, (most / 4 - 1) / 2) : Infinity;
   if (V <= mostVertices && F <= mostFaces && n <= mostFans) return null;
   const importance = new Float32Array(n), point = k => vertices.subarray(3 * k, 3 * k + 3);
   for (let fan = 0; fan < n; fan++) {
@@ -80,7 +81,7 @@ export function frameUniform(
   split([fx, fy, cx, cy], 20, 56);
   floats.set([near, 1e-6, -1, filter], 24);
   words.set([width, height, Math.ceil(width / TILE), Math.ceil(height / TILE)], 28);
-  words.set([counts.vertices, counts.faces, counts.runs, counts.fans], 32);
+  words.set([counts.vertices, counts.faces, counts.runs, counts.splats], 32);
   words.set([counts.groups, capacity, 0, budget, ...offsets, 1], 36);
   return floats;
 }
@@ -100,6 +101,18 @@ export function findRuns(faces, splat) {
     runs.push((f | ((count - 1) << 29)) >>> 0);
   }
   return Uint32Array.from(runs);
+}
+
+// The first triangle of each splat, and the count of triangles; then the first run of each splat.
+export function findFans(splat, F) {
+  const starts = [], runs = [];
+  for (let f = 0, run = 0; f < F; f++) {
+    if (f > 0 && splat[f] === splat[f - 1]) continue;
+    if (f > 0) run += Math.ceil((f - starts.at(-1)) / RUN);
+    starts.push(f);
+    runs.push(run);
+  }
+  return Uint32Array.from([...starts, F, ...runs]);
 }
 
 // ofFace: the depth group of each face, without gaps, NONE for none; largest: the face of each with the

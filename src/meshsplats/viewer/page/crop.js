@@ -117,8 +117,8 @@ export function fanMiddles(mesh) {
 }
 
 // The mean of each fan's triangle centres.
-export function middlesOf({ vertices, faces }, fans) {
-  const middles = new Float32Array(3 * (fans.length - 1));
+export function middlesOf({ vertices, faces }, fans, Values = Float32Array) {
+  const middles = new Values(3 * (fans.length - 1));
   for (let fan = 0; fan + 1 < fans.length; fan++) {
     const weight = 1 / (3 * (fans[fan + 1] - fans[fan]));
     for (let i = 3 * fans[fan]; i < 3 * fans[fan + 1]; i++) {

@@ -1,7 +1,7 @@
 // WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in
 // the page as Python wrote them; docs/webgpu.md says what a host has to do.
 
-import { TILE, findGroups, findRuns, fitting, frameUniform } from "./arrays.js";
+import { TILE, findFans, findGroups, findRuns, fitting, frameUniform } from "./arrays.js";
 import { counting } from "./scene.js";
 
 const ROWS = 16; // strips of an image begin at multiples of it
@@ -147,7 +147,8 @@ export class ExactRenderer {
     const faces = pick(mesh.faces, 3), splat = pick(mesh.splat, 1), group = pick(mesh.group, 1);
     if (part) for (let i = 0; i < faces.length; i++) faces[i] = part.vertexOf[faces[i]];
     const vertices = part?.vertices ?? mesh.vertices, runs = findRuns(faces, splat), F = faces.length / 3;
-    const counts = { one: 1, vertices: vertices.length / 3, faces: F, runs: runs.length, fans: 0, groups: 0 };
+    const counts = { one: 1, vertices: vertices.length / 3, faces: F, runs: runs.length, splats: 0, fans: 0,
+      groups: 0 };
     let offsets = [3 * F, 0, 0];
     const parts = [faces, runs];
     if (this.kernels.groups) {
@@ -156,11 +157,11 @@ export class ExactRenderer {
       offsets = [3 * F, 3 * F + runs.length, 3 * F + runs.length + F];
       counts.groups = largest.length;
     }
-    if (mesh.filter > 0) {
-      const fans = [];
-      for (let f = 0; f < F; f++) if (f === 0 || splat[f] !== splat[f - 1]) fans.push(f);
-      counts.fans = fans.length;
-      this.#upload(`${level}/fans`, Uint32Array.from([...fans, F]));
+    if (mesh.filter > 0 || this.kernels.order === "splat") {
+      const fans = findFans(splat, F);
+      counts.splats = (fans.length - 1) / 2;
+      if (mesh.filter > 0) counts.fans = counts.splats;
+      this.#upload(`${level}/fans`, fans);
     }
     Object.assign(this.levels[level], { counts, offsets });
     const joined = new Uint32Array(parts.reduce((sum, one) => sum + one.length, 0));
@@ -262,9 +263,11 @@ export class ExactRenderer {
   #prepare(level, pinhole, filterScale) {
     const { width, height } = pinhole, { mesh, counts, offsets } = this.levels[level];
     this.tiles = Math.ceil(width / TILE) * Math.ceil(height / TILE);
-    const blocks = Math.ceil(this.capacity / 2048);
-    this.#allocate("pairs_a", 8 * this.capacity);
-    this.#allocate("pairs_b", 8 * this.capacity);
+    // In the order of the splats, the runs themselves are sorted first.
+    const room = Math.max(this.capacity, this.kernels.order === "splat" ? counts.runs : 0);
+    const blocks = Math.ceil(room / 2048);
+    this.#allocate("pairs_a", 8 * room);
+    this.#allocate("pairs_b", 8 * room);
     this.#allocate("table", 4 * 256 * blocks);
     this.#allocate("sums", 4 * (2 + Math.max(Math.ceil(256 * blocks / 2048), Math.ceil(counts.runs / 2048))));
     this.#allocate("lists", 16 * (this.tiles + 1));

@@ -51,6 +51,7 @@ export function decodeMesh({ header, row, rows }) {
   const mesh = {
     vertices: new Float32Array(3 * V), colors: new Float32Array(4 * V), faces: new Uint32Array(3 * F),
     splat: null, group: null, fans: null, blending: header.blending, filter: header.filter,
+    order: header.order ?? "fragment",
   };
   const steps = { ...header, row, rows, store: (v, x, y, z) => {
     mesh.vertices[3 * v] = x + header.origin[0];
@@ -64,9 +65,16 @@ export function decodeMesh({ header, row, rows }) {
     for (let c = 0; c < 3; c++) mesh.colors[4 * v + c] /= color;
     mesh.colors[4 * v + 3] /= alpha;
   }
-  mesh.fans ??= counting(F + 1);
+  mesh.fans ??= mesh.order === "splat" ? startsOf(mesh.splat) : counting(F + 1);
   if (header.group >= 0) mesh.group = Int32Array.from(row(header.group));
   return mesh;
+}
+
+// First triangle of each splat, and their count at the end.
+function startsOf(splat) {
+  const starts = [];
+  splat.forEach((name, f) => { if (f === 0 || name !== splat[f - 1]) starts.push(f); });
+  return Uint32Array.from([...starts, splat.length]);
 }
 
 // Strays, as the two halves of their bits, into points (3 floats each).

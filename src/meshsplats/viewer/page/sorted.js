@@ -1,8 +1,9 @@
 // WebGL2: the mesh with its triangles sorted by their centres, and the splats. Not exact, as triangles that
-// overlap in depth are not split, but quick, and it runs where WebGPU is missing.
+// overlap in depth are not split, but quick, and it runs where WebGPU is missing. A mesh in the order of its
+// splats is blended in that order.
 
 import { fanMiddles, middlesOf } from "./crop.js";
-import { depthsOf, sortFarToNear } from "./order.js";
+import { depthsOf, sortFarToNear, sortFarToNearExactly } from "./order.js";
 import { counting } from "./scene.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
@@ -119,11 +120,13 @@ export class SortedRenderer {
     this.programs.mesh ??= program(gl, MESH_VERTEX, MESH_FRAGMENT);
     const bytes = new Uint8Array(4 * V);
     for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
-    const middles = fanMiddles(mesh), centers = fans.length - 1 === F ? middles
+    // In the order of the splats, the centres have the precision of the core's.
+    const bySplat = mesh.order === "splat", middles = bySplat ? middlesOf(mesh, fans, Float64Array)
+      : fanMiddles(mesh), centers = bySplat || fans.length - 1 === F ? middles
       : middlesOf(mesh, counting(F + 1));
     this.triangles[level] = {
-      ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans,
-        order: new Uint32Array(F),
+      ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans, bySplat,
+      order: new Uint32Array(F),
       depths: new Float32Array(F), fanDepths: new Float32Array(fans.length - 1),
       fanOrder: new Uint32Array(fans.length - 1), count: 0,
     };
@@ -166,8 +169,9 @@ export class SortedRenderer {
 
   // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of
   // the canvas transparent. scale: size of the image in that of the canvas; still: triangles are sorted one
-  // by one, not fan by fan, and the device may take its time, unless stop() says that the image is not wanted
-  // any more: then the canvas stays as it is, and the result is false.
+  // by one, not fan by fan, unless the mesh is in the order of its splats, and the device may take its time,
+  // unless stop() says that the image is not wanted any more: then the canvas stays as it is, and the result
+  // is false.
   async draw({ view, level, parts, style, still, scale, background, gain, stop }) {
     const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
     const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h), images = [];
@@ -237,14 +241,15 @@ export class SortedRenderer {
 
   #sortMesh(all, pinhole, still) {
     const row = pinhole.rows[2];
-    if (still || all.fans.length - 1 === all.order.length) {
+    if (!all.bySplat && (still || all.fans.length - 1 === all.order.length)) {
       depthsOf(all.centers, row, pinhole.near, all.depths);
       sortFarToNear(all.depths, all.items, all.order);
       all.count = all.items.length;
       return;
     }
-    depthsOf(all.middles, row, pinhole.near, all.fanDepths);
-    sortFarToNear(all.fanDepths, all.fanItems, all.fanOrder);
+    depthsOf(all.middles, row, all.bySplat ? -Infinity : pinhole.near, all.fanDepths);
+    const sort = all.bySplat ? sortFarToNearExactly : sortFarToNear;
+    sort(all.fanDepths, all.fanItems, all.fanOrder);
     let at = 0;
     for (let i = 0; i < all.fanItems.length; i++) {
       const fan = all.fanOrder[i];
