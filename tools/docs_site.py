@@ -30,6 +30,7 @@ NAVIGATION = {
     "Tutorials": ["docs/tutorials/from_a_splat_file", "docs/tutorials/from_photographs"],
     "Using it": [
         *("docs/install", "docs/commands", "docs/python", "docs/files", "docs/quality", "docs/options"),
+        "docs/view-dependent-colour",
         *("docs/large-captures", "docs/pipelines", "docs/finetuning", "docs/levels", "docs/mesh-prior"),
         "docs/datasets",
         *("docs/blender", "docs/viewers", "docs/cluster", "examples"),

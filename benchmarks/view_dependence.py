@@ -1,0 +1,114 @@
+"""What colours that depend on the view are worth and cost, by degree of the harmonics.
+
+    python benchmarks/view_dependence.py --data ../shared/data
+    python benchmarks/view_dependence.py --data ../shared/data --splats capture.ply --steps 150
+
+PSNR of conversions against the splats with all their harmonics, look "area", in eight views from around, in
+both orders of blending; size of the files; processor milliseconds of shading, and of a picture of 800 pixels
+with it. With --steps also of a fine-tuning of that many steps, on views that it was not tuned on, and of what
+programs without harmonics then show (``plain``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from _common import PHOTOGRAPHED, SCENES, Report, Stopwatch, areas, arguments, images, mean_psnr
+
+import meshsplats as ms
+from meshsplats.finetuning import make_config, starting_mesh
+from meshsplats.rendering.shading import Shading
+
+VIEWS, SIDE, LARGE = 8, 400, 800
+REPEATS = 5
+
+
+def main() -> None:
+    parser = arguments(__doc__, data=True)
+    parser.add_argument("--splats", type=Path, nargs="+", help="these files, in place of playbot and lego")
+    parser.add_argument("--steps", type=int, default=0)
+    options = parser.parse_args()
+    known = [SCENES["playbot"].splats, PHOTOGRAPHED["lego-sh3"].splats]
+    paths = options.splats or [options.data / "splats" / name for name in known]
+    with Report(options) as report:
+        report.table(
+            *("scene", "degree", "dB, fragment", "dB, splat", ".npz MB", ".glb MB"),
+            *("shading ms a million triangles", "picture ms", "of it shading"),
+        )
+        for path in paths:
+            conversions(report, path)
+        if options.steps:
+            report.table("scene", "degree", "steps", "dB, converted", "dB, tuned", "dB, plain", "seconds")
+            for path in paths:
+                tunings(report, path, options)
+
+
+def degrees(cloud: ms.GaussianCloud) -> list[int]:
+    return list(range(cloud.sh_degree + 1))
+
+
+def conversions(report: Report, path: Path) -> None:
+    cloud = ms.load_gaussians(path)
+    cameras = ms.orbit(cloud, VIEWS, width=SIDE, height=SIDE)
+    truths = areas(cloud, cameras)
+    large = cameras[0].scaled(LARGE / SIDE)
+    whole = ms.convert(cloud)
+    for degree in degrees(cloud):
+        mesh = whole.of_degree(degree)
+        found = [
+            f"{mean_psnr(images(mesh, cameras, samples=2, order=order), truths):.2f}"
+            for order in ("fragment", "splat")
+        ]
+        watch = Stopwatch()
+        for _ in range(REPEATS):
+            ms.render(mesh, large)
+        picture = watch.processor / REPEATS
+        shading = 0.0
+        if degree:
+            watch = Stopwatch()
+            for _ in range(REPEATS):
+                Shading(mesh.triangles, large)
+            shading = watch.processor / REPEATS
+        report.row(
+            *(path.stem, degree, *found, *(f"{size:.1f}" for size in sizes(mesh))),
+            f"{1e9 * shading / len(mesh.faces):.1f}",
+            f"{1e3 * picture:.0f}",
+            f"{shading / picture:.1%}",
+        )
+
+
+def sizes(mesh: ms.SplatMesh) -> list[float]:
+    """MB of the mesh as .npz and as .glb."""
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix in (".npz", ".glb"):
+            file = Path(folder) / f"mesh{suffix}"
+            ms.save_mesh(mesh, file)
+            found.append(file.stat().st_size / 1e6)
+    return found
+
+
+def tunings(report: Report, path: Path, options: argparse.Namespace) -> None:
+    cloud = ms.load_gaussians(path)
+    data = ms.splat_dataset(cloud, train=100, test=VIEWS, width=SIDE, height=SIDE)
+    config = make_config(steps=options.steps)
+    start = starting_mesh(cloud, [view.camera for view in data.train], config=config)
+    cameras = [view.camera for view in data.test]
+    truths = [view.image for view in data.test]
+    for degree in degrees(cloud):
+        before = start.of_degree(degree)
+        watch = Stopwatch()
+        tuned = ms.finetune(before, replace(data), config)
+        seconds = watch.processor
+        found = [
+            f"{mean_psnr(images(mesh, cameras, samples=2), truths):.2f}"
+            for mesh in (before, tuned, tuned.plain)
+        ]
+        report.row(path.stem, degree, options.steps, *found, f"{seconds:.0f}")
+
+
+if __name__ == "__main__":
+    main()
