@@ -12,10 +12,8 @@ WRAP_UP_SECONDS = 1.5
 """Time that a run with a length in minutes reserves for writing the mesh and rendering its preview. In short
 runs it is a hundredth of the length."""
 
-PLAIN_VIEWS = 16
-"""Largest number of views for the plain colours of a result."""
-PLAIN_SHARE = 0.04
-"""Largest share of a run with a length in minutes for them, but for one view."""
+PLAIN_SHARE = 0.1
+"""Largest share of a run with a length in minutes for the plain colours of its result, but for one image."""
 
 
 class Clock:
@@ -32,8 +30,8 @@ class Clock:
         step: number of steps taken, counted by the loop.
         steps: total number of steps; None if the length is given in minutes.
         step_cost, report_cost, save_cost: seconds of the last step, report and checkpoint.
-        plain_views: number of views for the plain colours of the result, each of which takes about as long as
-            a step; 0: it has none.
+        plain_images: number of images for the plain colours of the result, each of which takes about as long
+            as a step; 0: it has none.
     """
 
     def __init__(
@@ -41,7 +39,7 @@ class Clock:
     ) -> None:
         self.step, self.steps = step, config.total_steps(views)
         self.step_cost = self.report_cost = self.save_cost = 0.0
-        self.plain_views = 0
+        self.plain_images = 0
         self._minutes, self._reserve = config.minutes, reserve
         self._began = time.perf_counter() - seconds
         self._first_step, self._first_seconds = step, self.seconds
@@ -58,13 +56,13 @@ class Clock:
             return None
         total = 60 * self._minutes
         reserve = 1.5 * (self.report_cost + self.save_cost) + self.step_cost + self._reserve
-        reserve += self.plain_views * self.step_cost
+        reserve += self.plain_images * self.step_cost
         return max(total - (reserve + min(0.01 * total, WRAP_UP_SECONDS)), 0)
 
-    def plan_plain_views(self) -> None:
-        """Sets ``plain_views`` by the cost of the last step."""
+    def plan_plain_images(self, most: int) -> None:
+        """Sets ``plain_images``, at most ``most``, by the cost of the last step."""
         share = np.inf if self._minutes is None else PLAIN_SHARE * 60 * self._minutes
-        self.plain_views = int(min(max(share / max(self.step_cost, 1e-9), 1), PLAIN_VIEWS))
+        self.plain_images = int(min(max(share / max(self.step_cost, 1e-9), 1), most))
 
     @property
     def fraction(self) -> float:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, subsample
+from meshsplats._arrays import checked_array
 from meshsplats._kinds import described, need, need_path
 from meshsplats._options import Range, check_options
 from meshsplats._origin import need_one_origin
@@ -32,13 +32,13 @@ from meshsplats.finetuning.loss import DefaultLoss, Loss, loss_name
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.phases.choice import PHASE_ARRAYS, check_phases, first_phase
 from meshsplats.finetuning.phases.phase import Moment, Phase
+from meshsplats.finetuning.plain import most_images, with_plain_colors
 from meshsplats.finetuning.reports import Reports, scored_count
 from meshsplats.finetuning.state import State, order_of
 from meshsplats.finetuning.step import make_step
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Device
-from meshsplats.rendering.plain_colors import plain_colors_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -331,7 +331,7 @@ class TrainingLoop:
         loss = make_step(self.state, views, clock.step, fraction, phase, self.loss)
         clock.step_cost = time.perf_counter() - start
         if self.state.harmonics is not None:
-            clock.plan_plain_views()
+            clock.plan_plain_images(most_images(clock.step + 1))
         clock.step += 1
         if loss is not None:
             self.losses.append(loss)
@@ -358,11 +358,10 @@ class TrainingLoop:
     def finished(self) -> SplatMesh:
         """``result``, with plain colours for programs that draw no harmonics."""
         mesh = self.result()
-        if mesh.harmonics is None or not self.clock.plain_views:
+        images = self.clock.plain_images
+        if mesh.harmonics is None or not images:
             return mesh
-        views = subsample(self.dataset.train, self.clock.plain_views)
-        cameras = [view.camera for view in views]
-        return replace(mesh, plain_colors=plain_colors_of(mesh, cameras, threads=self.options.threads))
+        return with_plain_colors(mesh, self.dataset, self.config, images, threads=self.options.threads)
 
     def _report(self) -> None:
         """Scores the held-out views and writes a line of the metrics."""
