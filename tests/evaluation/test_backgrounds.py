@@ -63,7 +63,7 @@ def test_photographs_show_what_splats_were_trained_over(cloud, name):
 
 
 def test_meshes_of_linear_light_are_judged_as_they_are_drawn(cloud):
-    mesh = replace(convert(cloud), blending="linear")
+    mesh = replace(convert(cloud, colors="base"), blending="linear")
     found = find_background(photographs(mesh, COLORS["white"]), {"mesh": mesh})
     assert found.name == "white"
     assert found.psnr["mesh"]["white"] > 60
@@ -84,7 +84,7 @@ def test_what_is_named_and_given_goes_before_with_a_warning_where_it_matters(clo
     assert (found.name, found.reason) == ("#ff8000", "given")
     assert set(found.psnr["splats"]) == {"black", "white", "#ff8000"}
     # A mesh that was made for something else than the splats is named, too.
-    painted = convert(cloud)
+    painted = convert(cloud, colors="base")
     painted = replace(painted, colors=np.concatenate([1 - painted.colors[:, :3], painted.colors[:, 3:]], 1))
     mixed = Dataset(photographs(cloud, (0, 0, 0)).train + photographs(painted, (1, 1, 1)).train * 2)
     with pytest.warns(DataWarning, match="the mesh scores"):

@@ -48,7 +48,8 @@ def scene():
 
 def same(a: SplatMesh, b: SplatMesh) -> bool:
     return all(
-        np.array_equal(getattr(a, n), getattr(b, n)) for n in ("vertices", "faces", "colors", "face_splat")
+        np.array_equal(getattr(a, n), getattr(b, n))
+        for n in ("vertices", "faces", "colors", "face_splat", "harmonics", "plain_colors")
     )
 
 

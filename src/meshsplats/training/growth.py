@@ -184,6 +184,8 @@ def select_fans(state: State, kept: np.ndarray, halved: np.ndarray | None = None
         "colors": colors.reshape(-1, 4),
         "face_splat": np.repeat(np.arange(n, dtype=np.int32), sides),
     }
+    if state.harmonics is not None:  # both halves inherit them as they are now
+        arrays["harmonics"] = state.harmonics[source]
     grown = replace(mesh, **arrays)
     result = state.rebuild(grown, rows, sizes.ravel())
     fresh = np.concatenate([place, np.arange(len(kept), n)])
