@@ -294,6 +294,7 @@ class TrainingLoop:
         self.held_out: float | None = None
         scored = scored_count(start.journal) if start.journal is not None and start.step else None
         self.reports = Reports(self.dataset, self.config, options.threads, options.device, scored)
+        self._plan_plain_images()
         self.quarter = int(MIN_PREVIEWS * clock.fraction)
 
     def run(self) -> SplatMesh:
@@ -330,9 +331,8 @@ class TrainingLoop:
         views = phase.views(self.dataset.train, fraction)
         loss = make_step(self.state, views, clock.step, fraction, phase, self.loss)
         clock.step_cost = time.perf_counter() - start
-        if self.state.harmonics is not None:
-            clock.plan_plain_images(most_images(clock.step + 1))
         clock.step += 1
+        self._plan_plain_images()
         if loss is not None:
             self.losses.append(loss)
             self.last_loss = loss
@@ -354,6 +354,10 @@ class TrainingLoop:
     def result(self) -> SplatMesh:
         """The current mesh, as the phase hands it over."""
         return self.phase.result(self.state)
+
+    def _plan_plain_images(self) -> None:
+        if self.state.harmonics is not None and self.clock.step:
+            self.clock.plan_plain_images(most_images(self.clock.step))
 
     def finished(self) -> SplatMesh:
         """``result``, with plain colours for programs that draw no harmonics."""
