@@ -91,7 +91,8 @@ def vertex_tables(
         tables = {"_BASE": mesh.colors}
     else:
         base = mesh.colors / np.float32([scales.base] * 3 + [1])
-        tables = {"_BASE": np.rint(base * np.float32(65535)).astype(np.uint16)}
+        # Rounded as COLOR_0 is: the opacity is the same number in both.
+        tables = {"_BASE": (base * np.float32(65535) + np.float32(0.5)).astype(np.uint16)}
     if harmonics is None:
         return tables
     count, terms, _ = harmonics.shape
