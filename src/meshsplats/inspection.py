@@ -151,6 +151,8 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
     if len(mesh.vertices):
         found |= _extent(mesh.vertices, scene_bounds(mesh), mesh.origin)
         found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
+    if mesh.sh_degree:
+        found["harmonics_drawn_by"] = "meshsplats; shaders of docs/viewers.md; others show plain colours"
     if mesh.binding is not None:
         base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"
         found["bound_to_base_of"] = base

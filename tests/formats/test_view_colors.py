@@ -13,7 +13,14 @@ import pytest
 from _meshes import assert_same, fan_mesh
 from test_mesh_foreign import edit_glb
 
-from meshsplats import DataWarning, FileFormatError, drawing_order, load_mesh, save_mesh
+from meshsplats import (
+    DataWarning,
+    FileFormatError,
+    MissingDependencyError,
+    drawing_order,
+    load_mesh,
+    save_mesh,
+)
 from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.meshes import expected_bytes
 from meshsplats.spherical_harmonics import sh_basis
@@ -69,8 +76,9 @@ def test_other_programs_see_plain_colours(tmp_path, suffix, plain):
     mesh = mesh_of(2, plain=plain)
     path = tmp_path / f"m{suffix}"
     if suffix == ".obj":
-        with pytest.warns(DataWarning, match="left out: face_splat, harmonics, flat"):
+        with pytest.warns(DataWarning, match=r"m\.obj: harmonics are left out") as caught:
             save_mesh(mesh, path)
+        assert any("left out: face_splat, flat" in str(each.message) for each in caught)
         lines = path.read_text().splitlines()
         seen = np.array([line.split()[4:] for line in lines if line.startswith("v ")], float)
     else:
@@ -117,6 +125,15 @@ def test_usd_passes_the_validators_of_usd(tmp_path):
     assert [
         str(error.GetMessage()) for error in context.Validate(Usd.Stage.Open(str(tmp_path / "m.usda")))
     ] == []
+
+
+def test_compression_says_what_it_leaves_out(tmp_path, monkeypatch):
+    monkeypatch.setenv("MESHSPLATS_GLTFPACK", str(tmp_path / "none"))
+    with (
+        pytest.warns(DataWarning, match="harmonics are left out, compression has no place for them"),
+        pytest.raises(MissingDependencyError),
+    ):
+        save_mesh(mesh_of(1), tmp_path / "m.glb", compression="meshopt")
 
 
 def accessor_of(path, name):

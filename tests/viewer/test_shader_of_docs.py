@@ -22,7 +22,7 @@ import _browser
 from _needs import lacking
 
 DOCS = Path(__file__).parents[2] / "docs" / "viewers.md"
-THREE = os.environ.get("MESHSPLATS_THREE")
+THREE = os.environ.get("MESHSPLATS_NODE_FOLDER")
 PAGE = """<!doctype html><style>body {margin: 0}</style><canvas id="c"></canvas>
 <script type="importmap">{"imports": {"three": "./node_modules/three/build/three.module.js",
   "three/addons/": "./node_modules/three/examples/jsm/"}}</script>
@@ -69,7 +69,7 @@ def drawing(tmp_path_factory):
     if _browser.PROGRAM is None:
         lacking("browser", "no Chromium was found")
     if THREE is None:
-        pytest.skip("set MESHSPLATS_THREE to a folder where 'npm install three' was run")
+        pytest.skip("set MESHSPLATS_NODE_FOLDER to a folder where 'npm install three' was run")
     folder = tmp_path_factory.mktemp("three")
     (folder / "node_modules").symlink_to(Path(THREE) / "node_modules")
     snippet = re.search(r"```js\n(.*?)```", DOCS.read_text("utf-8"), re.DOTALL)[1]

@@ -172,8 +172,8 @@ def save_mesh(
         cutoff: (with 'opaque' and 'mask'; default 0.2) least opacity that is drawn, 0 to 1.
         compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
             gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
-            order of triangles changes a little; splat indices and attributes are left out. Such files are for
-            viewers; ``load_mesh`` does not read them.
+            order of triangles changes a little; splat indices, attributes and harmonics are left out. Such
+            files are for viewers; ``load_mesh`` does not read them.
         order: (`.glb`) that of ``drawing_order``, for web viewers and engines, which blend triangles as they
             are listed: each is written twice, with both windings and a single-sided material, in this order.
             Not for ray tracers, Blender and CesiumJS, which do not cull translucent triangles and draw both.
@@ -239,6 +239,14 @@ def save_mesh(
             f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"
             " other programs do not have: from afar it will look thin there. Make it part of the triangles"
             " for the views that count: bake_filter(mesh, cameras), or meshsplats bake",
+            DataWarning,
+            stacklevel=2,
+        )
+    if mesh.harmonics is not None and (suffix == ".obj" or "compression" in options):
+        what = "compression" if "compression" in options else ".obj"
+        warnings.warn(
+            f"{target.name}: harmonics are left out, {what} has no place for them: colours will be the same"
+            " from everywhere. bake --colors (plain_colors_of) makes them the mean of what given views show",
             DataWarning,
             stacklevel=2,
         )

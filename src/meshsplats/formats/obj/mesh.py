@@ -31,7 +31,7 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
     where the mesh has an origin; the up direction and the origin are in comments, which ``load_mesh`` reads
     and other programs ignore.
     """
-    lost = [f.name for f in mesh.extras() if f.name != "plain_colors"] + list(mesh.attributes)
+    lost = [f.name for f in mesh.extras() if f.per == "face"] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
     if translucent:
         more = f"; also left out: {', '.join(n[:40] for n in lost[:8])}" if lost else ""
