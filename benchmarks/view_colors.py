@@ -2,8 +2,9 @@
 
     python benchmarks/view_colors.py SPLATS ...
 
-For each degree the conversion is saved and read again. dB compare the image of the file with that of the mesh, four
-views of ``orbit(cloud, 4, elevation=20)`` on white, 400 pixels wide. ``texcoords`` is `.glb` for engines.
+For each degree the conversion is saved and read again. dB compare the image of the file with that of the
+mesh, four views of ``orbit(cloud, 4, elevation=20)`` on white, 400 pixels wide. ``texcoords`` is `.glb` for
+engines.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def vertex_tables(
     if exact:
         tables = {"_BASE": mesh.colors}
     else:
-        base = mesh.colors / np.float32([scales.base] * 3 + [1])
+        base = mesh.colors / np.array([*[scales.base] * 3, 1], np.float32)
         # Rounded as COLOR_0 is: the opacity is the same number in both.
         tables = {"_BASE": (base * np.float32(65535) + np.float32(0.5)).astype(np.uint16)}
     if harmonics is None:
