@@ -41,8 +41,31 @@ def random_mesh(rng, vertices=9, faces=12, *, extras=True, blending="display"):
     return mesh
 
 
-def assert_same(got, mesh, color_error=0.0):
-    """All arrays equal, bit by bit; colours within ``color_error``."""
+def fan_mesh(rng, splats=7, degree=2, *, plain=True, extras=True):
+    """Splats of two triangles each, some with colours above white, and a vertex that none uses: with
+    harmonics unless ``degree`` is 0."""
+    v = 4 * splats + 1
+    corners = 4 * np.arange(splats)[:, None, None] + [[0, 1, 2], [0, 2, 3]]
+    rgb = rng.random((v, 3)) * 1.6
+    more = {}
+    if degree:
+        more["harmonics"] = rng.normal(size=(splats, (degree + 1) ** 2 - 1, 3)) / 4
+    if plain:
+        more["plain_colors"] = rng.random((v, 3))
+    if extras:
+        more["attributes"] = {"flat": rng.normal(size=v)}
+    return SplatMesh(
+        rng.normal(size=(v, 3)),
+        corners.reshape(-1, 3),
+        np.column_stack([rgb, rng.random(v)]),
+        face_splat=np.repeat(3 * np.arange(splats) + 2, 2),
+        up=rng.normal(size=3),
+        **more,
+    )
+
+
+def assert_same(got, mesh, color_error=0.0, harmonic_error=0.0):
+    """All arrays equal, bit by bit; colours within ``color_error``, harmonics within ``harmonic_error``."""
     np.testing.assert_array_equal(got.vertices, mesh.vertices)
     np.testing.assert_array_equal(got.faces, mesh.faces)
     assert np.abs(got.colors - mesh.colors).max(initial=0) <= color_error
@@ -50,7 +73,8 @@ def assert_same(got, mesh, color_error=0.0):
         if getattr(mesh, name) is None:
             assert getattr(got, name) is None
         else:
-            np.testing.assert_array_equal(getattr(got, name), getattr(mesh, name))
+            within = {"plain_colors": color_error, "harmonics": harmonic_error}.get(name, 0)
+            np.testing.assert_allclose(getattr(got, name), getattr(mesh, name), rtol=0, atol=within)
     np.testing.assert_allclose(got.up, mesh.up, atol=1e-6)  # the mesh scales it to unit length again
     assert (got.blending, got.filter_px2) == (mesh.blending, mesh.filter_px2)
     assert got.order == mesh.order

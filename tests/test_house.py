@@ -32,6 +32,8 @@ WIDER = {
     "evaluation/comparison.py: compare_views": "public",
     "evaluation/report.py: _scores": "being divided",
     "evaluation/report.py: evaluate": "public",
+    "formats/gltf/writer.py: write_glb": "as public",
+    "formats/meshes.py: save_mesh": "public",
     "rendering/api.py: render": "public",
     "rendering/autograd.py: rasterize": "public",
     "rendering/reference.py: render": "as in the library",

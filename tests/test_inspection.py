@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
+from _meshes import fan_mesh
 from _splats import few_splats
 
 from meshsplats import convert
@@ -46,3 +48,15 @@ def test_missing_libraries_are_named_as_pip_takes_them(monkeypatch):
     assert "gpu" in missing
     assert {name[:4] for names in missing.values() for name in names} == {"wgpu"}
     json.dumps(found)
+
+
+def test_a_mesh_says_whether_its_colours_depend_on_the_view(tmp_path):
+    mesh = fan_mesh(np.random.default_rng(0), degree=2)
+    save_mesh(mesh, tmp_path / "m.glb")
+    found = describe(tmp_path / "m.glb")
+    assert (found["sh_degree"], found["plain_colors"], found["colors_above_white"]) == (2, True, True)
+    assert "others show plain colours" in found["harmonics_drawn_by"]
+    save_mesh(mesh.of_degree(0), tmp_path / "m.glb")
+    found = describe(tmp_path / "m.glb")
+    assert (found["sh_degree"], found["plain_colors"], found["colors_above_white"]) == (0, False, False)
+    assert "harmonics_drawn_by" not in found

@@ -151,6 +151,8 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
     if len(mesh.vertices):
         found |= _extent(mesh.vertices, scene_bounds(mesh), mesh.origin)
         found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
+    if mesh.sh_degree:
+        found["harmonics_drawn_by"] = "meshsplats; shaders of docs/viewers.md; others show plain colours"
     if mesh.binding is not None:
         base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"
         found["bound_to_base_of"] = base
@@ -159,6 +161,9 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
         "blending": mesh.blending,
         "filter_px2": mesh.filter_px2,
         "order": mesh.order,
+        "sh_degree": mesh.sh_degree,
+        "plain_colors": mesh.plain_colors is not None,
+        "colors_above_white": bool(mesh.colors.max(initial=0) > 1),
         "normals": mesh.normals is not None,
         "depth_groups": mesh.depth_group is not None,
         "attributes": list(mesh.attributes),

@@ -83,6 +83,14 @@ def turned_harmonics(harmonics: np.ndarray, rotations: np.ndarray) -> np.ndarray
     return turned
 
 
+def moved_harmonics(harmonics: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """(s, k, 3) float32 ``harmonics`` (s, k, 3) of degree 1 and more, all turned as points x move to ``matrix
+    @ x``: by the rotation or mirror that is nearest to (3, 3) ``matrix``."""
+    u, _, v = np.linalg.svd(matrix)
+    turn = harmonics_map(u @ v, int((harmonics.shape[1] + 1) ** 0.5) - 1)
+    return np.ascontiguousarray(turn @ harmonics, np.float32)
+
+
 def _spiral(count: int) -> np.ndarray:
     """(count, 3) unit directions on a Fibonacci spiral."""
     i = np.arange(count) + 0.5

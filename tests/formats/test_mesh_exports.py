@@ -48,7 +48,7 @@ def test_usd(tmp_path, suffix, lit):
     np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-7)
     color, opacity = shape.GetDisplayColorPrimvar(), shape.GetDisplayOpacityPrimvar()
     assert color.GetInterpolation() == opacity.GetInterpolation() == "vertex"
-    np.testing.assert_allclose(np.array(color.Get()), srgb_to_linear(mesh.colors[:, :3]), atol=1e-7)
+    np.testing.assert_allclose(np.array(color.Get()), srgb_to_linear(mesh.plain_colors), atol=1e-7)
     np.testing.assert_array_equal(np.array(opacity.Get()), mesh.colors[:, 3])
     np.testing.assert_array_equal(np.array(shape.GetNormalsAttr().Get()), mesh.normals)
     primvars = UsdGeom.PrimvarsAPI(shape)
@@ -119,7 +119,7 @@ def test_obj_keeps_positions_colours_and_up(tmp_path):
     got = load_mesh(tmp_path / "m.obj")
     np.testing.assert_array_equal(got.vertices, MESH.vertices)
     np.testing.assert_array_equal(got.faces, MESH.faces)
-    np.testing.assert_array_equal(got.colors[:, :3], MESH.colors[:, :3])
+    np.testing.assert_array_equal(got.colors[:, :3], MESH.plain_colors)
     assert (got.colors[:, 3] == 1).all()
     np.testing.assert_allclose(got.up, MESH.up, atol=1e-6)
 
@@ -147,7 +147,7 @@ def test_obj_of_a_mesh_for_linear_blending_has_display_colours(tmp_path):
 
 def test_trimesh_reads_our_obj(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    mesh = replace(MESH, normals=None, colors=np.hstack([MESH.colors[:, :3], np.ones((20, 1))]))
+    mesh = replace(MESH, normals=None, colors=np.hstack([MESH.plain_colors, np.ones((20, 1))]))
     save_mesh(mesh, tmp_path / "m.obj")
     got = trimesh.load(tmp_path / "m.obj", process=False, maintain_order=True)
     np.testing.assert_array_equal(got.vertices.astype(np.float32), mesh.vertices)

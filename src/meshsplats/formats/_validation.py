@@ -100,7 +100,7 @@ def straight_colors(colors: np.ndarray, path: Path, brightest: float = 1) -> np.
         raise FileFormatError(f"{path}: colours must be floats or unsigned integers, got {colors.dtype}")
     with np.errstate(over="ignore"):
         result[:, : colors.shape[1]] = colors
-    most = np.float32([brightest, brightest, brightest, 1])
+    most = np.array([brightest, brightest, brightest, 1], np.float32)
     # Values that are not finite are left to the check of SplatMesh, which names their row.
     if ((result < 0) | (result > most)).any() and np.isfinite(result).all():
         # A rounding error needs no warning.

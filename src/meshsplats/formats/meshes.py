@@ -20,6 +20,7 @@ from meshsplats.formats.content import Content
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
 from meshsplats.formats.gltf.reader import read_gltf
+from meshsplats.formats.gltf.view_colors import Harmonics, stored_bytes
 from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.formats.npz import read_npz, write_npz
 from meshsplats.formats.obj.mesh import read_obj, write_obj
@@ -48,6 +49,7 @@ _OPTION_SUFFIXES = {
     "alpha": _GLB,
     "compression": _GLB,
     "order": _GLB,
+    "harmonics": _GLB,
 }
 
 MESH_SUFFIXES = tuple(_WRITERS)
@@ -131,14 +133,18 @@ def save_mesh(
     cutoff: float | None = None,
     compression: Compression | None = None,
     order: DrawOrder | None = None,
+    harmonics: Harmonics | None = None,
 ) -> None:
     """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all.
 
     - `.npz`, `.ply` keep everything exactly, `.ply` without the binding to a base mesh.
-    - `.glb` keeps colours as linear values of 16 bits (within 1/2000 as display values), the rest exactly.
-    - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat indices and attributes become
-      primvars. They need the extra ``usd``.
-    - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
+    - `.glb` keeps colours as linear values of 16 bits (within 1/2000 as display values), harmonics as 8 bits
+      of the largest one, the rest exactly.
+    - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat indices, harmonics and attributes
+      become primvars. They need the extra ``usd``.
+    - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning, and harmonics.
+
+    Programs that draw no harmonics see ``mesh.plain``: its ``plain_colors``, or ``colors`` up to 1.
 
     Every format puts a mesh with an ``origin`` at its place in the world: as the translation of a node
     (`.glb`, USD), as double or decimal coordinates (`.ply`, `.obj`), as an array of its own (`.npz`). Read
@@ -166,12 +172,14 @@ def save_mesh(
         cutoff: (with 'opaque' and 'mask'; default 0.2) least opacity that is drawn, 0 to 1.
         compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
             gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
-            order of triangles changes a little; splat indices and attributes are left out. Such files are for
-            viewers; ``load_mesh`` does not read them.
+            order of triangles changes a little; splat indices, attributes and harmonics are left out. Such
+            files are for viewers; ``load_mesh`` does not read them.
         order: (`.glb`) that of ``drawing_order``, for web viewers and engines, which blend triangles as they
             are listed: each is written twice, with both windings and a single-sided material, in this order.
             Not for ray tracers, Blender and CesiumJS, which do not cull translucent triangles and draw both.
             ``load_mesh`` returns the mesh as it was. Without lit, compression, and alpha but 'blend'.
+        harmonics: (`.glb`; default 'attributes') 'texcoords' keeps them, and base colours of 8 bits, as
+            texture coordinates, which engines import: docs/viewers.md has the shaders.
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh.
@@ -194,6 +202,7 @@ def save_mesh(
         "alpha": alpha,
         "compression": compression,
         "order": order,
+        "harmonics": harmonics,
     }
     options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
     if cutoff is not None:
@@ -230,6 +239,14 @@ def save_mesh(
             f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"
             " other programs do not have: from afar it will look thin there. Make it part of the triangles"
             " for the views that count: bake_filter(mesh, cameras), or meshsplats bake",
+            DataWarning,
+            stacklevel=2,
+        )
+    if mesh.harmonics is not None and (suffix == ".obj" or "compression" in options):
+        what = "compression" if "compression" in options else ".obj"
+        warnings.warn(
+            f"{target.name}: harmonics are left out, {what} has no place for them: colours will be the same"
+            " from everywhere. bake --colors (plain_colors_of) makes them the mean of what given views show",
             DataWarning,
             stacklevel=2,
         )
@@ -282,8 +299,10 @@ def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False, co
     if suffix == ".usda":
         return 85 * v + 24 * f + 3 * held
     if suffix == ".ply":
+        held += 12 * v if mesh.harmonics is not None and mesh.plain_colors is None else 0
         return (52 if mesh.origin.any() else 28) * v + 13 * f + held
     if suffix == ".glb":
+        held += stored_bytes(mesh)
         whole = 20 * v + (1 + copies) * (12 if v > 0xFFFF else 6) * f + held
         return whole // 5 if compressed else whole
     if suffix in _USD:

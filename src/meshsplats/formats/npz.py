@@ -213,9 +213,12 @@ def _check_shapes(members: dict[str, _Member], path: Path) -> None:
     }
     for prefix, fields in (("", SplatMesh.FIELDS), ("binding_", Binding.FIELDS)):
         wanted |= {prefix + field.name: (field.shape(counts),) for field in fields}
-    # How many splats there are is in face_splat, which is not read yet.
-    splats = min(rows_of("harmonics"), rows_of("face_splat"))
-    wanted["harmonics"] = tuple((splats, k, 3) for k in TERMS)
+    for field in SplatMesh.FIELDS:
+        if field.per == "splat":  # how many there are is in face_splat, which is not read yet
+            rows = min(rows_of(field.name), rows_of("face_splat"))
+            wanted[field.name] = (field.shape({"splat": rows}),)
+            if field.name == "harmonics":
+                wanted[field.name] = tuple((rows, k, 3) for k in TERMS)
     for name, shape in shapes.items():
         if name.startswith(_ATTRIBUTE):
             fits = len(shape) in (1, 2) and shape[0] == v

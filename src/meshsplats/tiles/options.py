@@ -27,7 +27,7 @@ class TileOptions:
     """Preset of the conversion."""
     conversion: ConversionOptions | None = None
     """What to do otherwise than the preset does; not ``max_splats``, ``max_triangles``, ``detail='cameras'``,
-    ``colors='mean'``, and of the footprints framing, distance and none."""
+    ``colors='mean'``, and of the footprints framing, distance and none. Colours are those of degree 0."""
     up: tuple[float, float, float] | None = None
     """Direction that points up in the world frame. None: that of the splat files, where they name it, else
     (0, -1, 0)."""

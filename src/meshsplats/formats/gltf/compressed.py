@@ -44,7 +44,8 @@ def write_compressed_glb(
     """Writes ``mesh`` to ``path`` with positions and colours of 16 bits, compressed.
 
     Concretely, a coordinate is moved by at most 0.5 / 65535 of the longest side of the bounding box. The
-    arrays that only this project reads are left out, as the order of triangles changes.
+    arrays that only this project reads are left out, as the order of triangles changes, and harmonics, whose
+    attributes the program drops: colours are plain ones.
 
     Raises:
         MissingDependencyError: gltfpack is missing.
@@ -66,7 +67,7 @@ def write_compressed_glb(
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         plain, packed = Path(folder) / "plain.glb", Path(folder) / "packed.glb"
         # The program has float32 for transforms of nodes.
-        local = replace(mesh, origin=zero_origin())
+        local = replace(mesh.plain, origin=zero_origin())
         write_glb(local, plain, lit=lit, alpha=alpha, cutoff=cutoff, extras=False)
         precision = ["-vp", str(_BITS), "-vc", "16", "-vn", "12"]
         done = subprocess.run(

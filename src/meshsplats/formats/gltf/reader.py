@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,8 +20,10 @@ from meshsplats.formats._validation import checked, straight_colors, warn_of_los
 from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, Skinning, placed_meshes, rotation_matrix
+from meshsplats.formats.gltf.view_colors import IN_VIEW_COLORS, Stored, put_back, stored_colors
 from meshsplats.formats.gltf.writer import camel_case, up_quaternion
 from meshsplats.mesh import Blending, SplatMesh
+from meshsplats.spherical_harmonics import moved_harmonics
 
 POINTS_TO_LINES = (0, 1, 2, 3)
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -38,6 +40,8 @@ class _Piece:
     faces: np.ndarray
     linear: np.ndarray
     normals: np.ndarray | None
+    tables: dict[str, np.ndarray]
+    """Those attributes that hold the rest of our colours."""
 
     def put(self, origin: np.ndarray) -> None:
         """Puts the piece into the scene, relative to ``origin``."""
@@ -45,7 +49,7 @@ class _Piece:
         self.skinning = None
 
     def arrays(self) -> dict[str, np.ndarray]:
-        found = {"vertices": self.vertices, "faces": self.faces, "linear": self.linear}
+        found = {"vertices": self.vertices, "faces": self.faces, "linear": self.linear} | self.tables
         return found if self.normals is None else found | {"normals": self.normals}
 
 
@@ -83,6 +87,7 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     if len(placed) != max(1, copies.counts(note.get("copies"))):
         note = {}
     own = placed[0].mesh if note else {}
+    stored = stored_colors(note, document.error)
     named: np.ndarray | None = None
     kept = bool(note) and all(_is_own_placement(place.matrix, note) for place in placed)
     if kept:
@@ -90,6 +95,7 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
         named = _origin_of(note)
     elif note:  # another program has moved the mesh in the scene
         note["up"] = [0.0, 1.0, 0.0]
+    motion = placed[0].matrix[:3, :3] if placed else np.eye(3)
     for place in placed:
         for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
             mode = primitive.get("mode", _TRIANGLES)
@@ -99,7 +105,7 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
                 continue
             material = material_of(document, primitive)
             textured += "baseColorTexture" in pbr_of(material)
-            pieces.append(_piece(document, primitive, material, place))
+            pieces.append(_piece(document, primitive, material, place, stored))
     if skipped:
         _warn(f"{path}: {skipped:,} primitives of points or lines were left out")
     if textured:
@@ -114,7 +120,10 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
         shift = origin = _chosen_origin(document, pieces) if origin is None else origin
     for piece in pieces:
         piece.put(shift)
-    return _join(document, pieces, own, note, origin)
+    mesh = _join(document, pieces, own, note | {"viewColors": stored}, origin)
+    if mesh.harmonics is not None and (motion != np.eye(3)).any():
+        return replace(mesh, harmonics=moved_harmonics(mesh.harmonics, motion))
+    return mesh
 
 
 def _chosen_origin(document: GltfDocument, pieces: list[_Piece]) -> np.ndarray:
@@ -125,7 +134,11 @@ def _chosen_origin(document: GltfDocument, pieces: list[_Piece]) -> np.ndarray:
 
 
 def _piece(
-    document: GltfDocument, primitive: dict[str, Any], material: dict[str, Any], place: Placed
+    document: GltfDocument,
+    primitive: dict[str, Any],
+    material: dict[str, Any],
+    place: Placed,
+    stored: Stored | None,
 ) -> _Piece:
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict) or "POSITION" not in attributes:
@@ -154,7 +167,14 @@ def _piece(
     for name, values in (("POSITION", vertices), ("NORMAL", normals)):
         if values is not None and values.shape != (v, 3):
             raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
-    return _Piece(place, place.skinning(document, attributes, v), vertices, faces, linear, normals)
+    tables = {}
+    for name in stored.names if stored else ():
+        if name in attributes:
+            tables[name] = document.floats(attributes[name], name)
+            wanted = (v, stored.columns if stored else 0)
+            if tables[name].shape != wanted:
+                raise document.error(f"{name} must have shape {wanted}, got {tables[name].shape}")
+    return _Piece(place, place.skinning(document, attributes, v), vertices, faces, linear, normals, tables)
 
 
 def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
@@ -190,6 +210,11 @@ def _join(
     note: dict[str, Any],
     origin: np.ndarray,
 ) -> SplatMesh:
+    stored: Stored | None = note.pop("viewColors")
+    whole = stored is not None and all(len(piece.tables) == len(stored.names) for piece in pieces)
+    if not whole:
+        for piece in pieces:
+            piece.tables = {}
     try:
         arrays: dict[str, Any] = joined_rows([piece.arrays() for piece in pieces])
     except ValueError as error:
@@ -204,13 +229,17 @@ def _join(
         faces, place = _own_triangles(document, note["copies"], arrays["faces"], len(colors))
         arrays["faces"] = faces
         if place is not None:
-            rows = [name for name in ("vertices", "colors", "normals") if arrays.get(name) is not None]
+            kept = ("vertices", "colors", "normals", *(stored.names if stored and whole else ()))
+            rows = [name for name in kept if arrays.get(name) is not None]
             arrays |= {name: arrays[name][place] for name in rows}
             colors = arrays["colors"]
     if note:
         arrays |= {"up": note["up"], "blending": note["blending"]}
+    tables = {name: arrays.pop(name) for name in (stored.names if stored and whole else ())}
     if note and len(own["primitives"]) == 1:
-        arrays |= _restore(document, own, note, len(arrays["faces"]), colors)
+        arrays |= _restore(document, own, note, len(arrays["faces"]), len(colors))
+        if stored is not None and not put_back(stored, tables, arrays):
+            _warn(f"{document.path}: another program has altered the file, left out: harmonics")
         if arrays.get("binding") is not None and not _matches(arrays["binding"], arrays["vertices"]):
             _warn(
                 f"{document.path}: another program has moved vertices, left out: the binding to a base mesh"
@@ -252,16 +281,15 @@ def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
 
 
 def _restore(
-    document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, colors: np.ndarray
+    document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, v: int
 ) -> dict[str, Any]:
     """Constructor arguments from our note. Arrays that another program has dropped or altered are left out,
     with a DataWarning: better no splat indices than wrong ones."""
     result: dict[str, Any] = {}
     lost: list[str] = []
-    v = len(colors)
     counts = {"vertex": v, "face": f}
     for field in SplatMesh.EXTRAS:
-        if field.name in note:
+        if field.name in note and field.name not in IN_VIEW_COLORS:
             if field.per == "splat":
                 counts["splat"] = len(np.unique(result.get("face_splat", ())))
             shape = field.shape(counts)

@@ -1,7 +1,8 @@
 """Writes meshes as binary glTF 2.0 (`.glb`), which viewers, engines and Blender open directly.
 
 Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one double-sided
-primitive, or of two where solid triangles are kept apart, coloured by COLOR_0 (linear RGBA). glTF is y-up:
+primitive, or of two where solid triangles are kept apart, coloured by COLOR_0 (linear RGBA; what depends on
+the view: ``view_colors``). glTF is y-up:
 the node turns the mesh's own frame to one whose +y is the mesh's ``up``, and puts the mesh at its ``origin``;
 vertices are stored unchanged. All else is in the mesh's ``extras.meshsplats``.
 """
@@ -25,14 +26,21 @@ from meshsplats.draw_order import DrawOrder
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf import copies
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk
+from meshsplats.formats.gltf.view_colors import (
+    IN_VIEW_COLORS,
+    Harmonics,
+    note_of,
+    scales_of,
+    vertex_tables,
+)
 from meshsplats.mesh import SplatMesh, solid_faces
 
 ColorType = Literal["uint16", "float32"]
 Alpha = Literal["blend", "mask", "opaque", "hybrid"]
 
-_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_FLOAT, _INT8, _UINT16, _UINT32 = 5126, 5120, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
-_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _ROWS = 1 << 15
 _MAX_BYTES = (1 << 32) - 1
 
@@ -47,6 +55,7 @@ def write_glb(
     cutoff: float = CUTOFF,
     extras: bool = True,
     order: DrawOrder | None = None,
+    harmonics: Harmonics = "attributes",
 ) -> None:
     """Writes ``mesh`` to ``path``.
 
@@ -69,6 +78,7 @@ def write_glb(
         extras: False leaves out the arrays that only this project reads.
         order: with 'blend', unlit: every triangle is written twice, with both windings and a single-sided
             material, in this order.
+        harmonics: where colours are kept that COLOR_0 cannot hold: see ``view_colors``.
 
     Raises:
         ValueError: the mesh has no triangles (glTF has no empty arrays), its normals are not of unit
@@ -79,15 +89,17 @@ def write_glb(
         raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
     if color_type not in get_args(ColorType):
         raise ValueError(f"color_type must be one of {', '.join(get_args(ColorType))}, got {color_type!r}")
+    if harmonics not in get_args(Harmonics):
+        raise ValueError(f"harmonics must be one of {', '.join(get_args(Harmonics))}, got {harmonics!r}")
     if not len(mesh.faces):
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
     check_attribute_names(mesh)
     if order is None:
-        document, parts = _document(mesh, lit, color_type, alpha, cutoff, extras)
+        document, parts = _document(mesh, lit, _Colors(mesh, color_type, harmonics), alpha, cutoff, extras)
     elif lit or alpha != "blend":
         raise ValueError("an order of triangles is for alpha='blend' and an unlit material")
     else:
-        document, parts = _ordered_document(mesh, order, color_type)
+        document, parts = _ordered_document(mesh, order, _Colors(mesh, color_type, harmonics))
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     binary = document["buffers"][0]["byteLength"]
@@ -106,45 +118,24 @@ def write_glb(
             file.write(b"\0" * (-part.nbytes % 4))
 
 
-class _Buffer:
-    """Builder of the binary chunk: arrays in order, each aligned to 4 bytes."""
+class _Colors:
+    """How the colours of ``mesh``, and of parts of it, are stored."""
 
-    def __init__(self) -> None:
-        self.parts: list[np.ndarray] = []
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-        self.length = 0
+    def __init__(self, mesh: SplatMesh, color_type: ColorType, packing: Harmonics) -> None:
+        self.type, self._packing = color_type, packing
+        self._scales, self._exact = scales_of(mesh), color_type == "float32"
+        self.note = note_of(mesh, self._scales, packing, exact=self._exact)
 
-    def view(self, array: np.ndarray, target: int | None = None) -> int:
-        """Appends ``array``; returns the index of its buffer view."""
-        little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": little.nbytes}
-        if target is not None:
-            view["target"] = target
-        self.parts.append(little)
-        self.views.append(view)
-        self.length += little.nbytes + -little.nbytes % 4
-        return len(self.views) - 1
-
-    def accessor(self, array: np.ndarray, component: int, target: int, **more: Any) -> int:
-        """Appends an array of numbers (n,) or (n, 1..4); returns the index of its accessor."""
-        columns = 1 if array.ndim == 1 else array.shape[1]
-        accessor = {
-            "bufferView": self.view(array, target),
-            "componentType": component,
-            "count": len(array),
-            "type": _TYPES[columns],
-            **more,
-        }
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
+    def tables(self, part: SplatMesh) -> dict[str, np.ndarray]:
+        """Attributes beside COLOR_0, for a part that has its splats."""
+        return vertex_tables(part, self._scales, self._packing, exact=self._exact) if self.note else {}
 
 
 def _document(
-    mesh: SplatMesh, lit: bool, color_type: ColorType, alpha: Alpha, cutoff: float, with_extras: bool
+    mesh: SplatMesh, lit: bool, colors: _Colors, alpha: Alpha, cutoff: float, with_extras: bool
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The JSON part, and the arrays of the binary part."""
-    buffer, extras = _Buffer(), _note(mesh)
+    buffer, extras = BinaryChunk(), _note(mesh) | colors.note
     if alpha == "hybrid":
         with_extras = False
     if mesh.filter_px2 and with_extras:
@@ -161,10 +152,13 @@ def _document(
         solid = solid_faces(mesh)
         halves: tuple[tuple[SplatMesh, Alpha], ...] = (
             (mesh.take(solid), "opaque"),
-            (_lowest_first(mesh.take(~solid)), "blend"),
+            (mesh.take(~solid), "blend"),
         )
         parts = [(half, mode) for half, mode in halves if len(half.faces)]
-    primitives = [_primitive(buffer, part, color_type, k) for k, (part, _) in enumerate(parts)]
+    primitives = []
+    for k, (part, mode) in enumerate(parts):
+        shown = _lowest_first(part.plain) if alpha == "hybrid" and mode == "blend" else part.plain
+        primitives.append(_primitive(buffer, shown, colors.type, k, colors.tables(part)))
     if with_extras:
         _add_own_arrays(buffer, mesh, primitives[0]["attributes"], extras)
     meshes = [{"name": "splats", "primitives": primitives, "extras": {"meshsplats": extras}}]
@@ -173,10 +167,11 @@ def _document(
 
 
 def _ordered_document(
-    mesh: SplatMesh, order: DrawOrder, color_type: ColorType
+    mesh: SplatMesh, order: DrawOrder, colors: _Colors
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """As ``_document``, with both windings of all triangles in ``order``."""
-    buffer, extras = _Buffer(), _note(mesh)
+    buffer, extras = BinaryChunk(), _note(mesh) | colors.note
+    shown, tables = mesh.plain, colors.tables(mesh)
     if mesh.filter_px2:
         extras["filter_px2"] = mesh.filter_px2
     if mesh.normals is not None:
@@ -187,12 +182,13 @@ def _ordered_document(
         piece = SplatMesh(
             mesh.vertices[part.vertices],
             part.faces,
-            mesh.colors[part.vertices],
+            shown.colors[part.vertices],
             normals=None if mesh.normals is None else mesh.normals[part.vertices],
             blending=mesh.blending,
         )
         listed.append(part.vertices)
-        primitive = _primitive(buffer, piece, color_type, 0)
+        own_tables = {name: table[part.vertices] for name, table in tables.items()}
+        primitive = _primitive(buffer, piece, colors.type, 0, own_tables)
         meshes.append({"name": "splats", "primitives": [primitive]})
     own = copies.own_triangles(mesh.faces)
     extras["copies"] = note = {"nodes": len(meshes), "turned": _raw(buffer, own.turned)}
@@ -213,7 +209,7 @@ def _note(mesh: SplatMesh) -> dict[str, Any]:
 
 
 def _scene(
-    buffer: _Buffer, mesh: SplatMesh, meshes: list[dict[str, Any]], materials: list[dict[str, Any]]
+    buffer: BinaryChunk, mesh: SplatMesh, meshes: list[dict[str, Any]], materials: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """The JSON part of a file of ``meshes``, which hold ``mesh``; several are below one node that places
     them."""
@@ -251,8 +247,14 @@ def _lowest_first(mesh: SplatMesh) -> SplatMesh:
     return plain.take(np.argsort(heights, kind="stable"))
 
 
-def _primitive(buffer: _Buffer, mesh: SplatMesh, color_type: ColorType, material: int) -> dict[str, Any]:
-    """A primitive with the triangles of ``mesh``."""
+def _primitive(
+    buffer: BinaryChunk,
+    mesh: SplatMesh,
+    color_type: ColorType,
+    material: int,
+    tables: dict[str, np.ndarray],
+) -> dict[str, Any]:
+    """A primitive with the triangles of ``mesh``, and further attributes of its vertices."""
     attributes = {
         "POSITION": buffer.accessor(
             mesh.vertices,
@@ -269,6 +271,10 @@ def _primitive(buffer: _Buffer, mesh: SplatMesh, color_type: ColorType, material
         attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
     else:
         attributes["COLOR_0"] = buffer.accessor(colors, _FLOAT, _ARRAY_BUFFER)
+    for name, table in tables.items():
+        component = {"float32": _FLOAT, "int8": _INT8, "uint16": _UINT16}[table.dtype.name]
+        flag = {} if component == _FLOAT else {"normalized": True}
+        attributes[name] = buffer.accessor(table, component, _ARRAY_BUFFER, **flag)
     # The largest 16-bit index is kept free: graphics interfaces use it as a restart mark.
     small = len(mesh.vertices) <= 0xFFFF
     indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
@@ -312,11 +318,15 @@ def change_alpha(path: Path, alpha: Alpha, cutoff: float = CUTOFF) -> None:
 
 
 def _add_own_arrays(
-    buffer: _Buffer, mesh: SplatMesh, attributes: dict[str, int] | None, extras: dict[str, Any]
+    buffer: BinaryChunk, mesh: SplatMesh, attributes: dict[str, int] | None, extras: dict[str, Any]
 ) -> None:
     """Stores the arrays that only this project reads, and notes in ``extras`` where they are: those of
     vertices among the ``attributes`` of a primitive that has all vertices, if there is one."""
-    extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
+    extras |= {
+        field.name: _raw(buffer, values)
+        for field, values in mesh.extras().items()
+        if field.name not in IN_VIEW_COLORS
+    }
     for name, values in mesh.attributes.items():
         columns = None if values.ndim == 1 else values.shape[1]
         entry: dict[str, Any] = {"name": name, "columns": columns}
@@ -331,14 +341,14 @@ def _add_own_arrays(
         extras["binding"] = _binding(buffer, mesh.binding)
 
 
-def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
+def _raw(buffer: BinaryChunk, values: np.ndarray) -> dict[str, Any]:
     """Values that no glTF attribute can hold, as a plain buffer view. The checksum shows a reader whether
     another program has renumbered or dropped the views."""
     view = buffer.view(values)
     return {"bufferView": view, "crc32": zlib.crc32(buffer.parts[view].data)}
 
 
-def _binding(buffer: _Buffer, binding: Binding) -> dict[str, Any]:
+def _binding(buffer: BinaryChunk, binding: Binding) -> dict[str, Any]:
     """The entry of a binding in our note."""
     entry: dict[str, Any] = {
         "lift": binding.lift,

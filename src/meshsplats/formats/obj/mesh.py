@@ -24,13 +24,14 @@ _ROWS = 1 << 14
 
 
 def write_obj(mesh: SplatMesh, path: Path) -> None:
-    """Writes positions, display colours after them and triangles as text; nine digits keep float32 exactly.
+    """Writes positions, display colours after them (those for programs without harmonics) and triangles as
+    text; nine digits keep float32 exactly.
 
     The format has no opacity: a DataWarning counts translucent vertices. Positions are in the world, doubles
     where the mesh has an origin; the up direction and the origin are in comments, which ``load_mesh`` reads
     and other programs ignore.
     """
-    lost = [f.name for f in mesh.extras()] + list(mesh.attributes)
+    lost = [f.name for f in mesh.extras() if f.per == "face"] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
     if translucent:
         more = f"; also left out: {', '.join(n[:40] for n in lost[:8])}" if lost else ""
@@ -40,7 +41,8 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
             DataWarning,
             stacklevel=3,
         )
-    rgb = linear_to_srgb(mesh.colors[:, :3]) if mesh.blending == "linear" else mesh.colors[:, :3]
+    rgb = mesh.plain.colors[:, :3]
+    rgb = linear_to_srgb(rgb) if mesh.blending == "linear" else rgb
     up = " ".join(repr(float(u)) for u in mesh.up)
     corner = "%d" if mesh.normals is None else "%d//%d"
     with open(path, "wb") as file:

@@ -1,11 +1,14 @@
 """Meshes as `.ply`: our own files (binary, float RGBA, lossless) and those of other programs.
 
 Our own files are little endian. Element ``vertex``: float x y z, nx ny nz where the mesh has normals,
-red green blue alpha (straight, as the mesh holds them, 0 to 1), then ``attribute_NAME`` or
-``attribute_NAME:COLUMN`` with the name in percent encoding. Element ``face``: ``list uchar int
-vertex_indices``, then int ``face_splat`` and ``depth_group`` where the mesh has them. Comments that
-begin with ``meshsplats`` hold the rest. For a mesh with an origin x y z are doubles in the world, and float
-``local_x local_y local_z`` the mesh's own coordinates, which the sums cannot give back to the last bit.
+red green blue alpha (straight, as programs should show them, 0 to 1; above only where the mesh has neither
+harmonics nor plain colours), ``colors:0`` to ``colors:2`` where those of the mesh differ, then
+``attribute_NAME`` or ``attribute_NAME:COLUMN`` with the name in percent encoding. Element ``face``: ``list
+uchar int vertex_indices``, then int ``face_splat`` and ``depth_group`` where the mesh has them. Element
+``splat``, where the mesh has harmonics: float ``f_rest_0``, ... as 3DGS has them, all of red, of green, of
+blue, for each splat in the order of its triangles. Comments that begin with ``meshsplats`` hold the rest. For
+a mesh with an origin x y z are doubles in the world, and float ``local_x local_y local_z`` the mesh's own
+coordinates, which the sums cannot give back to the last bit.
 """
 
 from __future__ import annotations
@@ -39,13 +42,15 @@ from meshsplats.formats.ply.header import (
     read_header,
 )
 from meshsplats.formats.ply.table import POSITION, FloatTable
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import MAX_COLOR, SplatMesh
 from meshsplats.mesh_joining import check_alike
+from meshsplats.spherical_harmonics import TERMS
 
 _ATTRIBUTE = "attribute_"
 _LOCAL = ("local_x", "local_y", "local_z")
 _ROUNDING = 1e-15
 """Rounding of the sum of an origin and a local coordinate, as a share of the origin."""
+_COLORS = ("colors:0", "colors:1", "colors:2")
 _ROWS = 1 << 15
 _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
@@ -57,9 +62,11 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
     """Writes ``mesh`` to ``path`` exactly. ValueError for more than ``MAX_PROPERTIES`` columns per vertex."""
     layout = _Layout(mesh)
     with open(path, "wb") as file:
-        file.write(layout.header(len(mesh.vertices), len(mesh.faces)))
+        rows = 0 if mesh.harmonics is None else len(mesh.harmonics)
+        file.write(layout.header(len(mesh.vertices), len(mesh.faces), rows))
         layout.write_vertices(mesh, file)
         layout.write_faces(mesh, file, 0)
+        layout.write_splats(mesh, file)
 
 
 def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int, int]:
@@ -75,6 +82,7 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
     with (
         tempfile.TemporaryFile(dir=path.parent) as first,
         tempfile.TemporaryFile(dir=path.parent) as second,
+        tempfile.TemporaryFile(dir=path.parent) as third,
         open(path, "wb") as file,
     ):
         for number, part in enumerate(parts):
@@ -87,14 +95,15 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
             part = part.relative_to(layout.origin)
             layout.write_vertices(part, first)
             layout.write_faces(part, second, vertices)
+            layout.write_splats(part, third)
             vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
             splats += part.splat_count or 0
             if max(vertices, faces) > np.iinfo(np.int32).max:
                 raise ValueError(f"{path}: more than 2^31 - 1 vertices or triangles; build a tileset instead")
         if layout is None:
             raise ValueError(f"{path}: no mesh to write")
-        file.write(layout.header(vertices, faces))
-        for spooled in (first, second):
+        file.write(layout.header(vertices, faces, splats))
+        for spooled in (first, second, third):
             spooled.seek(0)
             shutil.copyfileobj(spooled, file, 1 << 20)
     return vertices, faces, splats
@@ -123,6 +132,12 @@ class _Layout:
         if mesh.normals is not None:
             self._names += ["nx", "ny", "nz"]
         self._names += ["red", "green", "blue", "alpha"]
+        self._terms = 0 if mesh.harmonics is None else mesh.harmonics.shape[1]
+        self._two_colors = bool(self._terms) or mesh.plain_colors is not None
+        if self._two_colors:
+            self._names += _COLORS
+        if mesh.plain_colors is not None:
+            self._head.append("comment meshsplats plain_colors")
         for name, values in mesh.attributes.items():
             width = "-" if values.ndim == 1 else values.shape[1]
             self._head.append(f"comment meshsplats attribute {_stored(name)} {width}")
@@ -133,17 +148,21 @@ class _Layout:
             raise ValueError(f"{count} columns per vertex are more than {MAX_PROPERTIES}; save as .npz")
         self._numbers = [field.name for field, _ in mesh.extras().items() if field.per == "face"]
 
-    def header(self, vertices: int, faces: int) -> bytes:
+    def header(self, vertices: int, faces: int, splats: int) -> bytes:
         lines = [*self._head, f"element vertex {vertices}"]
         if self.origin.any():
             lines += [f"property double {name}" for name in POSITION]
         lines += [f"property float {name}" for name in self._names]
         lines += [f"element face {faces}", "property list uchar int vertex_indices"]
         lines += [f"property int {name}" for name in self._numbers]
+        if self._terms:
+            lines += [f"element splat {splats}"]
+            lines += [f"property float {name}" for name in _rest(self._terms)]
         return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
     def write_vertices(self, mesh: SplatMesh, file: IO[bytes]) -> None:
-        columns = [mesh.vertices, *([] if mesh.normals is None else [mesh.normals]), mesh.colors]
+        columns = [mesh.vertices, *([] if mesh.normals is None else [mesh.normals])]
+        columns += [mesh.plain.colors, mesh.colors[:, :3]] if self._two_colors else [mesh.colors]
         for values in _tables(mesh).values():
             columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
         for start in range(0, len(mesh.vertices), _ROWS):
@@ -168,6 +187,17 @@ class _Layout:
                 faces[name] = getattr(mesh, name)[part]
             file.write(faces.data)
 
+    def write_splats(self, mesh: SplatMesh, file: IO[bytes]) -> None:
+        if mesh.harmonics is not None:
+            for start in range(0, len(mesh.harmonics), _ROWS):
+                rows = mesh.harmonics[start : start + _ROWS].transpose(0, 2, 1)
+                file.write(np.ascontiguousarray(rows, "<f4").data)
+
+
+def _rest(terms: int) -> tuple[str, ...]:
+    """Names of the harmonics of a splat, ``terms`` of each colour, without the constant ones."""
+    return tuple(f"f_rest_{i}" for i in range(3 * terms))
+
 
 def _stored(name: str) -> str:
     """Name in the file of an attribute."""
@@ -176,8 +206,7 @@ def _stored(name: str) -> str:
 
 def _tables(mesh: SplatMesh) -> dict[str, np.ndarray]:
     """Arrays of vertices that only this project reads, by their names in the file."""
-    extras = {field.name: values for field, values in mesh.extras().items() if field.per == "vertex"}
-    return extras | {_stored(name): values for name, values in mesh.attributes.items()}
+    return {_stored(name): values for name, values in mesh.attributes.items()}
 
 
 def _properties(name: str, columns: Any) -> tuple[str, ...]:
@@ -223,13 +252,12 @@ def _read(
     groups: dict[str, tuple[str, ...]] = {"vertices": ("x", "y", "z"), "colors": (*rgb, *alpha)}
     if all(n in vertex.names for n in ("nx", "ny", "nz")):
         groups["normals"] = ("nx", "ny", "nz")
-    columns_of = {f: _properties(f.name, f.columns) for f in SplatMesh.EXTRAS if f.per == "vertex"}
-    extras = [f for f, columns in columns_of.items() if all(n in vertex.names for n in columns)]
-    groups |= {f.name: columns_of[f] for f in extras}
     attributes, settings = _notes(header, vertex, path)
     for name, (_, columns) in attributes.items():
         groups[f"attribute {name}"] = columns
     own = "up" in settings  # written by this project
+    if own and all(n in vertex.names for n in _COLORS):
+        groups["view"] = _COLORS
     if own and all(n in vertex.names for n in _LOCAL):
         groups["local"] = _LOCAL
     wanted = tuple(dict.fromkeys(n for columns in groups.values() for n in columns))
@@ -263,11 +291,18 @@ def _read(
             arrays["colors"][:, i] /= np.float32(255)
     of_faces = tuple(field.name for field in SplatMesh.EXTRAS if field.per == "face")
     faces, numbers = read_faces(file, header, face, of_faces, budget, path)
+    plain = settings.pop("plain_colors", False)
+    if own:
+        settings["harmonics"] = _harmonics(file, header, budget, path)
     if "face_splat" not in numbers:
         lost = [
             what
-            for name, what in (("filter_px2", "the filter of its splats"), ("order", "their order"))
-            if settings.pop(name, None)
+            for name, what in (
+                ("filter_px2", "the filter of its splats"),
+                ("order", "their order"),
+                ("harmonics", "their harmonics"),
+            )
+            if settings.pop(name, None) is not None
         ]
         if lost:
             warnings.warn(
@@ -275,21 +310,49 @@ def _read(
                 DataWarning,
                 stacklevel=3,
             )
+    colors = straight_colors(arrays["colors"], path, MAX_COLOR if own else 1)
+    if plain:
+        settings["plain_colors"] = colors[:, :3].copy()
+    if "view" in arrays:
+        rgba = np.concatenate([arrays["view"], colors[:, 3:]], axis=1)
+        colors = straight_colors(rgba, path, MAX_COLOR)
     return checked(
         path,
         SplatMesh,
         vertices=arrays["vertices"],
         faces=faces,
-        colors=straight_colors(arrays["colors"], path),
+        colors=colors,
         normals=arrays.get("normals"),
         attributes={
             name: arrays[f"attribute {name}"][:, 0] if flat else arrays[f"attribute {name}"]
             for name, (flat, _) in attributes.items()
         },
-        **{f.name: arrays[f.name].reshape(f.shape({"vertex": v})) for f in extras},
         **settings,
         **numbers,
     )
+
+
+def _harmonics(file: BinaryIO, header: PlyHeader, budget: Budget, path: Path) -> np.ndarray | None:
+    """(s, k, 3) those of the element ``splat``, None without any."""
+    element = header.element("splat")
+    if element is None:
+        return None
+    count = len(element.names)
+    if count not in [3 * terms for terms in TERMS] or set(element.names) != set(_rest(count // 3)):
+        raise FileFormatError(
+            f"{path}: element 'splat' must have f_rest_0 to f_rest_8, f_rest_23 or f_rest_44, of degree 1, 2"
+            f" or 3, got {count} properties"
+        )
+    names = _rest(count // 3)
+    table = FloatTable(file, header, element, names, path)
+    budget.spend(4 * len(table) * count, "the harmonics")
+    place = [table.names.index(name) for name in names]
+    rows = np.empty((len(table), count), np.float32)
+    done = 0
+    for chunk in table.chunks():
+        rows[done : done + len(chunk)] = chunk[:, place]
+        done += len(chunk)
+    return rows.reshape(-1, 3, count // 3).transpose(0, 2, 1)
 
 
 def _chosen(table: FloatTable, path: Path) -> np.ndarray:
@@ -322,6 +385,8 @@ def _notes(
                 settings["blending"] = space
             case ["order", order]:
                 settings["order"] = order
+            case ["plain_colors"]:
+                settings["plain_colors"] = True
             case ["filter_px2", variance]:
                 try:
                     settings["filter_px2"] = float(variance)

@@ -25,6 +25,7 @@ from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import Blending, SplatMesh
+from meshsplats.spherical_harmonics import TERMS, moved_harmonics
 
 _LIBRARY_BYTES = 2 << 30
 _FACTOR = 256
@@ -117,6 +118,8 @@ def _extract(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, A
     if note:
         report["blending"] = note["blending"]
         arrays |= _restored(shapes[0], note, arrays, report)
+        if "harmonics" in arrays and not own:
+            arrays["harmonics"] = moved_harmonics(arrays["harmonics"], matrices[0][:3, :3].T)
     if note.get("normals") == "computed":
         arrays.pop("normals", None)
     np.savez(result, **arrays)  # type: ignore[arg-type]
@@ -331,7 +334,7 @@ def _restored(
     lost: list[str] = []
     v = len(arrays["vertices"])
     for field in SplatMesh.EXTRAS:
-        if note.get(field.name) is True:
+        if field.per == "face" and note.get(field.name) is True:
             values = stored(field.name, field.dtype)
             wanted = field.shape({"vertex": v, "face": len(arrays["faces"])})
             sorted_ = field.name != "face_splat" or not (values[1:] < values[:-1]).any()
@@ -339,6 +342,23 @@ def _restored(
                 restored[field.name] = values.reshape(wanted)
             else:
                 lost.append(field.name)
+    if note.get("colors") is True:
+        values = stored("colors", np.float32)
+        if values.size == 3 * v:
+            restored["colors"] = values.reshape(v, 3)
+            report["plain_colors"] = note.get("plain_colors") is True
+        else:
+            lost.append("colors")
+    if "harmonics" in note:
+        degree = note["harmonics"]
+        if type(degree) is not int or degree not in (1, 2, 3):
+            raise FileFormatError(f"harmonics must have degree 1, 2 or 3, got {str(degree)[:60]}")
+        splats, terms = len(np.unique(restored.get("face_splat", ()))), TERMS[degree - 1]
+        values = stored("harmonics", np.float32)
+        if splats and values.size == splats * terms * 3 and "colors" in restored:
+            restored["harmonics"] = values.reshape(splats, terms, 3)
+        else:
+            lost.append("harmonics")
     if "filter_px2" in note:
         variance = note["filter_px2"]
         if not isinstance(variance, (int, float)):

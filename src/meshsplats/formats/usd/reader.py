@@ -23,7 +23,7 @@ import numpy as np
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget, checked, straight_colors
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import MAX_COLOR, SplatMesh
 
 _SECONDS = 60
 _BYTES_A_SECOND = 1 << 20
@@ -58,6 +58,11 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     colors = straight_colors(arrays.pop("linear"), path)
     if report["blending"] != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
+    if "colors" in arrays:
+        if report["plain_colors"]:
+            arrays["plain_colors"] = colors[:, :3].copy()
+        rgba = np.concatenate([arrays.pop("colors"), colors[:, 3:]], axis=1)
+        colors = straight_colors(rgba, path, MAX_COLOR)
     attributes = {name: arrays.pop(f"attribute_{i}") for i, name in enumerate(report["attributes"])}
     return checked(
         path,

@@ -26,8 +26,9 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
 
     The material emits the colours; ``lit`` makes it a rough surface that scene lights shade, with the mesh's
     normals or else area-weighted vertex normals. Splat indices, depth groups and attributes become primvars
-    of the same names (characters that USD forbids become underscores). Raises MissingDependencyError without
-    usd-core.
+    of the same names (characters that USD forbids become underscores), as do harmonics, constant and splat by
+    splat, and ``colors``, display RGB, where programs without harmonics should show others. Raises
+    MissingDependencyError without usd-core.
     """
     try:
         from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
@@ -57,7 +58,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     if normals is not None:
         shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
         shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    linear = linear_colors(mesh, "float32")
+    shown = mesh.plain
+    linear = linear_colors(shown, "float32")
     colors = shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
     colors.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(linear[:, :3])))
     opacities = shape.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.vertex)
@@ -68,15 +70,26 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         np.int32: (Sdf.ValueTypeNames.IntArray, Vt.IntArray),
         np.float32: (Sdf.ValueTypeNames.FloatArray, Vt.FloatArray),
     }
-    extras = mesh.extras()
-    for field, values in extras.items():
-        kind, array = types[field.dtype]
-        per = UsdGeom.Tokens.uniform if field.per == "face" else UsdGeom.Tokens.vertex
-        new = primvars.CreatePrimvar(field.name, kind, per, field.columns or -1)
-        new.Set(array.FromNumpy(values.reshape(-1)))
+    # displayColor gives plain colours back.
+    extras = {field.name: values for field, values in mesh.extras().items() if field.name != "plain_colors"}
+    if shown is not mesh:
+        extras["colors"] = np.ascontiguousarray(mesh.colors[:, :3])
+    for name, values in extras.items():
+        kind, array = types[values.dtype.type]
+        per, columns = {
+            "face_splat": (UsdGeom.Tokens.uniform, -1),
+            "depth_group": (UsdGeom.Tokens.uniform, -1),
+            "colors": (UsdGeom.Tokens.vertex, 3),
+            "harmonics": (UsdGeom.Tokens.constant, values.size),
+        }[name]
+        primvars.CreatePrimvar(name, kind, per, columns).Set(array.FromNumpy(values.reshape(-1)))
     up = Gf.Vec3d(*(float(u) for u in mesh.up))
     note: dict[str, Any] = {"version": 1, "blending": mesh.blending, "up": up}
-    note |= {field.name: True for field in extras}
+    note |= {name: True for name in extras}
+    if mesh.harmonics is not None:
+        note["harmonics"] = mesh.sh_degree
+    if mesh.plain_colors is not None:
+        note["plain_colors"] = True
     if mesh.origin.any():
         note["origin"] = Gf.Vec3d(*mesh.origin.tolist())
     if lit and mesh.normals is None:
@@ -85,7 +98,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         note["filter_px2"] = mesh.filter_px2
     if mesh.order != "fragment":
         note["order"] = mesh.order
-    taken = {"displayColor", "displayOpacity", "normals", *(field.name for field in mesh.EXTRAS)}
+    taken = {"displayColor", "displayOpacity", "normals", "colors", *(field.name for field in mesh.EXTRAS)}
     stored: list[tuple[str, str, int]] = []
     for name, values in mesh.attributes.items():
         columns = 1 if values.ndim == 1 else values.shape[1]
