@@ -51,7 +51,7 @@ CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help demo fuzz test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
+.PHONY: help dawn demo fuzz test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
 	release docs lint format clean
 .DEFAULT_GOAL := help
 
@@ -90,8 +90,17 @@ demo: $(VENV)/installed
 	$(BIN)/meshsplats demo -o $(DEMO) --force
 
 # A worker for each processor; each takes whole files, whose tests share what they make.
-test: $(VENV)/installed-dev
+test: $(VENV)/installed-dev dawn
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# Chromium's compiler of WGSL, for tests/webgpu/test_dawn.py: 130 MB. Without npm, these tests are skipped.
+DAWN := build/dawn
+DAWN_VERSION := 0.6.2
+dawn:
+	@test -e $(DAWN)/$(DAWN_VERSION) || ! command -v npm > /dev/null \
+	  || { echo 'Installing Dawn into $(DAWN)'; mkdir -p $(DAWN); \
+	    npm install --silent --fetch-retries 1 --no-fund --no-audit --prefix $(DAWN) webgpu@$(DAWN_VERSION) && touch $(DAWN)/$(DAWN_VERSION); } \
+	  || echo 'Dawn cannot be installed here: its tests are skipped'
 
 # One wheel serves all versions of Python.
 PACKAGE_FILES := $(foreach kind,py wgsl js html css,$(shell find src -name '*.$(kind)'))
