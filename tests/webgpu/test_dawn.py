@@ -12,6 +12,7 @@ from pathlib import Path
 
 from _needs import lacking
 
+from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 
 FOLDER = Path(__file__).parents[2] / "build" / "dawn"
@@ -26,11 +27,16 @@ def sources() -> dict[str, str]:
         "filter": kernels.filter_source(),
         "training": kernels.training_source(),
     }
-    for queue, groups in itertools.product((kernels.QUEUE, kernels.LONG_QUEUE), (False, True)):
-        name = f"{queue}{' groups' * groups}"
-        found[f"gradients {name}"] = kernels.gradients_source(queue, groups=groups)
+    kinds: list[tuple[int, bool, Order]] = [
+        (queue, groups, "fragment")
+        for queue, groups in itertools.product((kernels.QUEUE, kernels.LONG_QUEUE), (False, True))
+    ]
+    for queue, groups, order in [*kinds, (kernels.QUEUE, False, "splat")]:
+        name = f"{queue}{' groups' * groups}, {order}"
+        found[f"gradients {name}"] = kernels.gradients_source(queue, groups=groups, order=order)
         for output in kernels.OUTPUTS:
-            found[f"{output} {name}"] = kernels.raster_source(queue, output=output, groups=groups)
+            text = kernels.raster_source(queue, output=output, groups=groups, order=order)
+            found[f"{output} {name}"] = text
     return found
 
 

@@ -1,7 +1,7 @@
 """The strip of the README: a capture as splats, as a mesh, lit in Blender, and opaque in three.js.
 
     npm install three puppeteer-core    (in some folder; Chromium installed)
-    python benchmarks/viewers/readme_strip.py PLAYBOT --blender-python blender-env/bin/python \\
+    python tools/readme_strip.py PLAYBOT --blender-python blender-env/bin/python \\
         --node-folder FOLDER -o docs/images/playbot.jpg
 
 PLAYBOT is Stephane Agullo's capture, CC-BY-4.0: https://superspl.at/view?id=ee6d8bc4, level 1 of its levels
@@ -17,8 +17,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from _node import draw_jobs, drawn_images, job
 from PIL import Image, ImageDraw, ImageFont
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "viewers"))
+from _node import draw_jobs, drawn_images, job
 
 import meshsplats as ms
 from meshsplats.images.reading import load_image
