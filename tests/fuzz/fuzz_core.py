@@ -102,8 +102,11 @@ class Maker:
         if self.chance(0.6):
             splat = np.sort(self.rng.integers(0, splats, faces))
             extras = {"face_splat": splat.astype(np.int32), "order": self.one_of("fragment", "splat")}
-            if self.chance(0.6):  # the filter wants vertices that belong to one splat
+            if self.chance(0.6):  # the filter and harmonics want vertices that belong to one splat
                 extras["filter_px2"] = self.one_of(0.0, 0.3, 1e-6, 100.0)
+                if self.chance(0.5):
+                    coefficients = (3, 8, 15)[self.count(2)]
+                    extras["harmonics"] = self.values(len(np.unique(splat)), coefficients, 3)
                 index = splat[:, None] * size + self.rng.integers(0, size, (faces, 3))
         if self.chance(0.3):
             extras["depth_group"] = self.rng.integers(-1, 1 + self.count(4), faces).astype(np.int32)
@@ -171,6 +174,7 @@ def call_backward(make: Maker) -> None:
         vertices=np.zeros((v, 3), np.float32),
         colors=np.zeros((v, 4), np.float32),
         vertex_attributes=np.zeros((v, k), np.float32),
+        harmonics=None if mesh.harmonics is None else np.zeros_like(mesh.harmonics),
         expected=expected,
     )
 
