@@ -47,10 +47,11 @@ def targets(folder: Path) -> dict[str, Target]:
         if seed.slow:
             continue
         names = [name for name in seed.changed or seed.files if not name.endswith(OPAQUE)]
+        put(folder / seed.name, seed.files)
         for name in names:
 
             def read(data: bytes, seed=seed, name=name) -> object:
-                put(folder / seed.name, {**seed.files, name: data})
+                (folder / seed.name / name).write_bytes(data)
                 return seed.load(folder / seed.name / seed.opened)
 
             title = seed.name if len(names) == 1 else f"{seed.name}/{name.replace('/', '_')}"
