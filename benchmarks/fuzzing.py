@@ -46,31 +46,25 @@ def main() -> None:
     parser.add_argument("logs", type=Path, nargs="+")
     asked = parser.parse_args()
     known = kinds()
-    rows: dict[str, list[int]] = {}
+    rows: dict[str, list[tuple[str, int, int]]] = {}
     text = "\n".join(path.read_text("utf-8", "replace") for path in asked.logs)
     lines = text.replace("\r", "\n").splitlines()
     for line in lines:
         tried, called = TRIED.match(line), CALLED.match(line)
         if tried:
-            row = rows.setdefault(known[tried[1].split("/")[0]], [0, 0, 0])
-            row[0], row[1], row[2] = (
-                row[0] + 1,
-                row[1] + int(tried[2].replace(",", "")),
-                row[2] + int(tried[3]),
-            )
-        elif called and not called[0].endswith("findings"):
-            row = rows.setdefault("the core's entry points, under sanitizers", [0, 0, 0])
-            row[0] += 1
-            row[1] += sum(int(n) for n in re.findall(r"(\d+) \w+", called[2].replace(",", "")))
-    found = sum(bool(FOUND.search(line)) for line in lines)
+            kind, count, kept = known[tried[1].split("/")[0]], tried[2].replace(",", ""), tried[3]
+            rows.setdefault(kind, []).append((tried[1], int(count), int(kept)))
+        elif called:
+            count = sum(int(n) for n in re.findall(r"(\d+) \w+", called[2].replace(",", "")))
+            rows.setdefault("the core's entry points, under sanitizers", []).append((called[1], count, 0))
     with Report(asked) as report:
-        report.table("of", "targets", "inputs", "reached new lines")
-        for name, (targets, inputs, kept) in rows.items():
-            report.row(name, targets, f"{inputs:,}", kept or "-")
-        report.row(
-            "all", sum(row[0] for row in rows.values()), f"{sum(row[1] for row in rows.values()):,}", ""
-        )
-        report.say(f"{found} findings")
+        report.table("of", "targets", "inputs", "of them kept, for new lines")
+        for kind, runs in rows.items():
+            kept = sum(run[2] for run in runs)
+            report.row(kind, len({run[0] for run in runs}), f"{sum(run[1] for run in runs):,}", kept or "-")
+        every = [run for runs in rows.values() for run in runs]
+        report.row("all", len({run[0] for run in every}), f"{sum(run[1] for run in every):,}", "")
+        report.say(f"{sum(bool(FOUND.search(line)) for line in lines)} findings")
 
 
 if __name__ == "__main__":
