@@ -64,6 +64,7 @@ def main() -> None:
             report.row(kind, len({run[0] for run in runs}), f"{sum(run[1] for run in runs):,}", kept or "-")
         every = [run for runs in rows.values() for run in runs]
         report.row("all", len({run[0] for run in every}), f"{sum(run[1] for run in every):,}", "")
+        report.say()
         report.say(f"{sum(bool(FOUND.search(line)) for line in lines)} findings")
 
 
