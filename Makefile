@@ -47,11 +47,11 @@ SANITIZER_FLAGS := -std=gnu++17 -O1 -g -fno-omit-frame-pointer -fno-sanitize-rec
 	-ffp-contract=off -fno-math-errno -fno-trapping-math -fvisibility=hidden -Wno-psabi -Wno-uninitialized \
 	-Wno-maybe-uninitialized $(if $(filter x86_64,$(shell uname -m)),-march=x86-64-v3) -DMS_CHECKS -D_GLIBCXX_ASSERTIONS
 CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_splat_order test_rasterize \
-	test_cutoff test_ramp test_fan_filter test_viewers test_losses test_adam test_merging
+	test_cutoff test_ramp test_fan_filter test_viewers test_losses test_adam test_merging test_core_fuzz
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help demo fuzz test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
+.PHONY: help dawn demo fuzz fuzz-core test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
 	release docs lint format clean
 .DEFAULT_GOAL := help
 
@@ -62,6 +62,7 @@ help:
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'
 	@echo 'make fuzz    broken files against every reader, guided by coverage, for MINUTES=60'
+	@echo 'make fuzz-core   arrays made up at random against the compiled core under sanitizers, CALLS=10000 of each call'
 	@echo 'make wheels  wheels for Linux, Windows and macOS, in dist/'
 	@echo 'make test-windows, test-arm64   the tests with the wheels for Windows, under wine, and for arm64, under qemu'
 	@echo 'make release   all that a release consists of, in dist/ (docs/releasing.md)'
@@ -90,8 +91,17 @@ demo: $(VENV)/installed
 	$(BIN)/meshsplats demo -o $(DEMO) --force
 
 # A worker for each processor; each takes whole files, whose tests share what they make.
-test: $(VENV)/installed-dev
+test: $(VENV)/installed-dev dawn
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# Chromium's compiler of WGSL, for tests/webgpu/test_dawn.py: 130 MB. Without npm, these tests are skipped.
+DAWN := build/dawn
+DAWN_VERSION := 0.6.2
+dawn:
+	@test -e $(DAWN)/$(DAWN_VERSION) || ! command -v npm > /dev/null \
+	  || { echo 'Installing Dawn into $(DAWN)'; mkdir -p $(DAWN); \
+	    npm install --silent --fetch-retries 1 --no-fund --no-audit --prefix $(DAWN) webgpu@$(DAWN_VERSION) && touch $(DAWN)/$(DAWN_VERSION); } \
+	  || echo 'Dawn cannot be installed here: its tests are skipped'
 
 # One wheel serves all versions of Python.
 PACKAGE_FILES := $(foreach kind,py wgsl js html css,$(shell find src -name '*.$(kind)'))
@@ -149,13 +159,13 @@ $(SANITIZED)/%.so: $(CORE_SOURCES) Makefile
 sanitized = LD_PRELOAD="$$($(SANITIZER_CXX) -print-file-name=$(1)) $$($(SANITIZER_CXX) -print-file-name=libstdc++.so.6)" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	TSAN_OPTIONS='halt_on_error=1 ignore_noninstrumented_modules=1' OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
-	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python -m pytest --capture=sys \
-	-k 'not ($(CORE_TESTS_LEFT_OUT))' \
+	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python
+core_tests = -m pytest --capture=sys -k 'not ($(CORE_TESTS_LEFT_OUT))' \
 	$(foreach name,$(CORE_TESTS),$(or $(shell find tests -name $(name).py),tests/$(name).py))
 
 test-sanitizers: $(VENV)/installed-dev $(SANITIZED)/address.so $(SANITIZED)/thread.so
-	$(call sanitized,libasan.so,address)
-	$(call sanitized,libtsan.so,thread) -k 'threads'
+	$(call sanitized,libasan.so,address) $(core_tests)
+	$(call sanitized,libtsan.so,thread) $(core_tests) -k 'threads'
 
 $(WHEELS_VENV)/installed: tools/requirements.txt
 	@echo 'Making $(WHEELS_VENV) with $(WHEELS_PYTHON)'
@@ -191,6 +201,9 @@ MINUTES ?= 60
 fuzz: $(VENV)/installed-dev
 	@$(PIP) install atheris
 	$(BIN)/python tests/fuzz/guided.py $(if $(INPUTS),--inputs $(INPUTS),--minutes $(MINUTES))
+
+fuzz-core: $(VENV)/installed-dev $(SANITIZED)/address.so
+	$(call sanitized,libasan.so,address) tests/fuzz/fuzz_core.py --count $(or $(CALLS),10000)
 
 release: $(WHEELS_VENV)/installed
 	$(WHEELS_BIN)/python tools/release.py -o dist

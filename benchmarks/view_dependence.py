@@ -4,15 +4,14 @@
     python benchmarks/view_dependence.py --data ../shared/data --splats capture.ply --steps 150
 
 PSNR of conversions against the splats with all their harmonics, look "area", in eight views from around, in
-both orders of blending; size of the files; processor milliseconds of shading, and of a picture of 800 pixels
-with it. With --steps also of a fine-tuning of that many steps, on views that it was not tuned on, and of what
+both orders of blending; processor milliseconds of shading, and of a picture of 800 pixels with it; for sizes of
+files, see view_colors.py. With --steps also of a fine-tuning of that many steps, on views that it was not tuned on, and of what
 programs without harmonics then show (``plain``).
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def main() -> None:
     paths = options.splats or [options.data / "splats" / name for name in known]
     with Report(options) as report:
         report.table(
-            *("scene", "degree", "dB, fragment", "dB, splat", ".npz MB", ".glb MB"),
+            *("scene", "degree", "dB, fragment", "dB, splat"),
             *("shading ms a million triangles", "picture ms", "of it shading"),
         )
         for path in paths:
@@ -73,22 +72,11 @@ def conversions(report: Report, path: Path) -> None:
                 Shading(mesh.triangles, large)
             shading = watch.processor / REPEATS
         report.row(
-            *(path.stem, degree, *found, *(f"{size:.1f}" for size in sizes(mesh))),
+            *(path.stem, degree, *found),
             f"{1e9 * shading / len(mesh.faces):.1f}",
             f"{1e3 * picture:.0f}",
             f"{shading / picture:.1%}",
         )
-
-
-def sizes(mesh: ms.SplatMesh) -> list[float]:
-    """MB of the mesh as .npz and as .glb."""
-    found = []
-    with tempfile.TemporaryDirectory() as folder:
-        for suffix in (".npz", ".glb"):
-            file = Path(folder) / f"mesh{suffix}"
-            ms.save_mesh(mesh, file)
-            found.append(file.stat().st_size / 1e6)
-    return found
 
 
 def tunings(report: Report, path: Path, options: argparse.Namespace) -> None:

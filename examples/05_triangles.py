@@ -1,4 +1,4 @@
-"""The triangles of a mesh: splats, mesh, and the mesh with its triangles opaque. The README's image.
+"""The triangles of a mesh: splats, mesh, and the mesh with its triangles opaque. The image of docs/method.md.
 
 python examples/05_triangles.py [scene.ply]      Without a file: the demo scene. Writes into example-output/.
 """

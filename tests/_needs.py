@@ -12,6 +12,7 @@ import pytest
 REMEDIES = {
     "browser": "Chromium: apt install chromium, or CHROMIUM=/path/to/it",
     "gpu": "a Vulkan driver: apt install mesa-vulkan-drivers libvulkan1 (on the processor), or that of a GPU",
+    "dawn": "Dawn for node: make dawn, which needs npm (apt install nodejs npm)",
 }
 VARIABLE = "MESHSPLATS_REQUIRE"
 

@@ -11,6 +11,8 @@ import pytest
 from meshsplats import demo_scene
 from meshsplats.errors import MissingDependencyError
 
+ARGUMENTS = {"08_photographs": ["12", "64", "20"]}
+"""Fewer and smaller photographs, and fewer steps, run the same lines."""
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
 
 
@@ -20,7 +22,7 @@ def test_example_runs(example, tmp_path, monkeypatch, capsys):
     small = demo_scene.make_scene(2_000)
     monkeypatch.setattr(demo_scene, "make_scene", lambda: small)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [str(example)])
+    monkeypatch.setattr(sys, "argv", [str(example), *ARGUMENTS.get(example.stem, [])])
     try:
         runpy.run_path(str(example), run_name="__main__")
     except MissingDependencyError as error:

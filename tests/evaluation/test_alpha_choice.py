@@ -51,7 +51,8 @@ def test_faint_layers_of_one_colour_need_no_order():
 def test_cutoff_below_the_opacities():
     # Many layers of 0.15 are solid together, and each of them is below the usual cutoff.
     layers = [shell(1 - 0.02 * i, 0.15, BLUE if i < 20 else RED) for i in range(40)]
-    choice = choose_alpha(joined(*layers))
+    mesh = joined(*layers)
+    choice = choose_alpha(mesh, orbit(mesh, 4, width=160, height=160))
     assert (choice.alpha, choice.cutoff) == ("mask", 0.1)
 
 

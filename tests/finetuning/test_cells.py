@@ -43,7 +43,7 @@ from meshsplats.finetuning.reports import held_out_scores
 from meshsplats.gaussians import GaussianCloud
 
 COUNT, MOST = 3000, 1100
-CONFIG = make_config(steps=60)
+CONFIG = make_config(steps=40)
 
 
 def scene():
@@ -252,7 +252,7 @@ def test_cells_outlive_a_killed_worker(held, whole_run, tmp_path):
 def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeypatch):
     """Finished cells are not repeated, and a cell goes on from its checkpoint."""
     real = in_cells.finetune
-    calls, cut = [], 25
+    calls, cut = [], 17
 
     def stopping(mesh, dataset, config, *, run, frozen):
         steps = []
@@ -285,7 +285,7 @@ def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeyp
     metrics = [Journal(folder).metrics() for folder in (tmp_path / "run", whole_run.files[0].parents[1])]
     assert [line["step"] for line in metrics[0]] == [line["step"] for line in metrics[1]]
     with pytest.raises(OtherRunError, match="other configuration"):
-        tuned(tmp_path / "run", held, config=make_config(steps=61), resume=True)
+        tuned(tmp_path / "run", held, config=make_config(steps=41), resume=True)
     with pytest.raises(OtherRunError, match="other cell_splats"):
         tuned(tmp_path / "run", held, most=1000, resume=True)
 

@@ -314,6 +314,10 @@ def test_a_checkpoint_with_arrays_that_do_not_fit_is_refused(scene, tmp_path):
         save_checkpoint(replace(good, arrays=arrays if array is None else arrays | {name: array}), path)
         with pytest.raises(FileFormatError, match="checkpoint"):
             finetune(mesh, dataset, make_config(steps=2), run=replace(run, resume=True))
+    for seconds in (10**400, -1.0, float("nan")):
+        save_checkpoint(replace(good, seconds=seconds), path)
+        with pytest.raises(FileFormatError, match="broken: step 2, seconds"):
+            load_checkpoint(path)
 
 
 def test_every_epoch_shows_every_view_once_in_another_order():

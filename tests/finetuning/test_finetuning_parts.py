@@ -355,8 +355,9 @@ def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
     journal.save_preview(2, image, image)
     journal.save_preview(4, image, image)
     journal.save(checkpoint(3))
-    with open(tmp_path / "run" / METRICS, "a") as file:
-        file.write('{"step": 7, "lo')  # a kill in the middle of a line
+    with open(tmp_path / "run" / METRICS, "ab") as file:
+        file.write(b'{"step": 8, "note": "\xff"}\n' + b"[" * 100_000 + b"\n")
+        file.write(b'{"step": 7, "lo')  # a kill in the middle of a line
     with pytest.raises(ValueError, match="no"):
         journal.resume({}, refuse)
     assert len(journal.metrics()) == 3

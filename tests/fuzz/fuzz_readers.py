@@ -26,12 +26,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from fuzz.data_seeds import DATA_SEEDS
 from fuzz.mesh_seeds import MESH_SEEDS
+from fuzz.record_seeds import RECORD_SEEDS
 from fuzz.seeds import SEEDS as SPLAT_SEEDS
 from fuzz.seeds import Seed
 
-from meshsplats import FileFormatError
-
-SEEDS = [*SPLAT_SEEDS, *MESH_SEEDS, *DATA_SEEDS]
+SEEDS = [*SPLAT_SEEDS, *MESH_SEEDS, *DATA_SEEDS, *RECORD_SEEDS]
 MEMORY = 512 << 20
 SECONDS = 10
 KINDS = np.array([4, 3, 3, 1, 1, 1, 1, 3, 3]) / 20
@@ -97,7 +96,8 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
 def mutated_files(seed: Seed, rng: np.random.Generator) -> dict[str, bytes]:
     """The seed's files with one of them mutated, inside its compression every other time."""
     files = dict(seed.files)
-    name = list(files)[int(rng.integers(len(files)))]
+    names = seed.changed or list(files)
+    name = names[int(rng.integers(len(names)))]
     if seed.inside is not None and rng.random() < 0.6:
         files[name] = seed.inside(files[name], lambda data: mutate(data, rng))
     else:
@@ -125,10 +125,8 @@ def fuzz(seed: Seed, count: int, number: int, keep: Path) -> tuple[Counter[str],
             try:
                 seed.load(Path(folder) / seed.opened)
                 outcome = "read"
-            except FileFormatError:
-                outcome = "FileFormatError"
-            except OSError:
-                outcome = "OSError"
+            except seed.errors as error:
+                outcome = type(error).__name__
             except (
                 BaseException
             ) as error:  # whatever else happens is a finding, MemoryError and alarm included

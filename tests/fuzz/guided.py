@@ -6,8 +6,8 @@ changed further.
     python tests/fuzz/guided.py --target ply spz-2/inside --minutes 10
 
 A target is one file of a seed of ``fuzz_readers.py``; NAME/inside is what is inside its compression, with
-the compression made anew around it. Each input gives splats, a mesh, views or cameras, a FileFormatError or
-an OSError, within 10 s and 2 GB. Findings are kept and named; the exit status is 1 if there is one.
+the compression made anew around it. Each input gives what the reader reads, or an error that it promises
+(``Seed.errors``), within 10 s and 2 GB. Findings are kept and named; the exit status is 1 if there is one.
 --corpus keeps what was reached for the next run. --inputs, in place of a time, tries the same inputs each
 time.
 """
@@ -34,8 +34,8 @@ SECONDS, MEGABYTES, MAX_BYTES = 10, 2048, 1 << 16
 """Limits of one input."""
 OPAQUE = (".png", ".webp")
 """Parsed by Pillow alone."""
-Target = tuple[bytes, Callable[[bytes], object]]
-"""What it starts with, and what reads a changed one."""
+Target = tuple[bytes, Callable[[bytes], object], tuple[type[Exception], ...]]
+"""What it starts with, what reads a changed one, and what that may raise."""
 
 
 def targets(folder: Path) -> dict[str, Target]:
@@ -46,24 +46,27 @@ def targets(folder: Path) -> dict[str, Target]:
     for seed in SEEDS:
         if seed.slow:
             continue
-        names = [name for name in seed.files if not name.endswith(OPAQUE)]
+        names = [name for name in seed.changed or seed.files if not name.endswith(OPAQUE)]
+        put(folder / seed.name, seed.files)
         for name in names:
 
             def read(data: bytes, seed=seed, name=name) -> object:
-                put(folder / seed.name, {**seed.files, name: data})
+                (folder / seed.name / name).write_bytes(data)
                 return seed.load(folder / seed.name / seed.opened)
 
             title = seed.name if len(names) == 1 else f"{seed.name}/{name.replace('/', '_')}"
-            found[title] = seed.files[name], read
+            found[title] = seed.files[name], read, seed.errors
             if seed.inside is not None:
-                found[f"{title}/inside"] = inside(seed.inside, seed.files[name], read)
+                start, read_inside = inside(seed.inside, seed.files[name], read)
+                found[f"{title}/inside"] = start, read_inside, seed.errors
     return found
 
 
 def inside(
     change: Callable[[bytes, Callable[[bytes], bytes]], bytes], whole: bytes, read: Callable[[bytes], object]
-) -> Target:
-    """A target within a compressed file. The first byte of its input says which part the rest replaces."""
+) -> tuple[bytes, Callable[[bytes], object]]:
+    """Start and reader of a target within a compressed file. The first byte of an input says which part the
+    rest replaces."""
     parts: list[bytes] = []
 
     def note(part: bytes) -> bytes:
@@ -83,18 +86,16 @@ def run_target(name: str, flags: list[str]) -> None:
     """Fuzzes in this process, which libFuzzer ends."""
     import atheris
 
-    from meshsplats import FileFormatError
-
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").exists() else None) as folder:
-        start, read = targets(Path(folder))[name]
+        start, read, errors = targets(Path(folder))[name]
         read(start)  # imports the reader
         for function in gc.get_objects():
             if isinstance(function, FunctionType) and str(function.__module__).startswith("meshsplats."):
                 atheris.instrument_func(function)
 
         def one(data: bytes) -> None:
-            with suppress(FileFormatError, OSError):
+            with suppress(*errors):
                 read(data)
 
         atheris.Setup([sys.argv[0], *flags], one)

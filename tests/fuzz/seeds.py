@@ -15,7 +15,7 @@ import _splat_encoders as encode
 import numpy as np
 from _splat_files import Table, random_splats, splat_table, write_ply
 
-from meshsplats import load_gaussians
+from meshsplats import FileFormatError, load_gaussians
 
 Change = Callable[[bytes], bytes]
 
@@ -34,6 +34,10 @@ class Seed:
     """The reader under test."""
     slow: bool = False
     """Fuzzed only when asked for by name."""
+    errors: tuple[type[Exception], ...] = (FileFormatError, OSError)
+    """What the reader may raise."""
+    changed: tuple[str, ...] = ()
+    """Files that are changed; empty: all."""
 
 
 def _ply(name: str, encoding: str, degree: int, tables: bool, away: float = 0.0) -> Seed:
@@ -58,7 +62,7 @@ def _moving_ply(name: str, *columns: str) -> Seed:
         return Seed(name, {"a.ply": path.read_bytes()}, "a.ply")
 
 
-def _in_gzip(data: bytes, change: Change) -> bytes:
+def in_gzip(data: bytes, change: Change) -> bytes:
     return gzip.compress(change(gzip.decompress(data)), mtime=0)
 
 
@@ -106,7 +110,7 @@ SEEDS = [
     _ply("ply-far", "binary_little_endian", 0, False, away=5e6),
     Seed("compressed-ply", {"a.ply": encode.compressed_ply(_VALUES)}, "a.ply"),
     Seed("splat", {"a.splat": encode.dot_splat(_VALUES)}, "a.splat"),
-    *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", _in_gzip) for version, data in _SPZ.items()),
+    *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", in_gzip) for version, data in _SPZ.items()),
     *_zstandard_seeds(),
     Seed("sog", {"a.sog": encode.bundle(encode.sog(_VALUES))}, "a.sog", _in_archive),
     Seed("sog-folder", encode.sog(_VALUES), "."),

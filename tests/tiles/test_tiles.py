@@ -408,9 +408,13 @@ def test_a_torn_line_of_the_journal_does_not_count(tmp_path):
         assert again.keys("cell") == {"01"}
         again.add("cell", key="03")
         assert Journal(path).keys("cell") == {"01", "03"}
-    path.write_bytes(b"nonsense\n")
-    with pytest.raises(FileFormatError, match="not a journal"):
-        Journal(path)
+    for line in (b"nonsense", b"7", b'{"step": 1}', b'{"step": "cell", "key": []}', b"[" * 100_000):
+        path.write_bytes(line + b"\n")
+        with pytest.raises(FileFormatError, match="not a journal"):
+            Journal(path)
+    path.write_bytes(b'{"step": "cell"}\n')
+    with pytest.raises(FileFormatError, match="'cell' has no key"):
+        Journal(path).keys("cell")
 
 
 def test_splats_in_one_spot_are_parted_by_their_order(tmp_path):
@@ -543,6 +547,7 @@ def set_(*keys, value):
         (set_("root", "geometricError", value=1e-9), "below one of"),
         (set_("root", "boundingVolume", value={"sphere": [0, 0, 0, 1]}), "bounding box must be 12"),
         (set_("root", "boundingVolume", "box", value=[1e400] * 12), "bounding box must be 12"),
+        (set_("root", "boundingVolume", "box", value=[10**400] * 12), "bounding box must be 12"),
         (set_("root", "transform", value=[1] * 16), "another program has moved it"),
         (set_("root", "refine", value="ADD"), "only explicit tiles"),
         (set_("root", "content", "uri", value="../secret.glb"), "no path below its folder"),

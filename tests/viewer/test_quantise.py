@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -184,6 +185,26 @@ def test_damaged_data_is_refused():
         unpack_mesh(packer.finish({"kind": "splats"}))
     with pytest.raises(ValueError, match="cut off"):
         Unpacker(data, most=100)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rows": [[1, 2]]}, "table of rows"),
+        ({"rows": [[1 << 40, 0, 0]]}, "table of rows"),
+        ({"rows": None}, "table of rows"),
+        ({"vertices": 1 << 40}, "vertices"),
+        ({"vertices": None}, "TypeError"),
+        ({"patterns": [{"size": 1 << 40, "faces": []}] * 64}, "than there are data"),
+        ({"step": None}, "TypeError"),
+    ],
+)
+def test_wrong_headers_are_refused(change, message):
+    body = gzip.decompress(pack_mesh(ms.convert(make_scene(200)), PRECISIONS[0], 1.0))
+    end = 12 + int.from_bytes(body[8:12], "little")
+    text = json.dumps(json.loads(body[12:end]) | change).encode()
+    with pytest.raises(ValueError, match=message):
+        unpack_mesh(gzip.compress(body[:8] + len(text).to_bytes(4, "little") + text + body[end:]))
 
 
 def test_the_same_mesh_gives_the_same_bytes():

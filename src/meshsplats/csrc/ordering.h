@@ -218,8 +218,9 @@ class ViewPairs {
                 enter = std::min(enter, x), leave = std::max(leave, x);
             }
             low = std::max(low, enter), high = std::min(high, leave);
-            const int begin = std::max(0, (int)std::ceil(std::max(low, -1.f) - 0.5f));
-            const int end = (int)std::ceil(std::min(high, width_ + 1.f) - 0.5f);
+            // Limited first: slivers of huge triangles have ends that no int holds.
+            const int begin = std::max(0, (int)std::ceil(std::clamp(low, -1.f, width_ + 1.f) - 0.5f));
+            const int end = (int)std::ceil(std::clamp(high, -1.f, width_ + 1.f) - 0.5f);
             for (int x = begin; x < std::min(end, width_); ++x) {
                 const float alpha = ca[3] + slope * (x + 0.5f - a.x) + down * (py - a.y);
                 if (alpha >= FAINT) blend((size_t)y * width_ + x, piece, layer, std::min(alpha, 1.f));

@@ -28,6 +28,8 @@ from meshsplats.mesh import SplatMesh
 
 VERSION = 1
 _KEY = "meshsplats"
+LONGEST = 1e10
+"""Seconds that a run may have taken: three centuries."""
 _REQUIRED = ("version", "step", "seconds", "config", "mesh", "dataset", "losses")
 
 
@@ -89,6 +91,7 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
         not isinstance(step, int)
         or step < 0
         or not isinstance(seconds, (int, float))
+        or not 0 <= seconds < LONGEST
         or not isinstance(config, dict)
         or not isinstance(losses, list)
         or not all(isinstance(loss, float) for loss in losses)

@@ -88,14 +88,14 @@ class Journal:
     def metrics(self) -> list[dict[str, Any]]:
         """All complete lines; one that was cut off when the process was killed is skipped."""
         try:
-            text = (self.folder / METRICS).read_text(encoding="utf-8")
+            content = (self.folder / METRICS).read_bytes()
         except FileNotFoundError:
             return []
         lines = []
-        for line in text.splitlines():
+        for line in content.splitlines():
             try:
                 entry = json.loads(line)
-            except ValueError:
+            except (ValueError, RecursionError):
                 continue
             if isinstance(entry, dict) and isinstance(entry.get("step"), int):
                 lines.append(entry)

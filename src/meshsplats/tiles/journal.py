@@ -23,10 +23,11 @@ class Journal:
                     break
                 try:
                     step = json.loads(line)
-                except ValueError:
-                    raise FileFormatError(
-                        f"{path}: not a journal: remove its folder, and begin again"
-                    ) from None
+                except (ValueError, RecursionError):
+                    step = None
+                named = isinstance(step, dict) and isinstance(step.get("step"), str)
+                if not named or not isinstance(step.get("key", ""), str):
+                    raise FileFormatError(f"{path}: not a journal: remove its folder, and begin again")
                 self.steps.append(step)
                 whole += len(line)
             os.truncate(path, whole)
@@ -45,4 +46,9 @@ class Journal:
 
     def keys(self, step: str) -> set[str]:
         """The ``key`` of each line of that ``step``."""
-        return {line["key"] for line in self.steps if line["step"] == step}
+        lines = [line for line in self.steps if line["step"] == step]
+        if any("key" not in line for line in lines):
+            raise FileFormatError(
+                f"{self._path}: a step {step!r} has no key: remove its folder, and begin again"
+            )
+        return {line["key"] for line in lines}

@@ -360,7 +360,9 @@ def _whole(value: Any, what: str, path: Path) -> int:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return isinstance(value, int) and not isinstance(value, bool)  # of any length
 
 
 def _beside(file: Path, uri: Any) -> Path:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._json import json_object
+
 MAGIC = b"MSplat01"
 LARGEST = (1 << 31) - 1
 """Magnitude of a number that still can be stored."""
@@ -76,15 +78,25 @@ class Unpacker:
             raise ValueError("not packed data, or cut off")
         at = len(MAGIC) + 4
         length = int.from_bytes(body[len(MAGIC) : at], "little")
-        self.header: dict[str, Any] = json.loads(body[at : at + length])
+        self.header: dict[str, Any] = json_object(body[at : at + length], len(body), "the packed data")
         at += length
+        self.longest = max(1 << 20, 64 * len(body))
+        """Longest row: one of zeros takes no bytes."""
+        rows = self.header.get("rows")
+        if not isinstance(rows, list) or not all(map(self._is_row, rows)):
+            raise ValueError("packed data is broken: its header has no good table of rows")
         self._rows: list[tuple[int, int, int, int]] = []
-        for count, planes, delta in self.header["rows"]:
+        for count, planes, delta in rows:
             self._rows.append((count, planes, delta, at))
             at += count * planes
         if at != len(body):
             raise ValueError(f"packed data must have {at} bytes, got {len(body)}")
         self._body = np.frombuffer(body, np.uint8)
+
+    def _is_row(self, row: object) -> bool:
+        if not isinstance(row, list) or len(row) != 3 or not all(type(n) is int and n >= 0 for n in row):
+            return False
+        return bool(row[0] <= self.longest and row[1] <= 4 and row[2] <= 1)
 
     def row(self, index: int) -> np.ndarray:
         """Row ``index``, (n,) int64."""

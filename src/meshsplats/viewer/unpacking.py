@@ -15,11 +15,20 @@ def unpack_mesh(data: bytes) -> SplatMesh:
     Raises ValueError for anything else.
     """
     source = Unpacker(data)
-    header = source.header
-    if header.get("kind") != "mesh":
+    if source.header.get("kind") != "mesh":
         raise ValueError("the packed data is not a mesh")
-    positions = np.zeros((header["vertices"], 3))
-    colors = np.zeros((header["vertices"], 4))
+    try:
+        return _unpacked(source)
+    except (KeyError, IndexError, TypeError, AttributeError, ArithmeticError) as error:
+        raise ValueError(f"packed data is broken: {type(error).__name__}: {error}") from None
+
+
+def _unpacked(source: Unpacker) -> SplatMesh:
+    header = source.header
+    count = header["vertices"]
+    if not 0 <= count <= source.longest:
+        raise ValueError(f"packed data is broken: {count} vertices")
+    positions, colors = np.zeros((count, 3)), np.zeros((count, 4))
     splat: np.ndarray | None
     if "patterns" in header:
         faces, splat = _unpack_fans(source, positions, colors)
@@ -70,6 +79,8 @@ def _unpack_fans(
     choice, fan_splat = source.row(source.header["choice"]), source.row(source.header["splat"])
     sizes = np.array([pattern["size"] for pattern in patterns])[choice]
     counts = np.array([len(pattern["faces"]) for pattern in patterns])[choice]
+    if max(int(sizes.sum()), int(counts.sum())) > source.longest:
+        raise ValueError("packed data is broken: its fans have more vertices or faces than there are data")
     first, first_face = np.cumsum(sizes) - sizes, np.cumsum(counts) - counts
     faces = np.zeros((int(counts.sum()), 3), np.int64)
     step = source.header["step"]
