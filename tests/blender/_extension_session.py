@@ -5,6 +5,7 @@ import json
 import sys
 import time
 from importlib.machinery import PathFinder
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -323,6 +324,58 @@ report["escape"] |= {
     "timers": window.timers,
 }
 
+# Viewports of EEVEE: what Blender calls when it draws them, and then from a timer.
+sorting = sys.modules[addon + ".sorting"]
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"))
+turned, registered = bpy.context.object, []
+space = SimpleNamespace(shading=SimpleNamespace(type="SOLID"))
+region_data = SimpleNamespace(view_perspective="PERSP", view_matrix=None)
+region = SimpleNamespace(as_pointer=lambda: 1)
+sorting.bpy = SimpleNamespace(
+    context=SimpleNamespace(
+        scene=scene,
+        region=region,
+        space_data=space,
+        region_data=region_data,
+        view_layer=bpy.context.view_layer,
+    ),
+    data=bpy.data,
+    app=SimpleNamespace(
+        is_job_running=lambda _: False,
+        timers=SimpleNamespace(
+            is_registered=lambda function: function in registered,
+            register=lambda function, first_interval: registered.append(function),
+        ),
+    ),
+)
+
+
+def drawn_from(direction, kind="MATERIAL"):
+    """Whether a drawn viewport asks for sorting, and whether the splats then lie far to near."""
+    space.shading.type, region_data.view_matrix = kind, [None, None, direction]
+    registered.clear()
+    sorting.before_drawing()
+    asked = len(registered)
+    while registered and sorting.sort() is not None:
+        pass
+    bpy.context.view_layer.update()
+    data = turned.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    centers = [value.vector for value in data.attributes["splat_center"].data]
+    heights = [sum(a * b for a, b in zip(center, direction, strict=True)) for center in centers]
+    return [asked, all(a <= b + 1e-5 for a, b in pairwise(heights))]
+
+
+turned.matrix_world.identity()
+report["sorted"] = [
+    drawn_from((0, 0, 1), "SOLID"),
+    drawn_from((0, 0, 1)),
+    drawn_from((0, 0, 1)),
+    drawn_from((0, 0.6, 0.8)),
+    drawn_from((0, 0.6, 0.8), "SOLID"),
+]
+sorting.bpy = bpy
+bpy.data.objects.remove(turned)
+
 bpy.ops.preferences.addon_disable(module=addon)
 report["left"] = [
     name
@@ -337,6 +390,7 @@ report["left"] = [
 ]
 report["left"] += [name for name in dir(bpy.types) if "meshsplats" in name.lower()]
 handlers = bpy.app.handlers.depsgraph_update_post[:] + bpy.app.handlers.frame_change_post[:]
+handlers += bpy.app.handlers.load_post[:]
 report["left"] += [h.__name__ for h in handlers if h.__module__.startswith(addon)]
 report["left"] += [name for name in dir(bpy.types.Object) if name == "meshsplats"]
 (folder / "report.json").write_text(json.dumps(report))

@@ -177,3 +177,6 @@ def test_a_whole_session(packed, tmp_path):
     assert (escape["results"], escape["was_cancelled"], escape["timers"]) == (None, True, 0)
     assert not escape["alive"], "the thread stops by itself"
     assert escape["converted"] < 50
+    assert report["sorted"] == [[0, False], [1, True], [0, True], [1, True], [1, False]], (
+        "asked for sorting, is sorted: a solid view, blended, drawn again, turned, solid again"
+    )

@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import objects, rendering, setting, versions
+from meshsplats.blender.inside import objects, rendering, setting, versions, written
 from meshsplats.blender.options import LIGHTS
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.images.reading import load_image
@@ -141,11 +141,26 @@ def test_a_truncated_image_is_an_error(tmp_path, monkeypatch, suffix):
     mesh, camera = plate(0.5)
     path = tmp_path / f"a.{suffix}"
     draw(mesh, [camera], images=[path])
-    rendering._check_written(path, 48 * 36)
+    written.check_image(path, 48 * 36)
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(OSError, match="wrote no image"):
-        rendering._check_written(path, 48 * 36)
+        written.check_image(path, 48 * 36)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
     with pytest.raises(OSError) as caught:
-        rendering._check_written(path, 48 * 36)
+        written.check_image(path, 48 * 36)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+
+
+def test_a_truncated_blend_is_an_error(tmp_path, monkeypatch):
+    path = tmp_path / "a.blend"
+    draw(convert(ball_splats(200)[0]), [], blend=path)
+    written.check_blend(path)
+    data = path.read_bytes()
+    for broken in (data[:-1], data[: len(data) // 2], data[:5000] + data[5100:], b""):
+        path.write_bytes(broken)
+        with pytest.raises(OSError, match=r"a\.blend: Blender wrote no complete file"):
+            written.check_blend(path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
+    with pytest.raises(OSError) as caught:
+        written.check_blend(path)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))

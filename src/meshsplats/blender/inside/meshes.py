@@ -97,17 +97,22 @@ def read_colors(mesh: Any, name: str) -> np.ndarray:
     return colors.reshape(-1, 4)
 
 
-def set_faces(mesh: Any, faces: np.ndarray) -> None:
-    """Reorders the faces of ``mesh``, which has no edges."""
-    versions.set_corners(mesh, faces)
-    mesh.update()
+def owners(mesh: Any) -> np.ndarray:
+    """(f,) int32 values of ``SPLAT``."""
+    values = np.empty(len(mesh.polygons), np.int32)
+    mesh.attributes[SPLAT].data.foreach_get("value", values)
+    return values
 
 
-def far_to_near(vertices: np.ndarray, faces: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
-    """(f,) back-to-front order of the faces (painter's algorithm): descending depth of their centroids.
-    ``vertices`` (v, 3) in the world frame of ``world_to_camera`` (4, 4)."""
-    depth = vertices @ world_to_camera[2, :3].astype(np.float32)
-    return np.argsort(-depth[faces].sum(axis=1), kind="stable")
+def face_middles(mesh: Any) -> np.ndarray:
+    """(f, 3) float32 means of the corners of each face of ``mesh``."""
+    corners, starts = np.empty(len(mesh.loops), np.int32), np.empty(len(mesh.polygons), np.int32)
+    mesh.loops.foreach_get("vertex_index", corners)
+    mesh.polygons.foreach_get("loop_start", starts)
+    places = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", places)
+    counts = np.diff(starts, append=len(corners)).astype(np.float32)
+    return np.add.reduceat(places.reshape(-1, 3)[corners], starts) / counts[:, None]
 
 
 def world_points(obj: Any) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.blender.inside import (
+    far_to_near,
     foreign,
     frame,
     levels,
@@ -73,6 +74,7 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
     rotation = frame.to_blender(prepared["mesh"].up)
     obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
     obj.location = (rotation @ prepared["origin"]).tolist()
+    far_to_near.add(obj, viewport=False)
     _give_stand_in(obj, prepared)
     if prepared["mesh"].binding is not None:
         priors.give_base(obj, prepared["mesh"].binding, collection)
@@ -113,6 +115,7 @@ def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
     old = obj.data
     prepared = prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
     obj.data = _data(prepared, old.name)
+    far_to_near.add(obj, viewport=False)
     stand_ins.remove(obj)
     _give_stand_in(obj, prepared)
     if old.users == 0:

@@ -10,6 +10,7 @@ import numpy as np
 
 from meshsplats.blender.inside import (
     baking,
+    far_to_near,
     frame,
     levels,
     materials,
@@ -157,7 +158,7 @@ def build(
 
 
 def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, edges: bool, home: Any) -> Any:
-    """The object of ``subject`` in the collection ``home``, with its material and, for EEVEE's shadows, its
+    """The object of ``subject`` in the collection ``home``, with its material, its order for EEVEE and its
     stand-in."""
     mesh = meshes.make_mesh(
         subject.name,
@@ -179,6 +180,8 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         linear=subject.linear,
         layers=subject.layers,
     )
+    if edges or options.engine == "eevee":  # a file may be drawn by either
+        far_to_near.add(obj)
     if light is None:
         mesh.materials.append(materials.unlit())
         return obj
