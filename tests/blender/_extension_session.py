@@ -324,6 +324,73 @@ report["escape"] |= {
     "timers": window.timers,
 }
 
+work.bpy_background = lambda: True
+
+# Out again: by our exporter, and by Blender's, which leaves out stand-ins and the ground.
+bpy.context.view_layer.active_layer_collection = bpy.context.view_layer.layer_collection
+for other in [o for o in scene.objects if o.type == "MESH"]:
+    other.hide_set(True)
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"), shading="lit")
+ball = bpy.context.object
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "mesh.npz"))
+other = bpy.context.object
+ball.rotation_euler, ball.location, ball.scale = (0.4, 0, 1), (3, 0, 0), (1, 1, -2)
+bpy.context.view_layer.update()
+for name, arguments in (("out.glb", {}), ("out.npz", {"use_selection": True}), ("out.ply", {})):
+    bpy.ops.export_scene.meshsplats(filepath=str(folder / name), **arguments)
+with contextlib.suppress(RuntimeError):
+    bpy.ops.preferences.addon_enable(module="io_scene_gltf2")
+materials = [o.data.materials[0].name for o in (ball, other)]
+bpy.ops.export_scene.gltf(filepath=str(folder / "theirs.glb"), use_visible=True)
+report["exported"] = {
+    "restored": [o.data.materials[0].name for o in (ball, other)] == materials,
+    "colors": [[a.name for a in o.data.color_attributes if "linear" in a.name] for o in (ball, other)],
+    "active": [o.data.color_attributes.active_color.name for o in (ball, other)],
+    "places": [[v for row in o.matrix_world for v in row] for o in (ball, other)],
+}
+try:
+    bpy.ops.export_scene.meshsplats(filepath=str(folder / "nowhere" / "out.glb"))
+except RuntimeError as error:
+    report["exported"]["error"] = str(error)
+bpy.data.objects.remove(other)
+
+# Edits of lit splats: the panel says so, and baking makes stand-in and light points anew.
+warning = sys.modules[addon + ".panel"].light_warning
+
+
+def only(*objs):
+    for selected in bpy.context.selected_objects:
+        selected.select_set(False)
+    for chosen in objs:
+        chosen.select_set(True)
+    bpy.context.view_layer.objects.active = objs[0]
+
+
+ball.rotation_euler, ball.scale = (0, 0, 0), (1, 1, 1)
+bpy.ops.scene.meshsplats_bake_light()
+report["light"] = {"baked": warning(scene, ball)}
+lamp = next(o for o in scene.objects if o.type == "LIGHT")
+lamp.data.energy *= 2
+report["light"]["lamp"] = warning(scene, ball)
+lamp.data.energy /= 2
+only(ball)
+bpy.ops.object.duplicate()
+copy = bpy.context.object
+report["light"]["duplicated"] = warning(scene, copy)
+bpy.ops.scene.meshsplats_bake_light()
+report["light"]["own"] = [sorted(c.name for c in o.children) for o in (ball, copy)]
+report["light"]["again"] = warning(scene, copy)
+only(ball, copy)
+bpy.ops.object.join()
+report["light"]["joined"] = warning(scene, ball)
+bpy.ops.scene.meshsplats_bake_light()
+report["light"]["left"] = [name for name in report["light"]["own"][1] if name in scene.objects]
+report["light"]["shadows"] = ball.visible_shadow
+made = [child.name for child in ball.children]
+bpy.data.objects.remove(ball)
+sys.modules[addon + ".following"].sweep()
+report["light"]["strays"] = [len(made), [name for name in made if name in scene.objects]]
+
 # Viewports of EEVEE: what Blender calls when it draws them, and then from a timer.
 sorting = sys.modules[addon + ".sorting"]
 bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"))

@@ -164,3 +164,35 @@ def test_a_truncated_blend_is_an_error(tmp_path, monkeypatch):
     with pytest.raises(OSError) as caught:
         written.check_blend(path)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+
+
+def test_the_start_scene_is_hidden_once_and_only_as_it_was(tmp_path):
+    bpy.ops.wm.read_factory_settings()
+    view = bpy.context.scene
+    cube, lamp = view.objects["Cube"], view.objects["Light"]
+    cube.location.x = 1
+    assert setting.hide_start_scene(view) == ["Light"], "a cube that was moved is the user's"
+    cube.location.x = 0
+    assert setting.hide_start_scene(view) == ["Cube"]
+    assert [o.hide_render and o.hide_get() for o in (cube, lamp)] == [True, True]
+    assert setting.hide_start_scene(view) == []
+    cube.hide_render = False
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    assert setting.hide_start_scene(view) == [], "a saved file is the user's"
+
+
+def test_viewports_show_what_was_imported():
+    bpy.ops.wm.read_factory_settings()
+    obj = ball()
+    obj.location = (100, 20, 3)
+    bpy.context.view_layer.update()
+    setting.frame_in_viewports(bpy.context.window_manager.windows, [obj])
+    areas = [a for w in bpy.context.window_manager.windows for a in w.screen.areas if a.type == "VIEW_3D"]
+    assert areas
+    space = areas[0].spaces.active
+    middle = np.mean([tuple(obj.matrix_world @ v.co) for v in obj.data.vertices], axis=0)
+    np.testing.assert_allclose(space.region_3d.view_location, middle, atol=0.2)
+    # The ball of radius 1 fills between half and all of the view's height, at 16 : 9; viewports double the lens'
+    # angle.
+    half = space.region_3d.view_distance * 36 / space.lens * 9 / 16
+    assert 1 < half < 2

@@ -97,6 +97,22 @@ def read_colors(mesh: Any, name: str) -> np.ndarray:
     return colors.reshape(-1, 4)
 
 
+def triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(f, 3) int32 triangles of ``mesh``, its faces cut where they have more corners; and (f,) int32 the face
+    of each."""
+    count = len(mesh.polygons)
+    if len(mesh.loops) == 3 * count:
+        faces = np.empty(3 * count, np.int32)
+        mesh.loops.foreach_get("vertex_index", faces)
+        return faces.reshape(-1, 3), np.arange(count, dtype=np.int32)
+    mesh.calc_loop_triangles()
+    faces = np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", faces)
+    polygon = np.empty(len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("polygon_index", polygon)
+    return faces.reshape(-1, 3), polygon
+
+
 def owners(mesh: Any) -> np.ndarray:
     """(f,) int32 values of ``SPLAT``."""
     values = np.empty(len(mesh.polygons), np.int32)
