@@ -192,7 +192,6 @@ def test_viewports_show_what_was_imported():
     space = areas[0].spaces.active
     middle = np.mean([tuple(obj.matrix_world @ v.co) for v in obj.data.vertices], axis=0)
     np.testing.assert_allclose(space.region_3d.view_location, middle, atol=0.2)
-    # The ball of radius 1 fills between half and all of the view's height, at 16 : 9; viewports double the lens'
-    # angle.
+    # The ball of radius 1 fills half to all of the view's height at 16 : 9; viewports take a sensor of 72 mm.
     half = space.region_3d.view_distance * 36 / space.lens * 9 / 16
     assert 1 < half < 2

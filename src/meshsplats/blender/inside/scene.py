@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -93,6 +93,7 @@ def build(
     *,
     edges: bool,
     coarser: Sequence[Subject] = (),
+    announce: Callable[[str], object] = lambda phase: None,
 ) -> Built:
     """A new file with the subject, its cameras and surroundings, ready to render.
 
@@ -100,6 +101,7 @@ def build(
         limit: that of transparent bounces.
         edges: as in ``meshes.make_mesh``.
         coarser: further levels of detail, if the subject is one; hidden at first (``levels.show``).
+        announce: told a phase of the work that takes long, before it begins.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     versions.enable_cycles()
@@ -153,6 +155,7 @@ def build(
         stage.aim(scene, cameras[0], made[0])
     bpy.context.view_layer.objects.active = obj
     if light is not None:
+        announce("gathering light")
         baking.bake(scene, objects.splat_objects(scene))
     return Built(scene, obj, made, rotation)
 

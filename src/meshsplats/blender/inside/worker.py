@@ -91,7 +91,16 @@ def main(job_path: str) -> None:
     blend, targets = job["blend"], [Path(target) for target in job["images"]]
 
     start, processor = time.perf_counter(), time.process_time()
-    built = build(subject, cameras, options, job["limit"], edges=bool(blend), coarser=coarser)
+    report(stage="building the scene", share=0.0, left=None)
+    built = build(
+        subject,
+        cameras,
+        options,
+        job["limit"],
+        edges=bool(blend),
+        coarser=coarser,
+        announce=lambda phase: report(stage=phase, share=0.0, left=None),
+    )
     report(
         built=round(time.perf_counter() - start, 3),
         processor=round(time.process_time() - processor, 3),
