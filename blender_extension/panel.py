@@ -3,6 +3,7 @@
 
 import bpy
 
+from .cut_operator import CutSplats
 from .import_operator import ImportMeshSplats
 from .object_operators import (
     BakeLight,
@@ -90,6 +91,8 @@ class MeshSplatsPanel(bpy.types.Panel):
             if obj.get("meshsplats_problem"):
                 box.label(text=obj["meshsplats_problem"], icon="ERROR")
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
+        if "meshsplats_lit" in obj.data:
+            layout.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
         warning = light_warning(bpy.context.scene, obj)
         if warning:
             layout.label(text=warning, icon="ERROR")

@@ -354,6 +354,19 @@ except RuntimeError as error:
     report["exported"]["error"] = str(error)
 bpy.data.objects.remove(other)
 
+# Several files at once move together; the engine is that of the user, or Cycles if asked for.
+files = [{"name": "ball.ply"}, {"name": "mesh.npz"}]
+report["imports"] = []
+for arguments in ({}, {"at_origin": True, "use_cycles": True}):
+    scene.render.engine = "BLENDER_WORKBENCH"
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.meshsplats(directory=directory, files=files, set_up_scene=False, **arguments)
+    first, second = sorted((o for o in bpy.data.objects if o not in before), key=lambda o: o.name)
+    apart = [round(b - a, 5) for a, b in zip(first.location, second.location, strict=True)]
+    report["imports"].append([scene.render.engine, apart, list(first.location)])
+    for obj_ in (first, second):
+        bpy.data.objects.remove(obj_)
+
 # Edits of lit splats: the panel says so, and baking makes stand-in and light points anew.
 warning = sys.modules[addon + ".panel"].light_warning
 

@@ -178,6 +178,10 @@ def test_a_whole_session(packed, tmp_path):
     assert not escape["alive"], "the thread stops by itself"
     assert escape["converted"] < 50
     check_exports(report["exported"], tmp_path)
+    plain, moved = report["imports"]
+    assert (plain[0], moved[0]) == ("BLENDER_WORKBENCH", "CYCLES")
+    assert plain[1] == moved[1] != [0, 0, 0]
+    assert plain[2] != moved[2] == [0, 0, 0]
     light = report["light"]
     assert (light["baked"], light["again"]) == ("", "")
     assert light["lamp"] == "Light is older than the scene: Bake Light"
