@@ -66,7 +66,9 @@ def main() -> None:
         report.say(f"Blender {bpy.app.version_string}; least and mean PSNR of {SIDES} sides, dB")
         report.table("splats", "triangles", "as converted", "in the file", "far to near", "sorting")
         for name in asked.splats:
-            mesh = replace(ms.convert(ms.load_gaussians(asked.data / "splats" / name)), harmonics=None)
+            mesh = ms.convert(ms.load_gaussians(asked.data / "splats" / name))
+            # Blender shows neither harmonics nor values above white.
+            mesh = replace(mesh, harmonics=None, plain_colors=None, colors=np.clip(mesh.colors, 0, 1))
             views = [
                 view.with_near_plane(mesh.vertices)
                 for view in ms.orbit(mesh, SIDES, width=asked.size, height=asked.size)
