@@ -19,7 +19,7 @@ from _common import Report, arguments
 
 from meshsplats import convert, orbit, psnr
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.options import estimated_seconds
+from meshsplats.blender.plan import estimated_seconds
 from meshsplats.demo_scene import make_scene
 from meshsplats.images.reading import load_image
 

@@ -1,20 +1,40 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """MeshSplats for Blender: Gaussian splats, and meshes made of them, by File > Import or drag and drop."""
 
-from . import following, import_operator, object_operators, panel, settings
+from . import (
+    cut_operator,
+    export_operator,
+    following,
+    import_operator,
+    object_operators,
+    panel,
+    settings,
+    sorting,
+)
+from .export_operator import (  # noqa: F401 - Blender's glTF exporter looks for them here
+    glTF2_post_export_callback,
+    glTF2_pre_export_callback,
+    glTF2ExportUserExtension,
+)
 
 
 def register():
     settings.register()
     import_operator.register()
+    export_operator.register()
     object_operators.register()
+    cut_operator.register()
     panel.register()
     following.register()
+    sorting.register()
 
 
 def unregister():
+    sorting.unregister()
     following.unregister()
     panel.unregister()
+    cut_operator.unregister()
     object_operators.unregister()
+    export_operator.unregister()
     import_operator.unregister()
     settings.unregister()

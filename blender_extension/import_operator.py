@@ -7,9 +7,9 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
-from meshsplats.formats.splat_formats import splat_suffixes
+from meshsplats.formats.splat_formats import folder_files, splat_suffixes
 
-from .settings import CHOICES, Choices, SceneChoice, copy_choices, draw_choices
+from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
 from .work import Modal, Work, settle
 
 SUFFIXES = (*splat_suffixes(), ".npz")
@@ -28,7 +28,9 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
 
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
-    filter_glob: StringProperty(default=";".join([*(f"*{s}" for s in SUFFIXES), CHAIN]), options={"HIDDEN"})
+    filter_glob: StringProperty(
+        default=";".join([*(f"*{s}" for s in SUFFIXES), CHAIN, *folder_files()]), options={"HIDDEN"}
+    )
     at_origin: BoolProperty(
         name="Move to World Origin",
         description="Stand it on the centre of the grid. Otherwise it keeps the place that its file gives it,"
@@ -38,15 +40,24 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
 
     def invoke(self, context, event):
         if self.files and self.directory:  # dropped
+            self._stand_on_grid(context)
             return context.window_manager.invoke_props_dialog(self)
+        self._stand_on_grid(context)
         return ImportHelper.invoke(self, context, event)
+
+    def _stand_on_grid(self, context):
+        """The first splats of a scene stand on the centre of the grid, unless the user chose otherwise."""
+        from meshsplats.blender.inside import objects
+
+        if not self.properties.is_property_set("at_origin"):
+            self.at_origin = not objects.splat_objects(context.scene)
 
     def draw(self, context):
         layout = self.layout
         layout.use_property_split = True
         draw_choices(self, layout)
         layout.prop(self, "at_origin")
-        layout.prop(self, "set_up_scene")
+        draw_choices(self, layout, SCENE_CHOICES)
 
     def execute(self, context):
         names = [file.name for file in self.files if file.name]
@@ -65,12 +76,14 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
                 )
             else:
                 made = [objects.add(result.prepared[0], result.name, context.collection)]
-            if self.at_origin:
-                made[0].location = (0, 0, 0)
             for obj, path in zip(made, result.level_paths or (result.path,), strict=True):
                 obj.meshsplats.path = path
                 copy_choices(obj.meshsplats, self)
             objs.append(made[0])
+        if self.at_origin:  # all by the same way: files of one capture keep their places to each other
+            away = objs[0].location.copy()
+            for obj in objs:
+                obj.location -= away
         settle(self, context, objs)
         count = sum(len(obj.data.polygons) for obj in objs)
         self.report({"INFO"}, f"MeshSplats: {len(objs)} imported, {count:,} triangles")

@@ -7,7 +7,7 @@ import warnings
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from .settings import CHOICES, Choices, SceneChoice, copy_choices, draw_choices
+from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
 from .work import CloudWork, Modal, Work, settle, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
@@ -84,7 +84,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         layout.use_property_split = True
         draw_choices(self, layout, [name for name in CHOICES if name != "axes"])
         layout.prop(self, "hide_splats")
-        layout.prop(self, "set_up_scene")
+        draw_choices(self, layout, SCENE_CHOICES)
 
     def execute(self, context):
         from meshsplats.blender.inside import frame, splat_points
@@ -213,6 +213,7 @@ class SetUpStage(bpy.types.Operator):
                     if not obj.data[objects.LIT]:
                         objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), True))
                         obj.meshsplats.shading = "lit"
+                setting.hide_start_scene(context.scene)
                 setting.set_up(context.scene, every, self.lights, camera=self.camera)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
@@ -235,8 +236,9 @@ class BakeLight(bpy.types.Operator):
     )
 
     def execute(self, context):
-        from meshsplats.blender.inside import baking, objects
+        from meshsplats.blender.inside import baking, objects, stand_ins
 
+        stand_ins.remove_strays(context.scene)
         lit = [obj for obj in objects.splat_objects(context.scene) if obj.data[objects.LIT]]
         if not lit:
             self.report({"ERROR"}, "there is no lit splat mesh in the scene: choose Lit for one first")
@@ -244,8 +246,15 @@ class BakeLight(bpy.types.Operator):
         if self.live:
             baking.forget(lit)
             return {"FINISHED"}
-        with waiting(context):
-            count = baking.bake(context.scene, lit)
+        try:
+            with waiting(context):
+                renewed = objects.renew_light(context.scene, lit)
+                count = baking.bake(context.scene, lit)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if renewed:
+            self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")
         if not count:
             self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
         return {"FINISHED"}

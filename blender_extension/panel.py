@@ -3,6 +3,7 @@
 
 import bpy
 
+from .cut_operator import CutSplats
 from .import_operator import ImportMeshSplats
 from .object_operators import (
     BakeLight,
@@ -19,6 +20,19 @@ from .settings import draw_choices
 
 CHAIN, LEVEL = "meshsplats_levels", "meshsplats_level"
 """Properties of the collections of levels of detail; ``meshsplats.blender.inside.levels`` sets them."""
+
+
+def light_warning(scene, obj):
+    """What is wrong with the baked light of ``obj``, or ''."""
+    if not obj.data.get("meshsplats_lit") or obj.get("meshsplats_base") is not None:
+        return ""
+    from meshsplats.blender.inside import baking, stand_ins
+
+    if not stand_ins.is_current(obj, counts_only=True):
+        return "Light is of another shape: Bake Light"
+    if baking.is_older(scene, obj):
+        return "Light is older than the scene: Bake Light"
+    return ""
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -77,6 +91,11 @@ class MeshSplatsPanel(bpy.types.Panel):
             if obj.get("meshsplats_problem"):
                 box.label(text=obj["meshsplats_problem"], icon="ERROR")
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
+        if "meshsplats_lit" in obj.data:
+            layout.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
+        warning = light_warning(bpy.context.scene, obj)
+        if warning:
+            layout.label(text=warning, icon="ERROR")
         layout.label(text="Material of this object")
         row = layout.row(align=True)
         row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"

@@ -53,13 +53,30 @@ class Choices:
     )
 
 
+SCENE_CHOICES = ("set_up_scene", "use_cycles", "hide_start_scene", "frame_view")
+
+
 class SceneChoice:
-    """Property of the operators that make splat meshes, for ``work.settle``."""
+    """Properties of the operators that make splat meshes, for ``work.settle``."""
 
     set_up_scene: BoolProperty(
         name="Set up Render",
         description="Set bounce limits and colour management for these meshes",
         default=True,
+    )
+    use_cycles: BoolProperty(
+        name="Render with Cycles",
+        description="Triangles that cross are then right, too, and lit splats have shadows of every lamp."
+        " EEVEE, Blender's default, is faster and draws whole splats far to near",
+        default=False,
+    )
+    hide_start_scene: BoolProperty(
+        name="Hide Start Cube and Lamp",
+        description="In a file that was not saved yet: the cube would stand in the middle of the subject",
+        default=True,
+    )
+    frame_view: BoolProperty(
+        name="Frame in View", description="Turn the 3D views to what was imported", default=True
     )
 
 

@@ -214,13 +214,22 @@ def waiting(context):
 
 
 def settle(operator, context, objs):
-    """Selects new splat meshes and, if ``operator`` is to, sets up the render for all of the scene."""
-    from meshsplats.blender.inside import objects
+    """Selects new splat meshes, hides Blender's start scene, shows them in the viewports and, if ``operator``
+    is to, sets up the render for all of the scene."""
+    from meshsplats.blender.inside import objects, setting
 
     for other in context.selected_objects:
         other.select_set(False)
     for obj in objs:
         obj.select_set(True)
+    hidden = setting.hide_start_scene(context.scene) if operator.hide_start_scene else []
+    if hidden:
+        operator.report({"INFO"}, f"MeshSplats: hid what Blender starts with: {', '.join(hidden)}")
+    context.view_layer.update()
+    if operator.frame_view:
+        setting.frame_in_viewports(context.window_manager.windows, objs)
+    if operator.use_cycles:
+        context.scene.render.engine = "CYCLES"
     if operator.set_up_scene:
         # Rays may pass through several meshes.
         every = objects.splat_objects(context.scene)

@@ -5,6 +5,7 @@ import json
 import sys
 import time
 from importlib.machinery import PathFinder
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -323,6 +324,138 @@ report["escape"] |= {
     "timers": window.timers,
 }
 
+work.bpy_background = lambda: True
+
+# Out again: by our exporter, and by Blender's, which leaves out stand-ins and the ground.
+bpy.context.view_layer.active_layer_collection = bpy.context.view_layer.layer_collection
+for other in [o for o in scene.objects if o.type == "MESH"]:
+    other.hide_set(True)
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"), shading="lit")
+ball = bpy.context.object
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "mesh.npz"))
+other = bpy.context.object
+ball.rotation_euler, ball.location, ball.scale = (0.4, 0, 1), (3, 0, 0), (1, 1, -2)
+bpy.context.view_layer.update()
+for name, arguments in (("out.glb", {}), ("out.npz", {"use_selection": True}), ("out.ply", {})):
+    bpy.ops.export_scene.meshsplats(filepath=str(folder / name), **arguments)
+with contextlib.suppress(RuntimeError):
+    bpy.ops.preferences.addon_enable(module="io_scene_gltf2")
+materials = [o.data.materials[0].name for o in (ball, other)]
+bpy.ops.export_scene.gltf(filepath=str(folder / "theirs.glb"), use_visible=True)
+report["exported"] = {
+    "restored": [o.data.materials[0].name for o in (ball, other)] == materials,
+    "colors": [[a.name for a in o.data.color_attributes if "linear" in a.name] for o in (ball, other)],
+    "active": [o.data.color_attributes.active_color.name for o in (ball, other)],
+    "places": [[v for row in o.matrix_world for v in row] for o in (ball, other)],
+}
+try:
+    bpy.ops.export_scene.meshsplats(filepath=str(folder / "nowhere" / "out.glb"))
+except RuntimeError as error:
+    report["exported"]["error"] = str(error)
+bpy.data.objects.remove(other)
+
+# Several files at once move together; the engine is that of the user, or Cycles if asked for.
+files = [{"name": "ball.ply"}, {"name": "mesh.npz"}]
+report["imports"] = []
+for arguments in ({}, {"at_origin": True, "use_cycles": True}):
+    scene.render.engine = "BLENDER_WORKBENCH"
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.meshsplats(directory=directory, files=files, set_up_scene=False, **arguments)
+    first, second = sorted((o for o in bpy.data.objects if o not in before), key=lambda o: o.name)
+    apart = [round(b - a, 5) for a, b in zip(first.location, second.location, strict=True)]
+    report["imports"].append([scene.render.engine, apart, list(first.location)])
+    for obj_ in (first, second):
+        bpy.data.objects.remove(obj_)
+
+# Edits of lit splats: the panel says so, and baking makes stand-in and light points anew.
+warning = sys.modules[addon + ".panel"].light_warning
+
+
+def only(*objs):
+    for selected in bpy.context.selected_objects:
+        selected.select_set(False)
+    for chosen in objs:
+        chosen.select_set(True)
+    bpy.context.view_layer.objects.active = objs[0]
+
+
+ball.rotation_euler, ball.scale = (0, 0, 0), (1, 1, 1)
+bpy.ops.scene.meshsplats_bake_light()
+report["light"] = {"baked": warning(scene, ball)}
+lamp = next(o for o in scene.objects if o.type == "LIGHT")
+lamp.data.energy *= 2
+report["light"]["lamp"] = warning(scene, ball)
+lamp.data.energy /= 2
+only(ball)
+bpy.ops.object.duplicate()
+copy = bpy.context.object
+report["light"]["duplicated"] = warning(scene, copy)
+bpy.ops.scene.meshsplats_bake_light()
+report["light"]["own"] = [sorted(c.name for c in o.children) for o in (ball, copy)]
+report["light"]["again"] = warning(scene, copy)
+only(ball, copy)
+bpy.ops.object.join()
+report["light"]["joined"] = warning(scene, ball)
+bpy.ops.scene.meshsplats_bake_light()
+report["light"]["left"] = [name for name in report["light"]["own"][1] if name in scene.objects]
+report["light"]["shadows"] = ball.visible_shadow
+made = [child.name for child in ball.children]
+bpy.data.objects.remove(ball)
+sys.modules[addon + ".following"].sweep()
+report["light"]["strays"] = [len(made), [name for name in made if name in scene.objects]]
+
+# Viewports of EEVEE: what Blender calls when it draws them, and then from a timer.
+sorting = sys.modules[addon + ".sorting"]
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"))
+turned, registered = bpy.context.object, []
+space = SimpleNamespace(shading=SimpleNamespace(type="SOLID"))
+region_data = SimpleNamespace(view_perspective="PERSP", view_matrix=None)
+region = SimpleNamespace(as_pointer=lambda: 1)
+sorting.bpy = SimpleNamespace(
+    context=SimpleNamespace(
+        scene=scene,
+        region=region,
+        space_data=space,
+        region_data=region_data,
+        view_layer=bpy.context.view_layer,
+    ),
+    data=bpy.data,
+    app=SimpleNamespace(
+        is_job_running=lambda _: False,
+        timers=SimpleNamespace(
+            is_registered=lambda function: function in registered,
+            register=lambda function, first_interval: registered.append(function),
+        ),
+    ),
+)
+
+
+def drawn_from(direction, kind="MATERIAL"):
+    """Whether a drawn viewport asks for sorting, and whether the splats then lie far to near."""
+    space.shading.type, region_data.view_matrix = kind, [None, None, direction]
+    registered.clear()
+    sorting.before_drawing()
+    asked = len(registered)
+    while registered and sorting.sort() is not None:
+        pass
+    bpy.context.view_layer.update()
+    data = turned.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    centers = [value.vector for value in data.attributes["splat_center"].data]
+    heights = [sum(a * b for a, b in zip(center, direction, strict=True)) for center in centers]
+    return [asked, all(a <= b + 1e-5 for a, b in pairwise(heights))]
+
+
+turned.matrix_world.identity()
+report["sorted"] = [
+    drawn_from((0, 0, 1), "SOLID"),
+    drawn_from((0, 0, 1)),
+    drawn_from((0, 0, 1)),
+    drawn_from((0, 0.6, 0.8)),
+    drawn_from((0, 0.6, 0.8), "SOLID"),
+]
+sorting.bpy = bpy
+bpy.data.objects.remove(turned)
+
 bpy.ops.preferences.addon_disable(module=addon)
 report["left"] = [
     name
@@ -337,6 +470,7 @@ report["left"] = [
 ]
 report["left"] += [name for name in dir(bpy.types) if "meshsplats" in name.lower()]
 handlers = bpy.app.handlers.depsgraph_update_post[:] + bpy.app.handlers.frame_change_post[:]
+handlers += bpy.app.handlers.load_post[:]
 report["left"] += [h.__name__ for h in handlers if h.__module__.startswith(addon)]
 report["left"] += [name for name in dir(bpy.types.Object) if name == "meshsplats"]
 (folder / "report.json").write_text(json.dumps(report))

@@ -21,7 +21,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats, random_mesh
 from conftest import SHARED, script
 
-from meshsplats import convert, save_gaussians, save_mesh
+from meshsplats import convert, load_mesh, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.prior import bind
 
@@ -177,3 +177,51 @@ def test_a_whole_session(packed, tmp_path):
     assert (escape["results"], escape["was_cancelled"], escape["timers"]) == (None, True, 0)
     assert not escape["alive"], "the thread stops by itself"
     assert escape["converted"] < 50
+    check_exports(report["exported"], tmp_path)
+    plain, moved = report["imports"]
+    assert (plain[0], moved[0]) == ("BLENDER_WORKBENCH", "CYCLES")
+    assert plain[1] == moved[1] != [0, 0, 0]
+    assert plain[2] != moved[2] == [0, 0, 0]
+    light = report["light"]
+    assert (light["baked"], light["again"]) == ("", "")
+    assert light["lamp"] == "Light is older than the scene: Bake Light"
+    assert light["duplicated"] == light["joined"] == "Light is of another shape: Bake Light"
+    assert [len(names) for names in light["own"]] == [2, 2], "each has a stand-in and light points"
+    assert light["left"] == [], "those of the copy are gone"
+    assert not light["shadows"], "the stand-in casts them"
+    assert light["strays"] == [2, []], "what was made for deleted splats goes with them"
+    assert report["sorted"] == [[0, False], [1, True], [0, True], [1, True], [1, False]], (
+        "asked for sorting, is sorted: a solid view, blended, drawn again, turned, solid again"
+    )
+
+
+def check_exports(report: dict, folder: Path) -> None:
+    """A lit ball of splats, moved, turned and mirrored, and an unlit mesh: colours, places and owners."""
+    ball, mesh = convert(ball_splats(400)[0], mode="flat"), random_mesh(30)
+    matrices = np.array(report["places"]).reshape(2, 4, 4)
+    ours = load_mesh(folder / "out.ply")
+    assert len(ours.faces) == len(ball.faces) + len(mesh.faces)
+    assert ours.splat_count == 430
+    np.testing.assert_array_equal(ours.up, [0, 0, 1])
+    colors = np.concatenate([ball.colors, mesh.colors])
+    np.testing.assert_allclose(ours.colors, colors, atol=2e-6)
+    local = ball.vertices - ball.vertices.mean(axis=0)
+    rotation = matrices[0, :3, :3]
+    placed = ours.vertices[: len(ball.vertices)]
+    np.testing.assert_allclose(placed - placed.mean(axis=0), local @ rotation.T, atol=1e-4)
+    np.testing.assert_allclose(load_mesh(folder / "out.glb").colors, colors, atol=1e-3)
+    alone = load_mesh(folder / "out.npz")
+    np.testing.assert_allclose(alone.colors, mesh.colors, atol=1e-6)
+    theirs = load_mesh(folder / "theirs.glb")
+    assert len(theirs.faces) == len(ours.faces), "no stand-in, no points of light, no ground"
+    middle = theirs.colors[theirs.faces].mean(axis=1)
+    np.testing.assert_allclose(middle, ours.colors[ours.faces].mean(axis=1), atol=1e-3)
+    document = (folder / "theirs.glb").read_bytes()
+    length = int.from_bytes(document[12:16], "little")
+    for material in json.loads(document[20 : 20 + length])["materials"]:
+        assert material["alphaMode"] == "BLEND"
+        assert "KHR_materials_unlit" in material["extensions"]
+    assert report["restored"]
+    assert report["colors"] == [[], []]
+    assert report["active"] == ["Color", "Color"]
+    assert "nowhere" in report["error"]

@@ -12,7 +12,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import baking, materials, meshes, objects, rendering, scene, stage, worker
+from meshsplats.blender.inside import baking, materials, meshes, objects, rendering, scene, stage
 from meshsplats.colors import linear_to_srgb
 
 SIDE = 48
@@ -161,17 +161,3 @@ def test_the_stand_in_is_seen_by_light_alone(ball, tmp_path):
     shadowed = shot(made, tmp_path / "d.exr")
     floor = render(mesh, view).alpha < 0.01
     assert (shadowed[floor] < 0.6 * without[floor]).mean() > 0.02, "the stand-in alone casts the shadow"
-
-
-def test_sorted_faces_keep_what_belongs_to_them(ball):
-    mesh, view = ball
-    fine = np.random.default_rng(0).random(len(mesh.faces)) < 0.3
-    arrays, facts = subject.prepare(mesh, [view], SceneOptions(), 4)
-    before = scene.Subject(**arrays | {"fine_faces": fine}, **facts)
-    after = worker._for_painter(before, view)
-    assert not np.array_equal(after.faces, before.faces)
-
-    def rows(found):
-        return sorted(zip(found.faces.tolist(), found.face_splat.tolist(), found.fine_faces, strict=True))
-
-    assert rows(after) == rows(before)

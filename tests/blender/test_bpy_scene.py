@@ -89,6 +89,18 @@ def test_lit_file_has_everything_in_named_collections(tmp_path):
     assert data.validate(verbose=True) is False, "Blender finds nothing to mend"
 
 
+def test_what_takes_long_before_a_lit_image_is_named(tmp_path):
+    told = []
+    draw(
+        convert(ball_splats(200)[0]),
+        cameras()[:1],
+        blend=tmp_path / "s.blend",
+        options=SceneOptions(light=LightOptions(), samples=1),
+        progress=lambda at: told.append(at.phase),
+    )
+    assert told == ["surface and colours for light", "building the scene", "gathering light"]
+
+
 def test_mesh_arrays_arrive_as_they_are():
     mesh = random_mesh(50)
     normals = np.tile(np.float32([0, 0.6, 0.8]), (len(mesh.vertices), 1))

@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import objects, rendering, setting, versions
+from meshsplats.blender.inside import objects, rendering, setting, versions, written
 from meshsplats.blender.options import LIGHTS
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.images.reading import load_image
@@ -141,11 +141,57 @@ def test_a_truncated_image_is_an_error(tmp_path, monkeypatch, suffix):
     mesh, camera = plate(0.5)
     path = tmp_path / f"a.{suffix}"
     draw(mesh, [camera], images=[path])
-    rendering._check_written(path, 48 * 36)
+    written.check_image(path, 48 * 36)
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(OSError, match="wrote no image"):
-        rendering._check_written(path, 48 * 36)
+        written.check_image(path, 48 * 36)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
     with pytest.raises(OSError) as caught:
-        rendering._check_written(path, 48 * 36)
+        written.check_image(path, 48 * 36)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+
+
+def test_a_truncated_blend_is_an_error(tmp_path, monkeypatch):
+    path = tmp_path / "a.blend"
+    draw(convert(ball_splats(200)[0]), [], blend=path)
+    written.check_blend(path)
+    data = path.read_bytes()
+    for broken in (data[:-1], data[: len(data) // 2], data[:5000] + data[5100:], b""):
+        path.write_bytes(broken)
+        with pytest.raises(OSError, match=r"a\.blend: Blender wrote no complete file"):
+            written.check_blend(path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
+    with pytest.raises(OSError) as caught:
+        written.check_blend(path)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+
+
+def test_the_start_scene_is_hidden_once_and_only_as_it_was(tmp_path):
+    bpy.ops.wm.read_factory_settings()
+    view = bpy.context.scene
+    cube, lamp = view.objects["Cube"], view.objects["Light"]
+    cube.location.x = 1
+    assert setting.hide_start_scene(view) == ["Light"], "a cube that was moved is the user's"
+    cube.location.x = 0
+    assert setting.hide_start_scene(view) == ["Cube"]
+    assert [o.hide_render and o.hide_get() for o in (cube, lamp)] == [True, True]
+    assert setting.hide_start_scene(view) == []
+    cube.hide_render = False
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    assert setting.hide_start_scene(view) == [], "a saved file is the user's"
+
+
+def test_viewports_show_what_was_imported():
+    bpy.ops.wm.read_factory_settings()
+    obj = ball()
+    obj.location = (100, 20, 3)
+    bpy.context.view_layer.update()
+    setting.frame_in_viewports(bpy.context.window_manager.windows, [obj])
+    areas = [a for w in bpy.context.window_manager.windows for a in w.screen.areas if a.type == "VIEW_3D"]
+    assert areas
+    space = areas[0].spaces.active
+    middle = np.mean([tuple(obj.matrix_world @ v.co) for v in obj.data.vertices], axis=0)
+    np.testing.assert_allclose(space.region_3d.view_location, middle, atol=0.2)
+    # The ball of radius 1 fills half to all of the view's height at 16 : 9; viewports take a sensor of 72 mm.
+    half = space.region_3d.view_distance * 36 / space.lens * 9 / 16
+    assert 1 < half < 2

@@ -301,6 +301,7 @@ def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
     [
         (["-o", "a.jpg"], "must end in .png, .exr, .blend"),
         (["-o", "a.png", "--mirror"], "the options of light need --lit"),
+        (["-o", "a.png", "--max-splats", "5"], "--max-splats is for splats: this is a mesh already"),
         (["-o", "a.png", "--no-denoise"], "--no-denoise is for --lit"),
         (["-o", "a.png", "--lit", "--engine", "eevee", "--no-denoise"], "--no-denoise is for --lit"),
         (["-o", "a.png", "--transparent", "--background", "black"], "exclude each other"),

@@ -71,14 +71,39 @@ def test_named_lights_and_what_is_said_instead():
 @pytest.mark.parametrize(
     ("layers", "options", "seconds"),
     [
-        (10, SceneOptions(light=LightOptions(), samples=10, threads=2), (1e6 * 10 * 12e-6 + 8) / 2),
-        (10, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 140e-6 + 8),
-        (10, SceneOptions(threads=1), 1e6 * 10 * 11e-6),
+        (10, SceneOptions(light=LightOptions(), samples=10, threads=2), (1e6 * 10 * 20.3e-6 + 8) / 2),
+        (10, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 223e-6 + 8),
+        (10, SceneOptions(threads=1), 1e6 * 10 * 19.3e-6),
         (10, SceneOptions(engine="eevee"), None),
     ],
 )
 def test_the_estimate(layers, options, seconds):
-    from meshsplats.blender.options import estimated_seconds
+    from meshsplats.blender.plan import estimated_seconds
 
-    ahead = {"mean_layers": layers, "samples": 10, "pixels": 10**6, "triangles": 0}
+    ahead = {
+        "mean_layers": layers,
+        "mean_square_layers": 1000,
+        "samples": 10,
+        "pixels": 10**6,
+        "triangles": 0,
+    }
     assert estimated_seconds(ahead, options) == (None if seconds is None else pytest.approx(seconds))
+
+
+def test_a_named_light_lights():
+    from meshsplats.cli.blender import Blender
+
+    assert not Blender(None, None).is_lit
+    assert Blender(None, None, lights="noon").is_lit
+    assert Blender(None, None, lights="noon").named_light() == LIGHTS["noon"]
+    assert Blender(None, None, lit=True).named_light() == LIGHTS["sun"]
+
+
+def test_phases_are_told_at_once(capsys):
+    from meshsplats.blender.launch import Progress
+    from meshsplats.cli.blender import _Lines
+
+    show = _Lines()
+    for stage in ("gathering light", "gathering light", "Sample 3/16", "Updating Geometry"):
+        show(Progress(0, 1, 0.0, stage, None))
+    assert capsys.readouterr().err.splitlines() == ["meshsplats: Blender: gathering light"]

@@ -254,3 +254,25 @@ def test_packages_are_refused_with_advice(tmp_path):
     (tmp_path / "m.usdz").write_bytes(b"PK\x03\x04" + bytes(30))
     with pytest.raises(FileFormatError, match="usdcat"):
         load_mesh(tmp_path / "m.usdz")
+
+
+@needs_usd
+@pytest.mark.parametrize(("lit", "linear"), [(False, False), (True, False), (False, True)])
+def test_colours_that_blenders_exporter_wrote(tmp_path, lit, linear):
+    """The extension's meshes: RGBA in a primvar named as the attribute, and no displayColor. Their stand-ins
+    for light are left out."""
+    rgba = "(0.5, 0.25, 1, 0.75)"
+    primvar = 'color4f[] primvars:{} = [{}] (interpolation = "constant")'
+    other = primvar.format("Color", "(0, 0, 0, 0)") if lit else ""
+    note = "".join(
+        f" custom bool userProperties:meshsplats_{name} = {int(value)}\n"
+        for name, value in (("lit", lit), ("linear", linear))
+    )
+    colors = primvar.format("DisplayColor" if lit else "Color", rgba)
+    body = 'def Xform "Splats" {\n' + shape("M", f"{colors}\n{other}\n{note}") + "}\n"
+    helper = 'def Xform "stand" {\n custom bool userProperties:meshsplats_stand_in = 1\n' + shape() + "}\n"
+    arrays, _ = read(tmp_path, stage(body + helper))
+    assert len(arrays["faces"]) == 1
+    colors = arrays["linear"] if linear else linear_to_srgb(arrays["linear"])
+    np.testing.assert_allclose(colors[:, :3], [[0.5, 0.25, 1]] * 3, atol=1e-6)
+    np.testing.assert_allclose(arrays["linear"][:, 3], 0.75)

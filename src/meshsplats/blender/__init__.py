@@ -115,6 +115,7 @@ def draw(
         _warn(meshes[counted.index((layers, limit))], cameras, layers, options)
     if announce is not None:
         samples = options.samples if options.light is not None else options.samples**2
+        mean, mean_square = subject.layer_means(finest, cameras, options.threads)
         announce(
             {
                 "triangles": len(finest.faces),
@@ -122,9 +123,12 @@ def draw(
                 "bounce_limit": limit,
                 "samples": samples,
                 "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
-                "mean_layers": subject.mean_layers(finest, cameras, options.threads),
+                "mean_layers": mean,
+                "mean_square_layers": mean_square,
             }
         )
+    if progress is not None and options.light is not None:
+        progress(launch.Progress(0, len(targets), 0.0, "surface and colours for light", None))
     subjects = []
     for level, size in zip(meshes, chain.screen_sizes, strict=True):
         arrays, facts = subject.prepare(level, cameras, options, layers)

@@ -54,6 +54,11 @@ class Progress:
     left: str | None
     """Blender's estimate of the time left for the current image, if any."""
 
+    @property
+    def phase(self) -> str:
+        """What is done before the images; '' for a step of an image, in Blender's words."""
+        return self.stage if self.stage[:1].islower() else ""
+
 
 class BlenderError(ChildProcessError):
     """Blender failed; the message quotes it."""

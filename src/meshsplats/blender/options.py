@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -137,21 +137,3 @@ def check_environment(path: Path) -> None:
         raise ValueError(
             f"{path}: an environment image is a Radiance .hdr or an OpenEXR file; this is neither"
         )
-
-
-def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:
-    """Estimated time with Cycles, from the plan of ``draw``; None for EEVEE. Measured with Blender 4.2 on
-    scenes of 4 to 16 layers per pixel (docs/blender.md): a ray that meets m layers costs 1.1 m microseconds,
-    and lit one more for the ground. Before a lit image come the stand-in, colours and baked light."""
-    if options.engine != "cycles":
-        return None
-    from meshsplats._core.library import processors
-
-    layers = ahead["mean_layers"]
-    lit = options.light is not None
-    ray = 1.1e-6 * layers + (1e-6 if lit else 0)
-    pixel = ray * ahead["samples"] + (20e-6 if options.denoise else 0)
-    busy = pixel * ahead["pixels"] + 2e-6 * ahead["triangles"]
-    if lit:
-        busy += 8 + 35e-6 * ahead["triangles"]
-    return busy / (options.threads or processors())

@@ -40,10 +40,15 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
 
 
-def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None) -> float:
-    """Mean number of triangles behind each other in a pixel, over the images."""
+def layer_means(
+    mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None
+) -> tuple[float, float]:
+    """Mean and mean square of the number of triangles behind each other in a pixel, over the images."""
     some = [camera.within(PROBE_SIDE) for camera in subsample(cameras, 4)]
-    return float(np.mean([count_layers(mesh, camera, threads=threads).mean() for camera in some] or [0.0]))
+    counts = [count_layers(mesh, camera, threads=threads).astype(np.float64) for camera in some]
+    if not counts:
+        return 0.0, 0.0
+    return float(np.mean([c.mean() for c in counts])), float(np.mean([(c**2).mean() for c in counts]))
 
 
 def prepare(

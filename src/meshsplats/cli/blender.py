@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
-from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions, estimated_seconds
+from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
+from meshsplats.blender.plan import in_words
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import Command, as_cli_options
@@ -106,9 +107,9 @@ class Blender(Command):
     """cycles: exact. eevee: faster on a graphics card, with triangles sorted per view, which is nearly
     exact."""
     views: ViewOptions = field(default_factory=ViewOptions)
-    lights: Literal["sun", "noon", "overcast", "studio"] = "sun"
-    """With --lit: afternoon sun, high sun in a clear sky, clouds, or two large lamps. The options under
-    "light" change them."""
+    lights: Literal["sun", "noon", "overcast", "studio"] | None = None
+    """Light the splats (--lit) by an afternoon sun, the default, a high sun in a clear sky, clouds, or two
+    large lamps. The options under "light" change them."""
     light: LightArguments = field(default_factory=LightArguments)
     background: str = "white"
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
@@ -127,6 +128,8 @@ class Blender(Command):
     """Maximum number of threads. Default: all processors."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
+    max_splats: Count = None
+    """Merge splats that are alike until at most this many are left: a preview in less time."""
     max_error: Number = None
     """Tileset: take tiles whose geometric error is at most this many pixels in the images. Default: 1."""
     json: bool = False
@@ -163,10 +166,10 @@ class Blender(Command):
         check_outputs(
             [*images, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )
-        mesh = self._tiles(tileset, cameras) if tileset else _converted(scene, self.lit)
+        mesh = self._tiles(tileset, cameras) if tileset else self._converted(scene)
         subject: SplatMesh | LevelMeshes = mesh
         if chain:
-            levels = [mesh, *(_converted(level, self.lit) for level in coarser)]
+            levels = [mesh, *(self._converted(level) for level in coarser)]
             subject = LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
         if not suffix:
             self.output.mkdir(exist_ok=True)
@@ -178,7 +181,7 @@ class Blender(Command):
                 blend=blend,
                 options=options,
                 executable=self.executable,
-                announce=lambda ahead: say(_plan(ahead, options, len(images))),
+                announce=lambda ahead: say(in_words(ahead, options, len(images))),
                 progress=show,
             )
         save_cameras(cameras, records[0], origin=scene.origin)
@@ -217,9 +220,9 @@ class Blender(Command):
             )
         if self.transparent and self.background != "white":
             raise UsageError("--transparent and --background exclude each other")
-        if not self.lit and (self.light != LightArguments() or self.lights != "sun"):
+        if not self.is_lit and self.light != LightArguments():
             raise UsageError("the options of light need --lit")
-        if self.no_denoise and (not self.lit or self.engine != "cycles"):
+        if self.no_denoise and (not self.is_lit or self.engine != "cycles"):
             raise UsageError("--no-denoise is for --lit with Cycles: other images are not denoised")
         if suffix and self.format != "png":
             raise UsageError("--format is for a folder of images: the name given with -o decides")
@@ -227,22 +230,37 @@ class Blender(Command):
             raise UsageError("--background has no effect with --hdri, which is the background")
         samples = self.samples
         if samples is None:
-            samples = LIT_SAMPLES if self.lit else 1 if suffix == ".blend" else 2
-        elif suffix == ".blend" and not self.lit and samples > 1:
+            samples = LIT_SAMPLES if self.is_lit else 1 if suffix == ".blend" else 2
+        elif suffix == ".blend" and not self.is_lit and samples > 1:
             raise UsageError("--samples: an unlit .blend takes one sample per pixel; render it larger")
         options = SceneOptions(
-            light=self.named_light() if self.lit else None,
+            light=self.named_light() if self.is_lit else None,
             engine=self.engine,
             samples=samples,
             background=None if self.transparent else parse_color(self.background),
-            denoise=self.lit and self.engine == "cycles" and not self.no_denoise,
+            denoise=self.is_lit and self.engine == "cycles" and not self.no_denoise,
             threads=self.threads,
         )
         options.check()
         return options
 
     def resolved(self) -> dict[str, Any]:
-        return asdict(self.named_light()) if self.lit else {}
+        return asdict(self.named_light()) if self.is_lit else {}
+
+    @property
+    def is_lit(self) -> bool:
+        return self.lit or self.lights is not None
+
+    def _converted(self, scene: GaussianCloud | SplatMesh) -> SplatMesh:
+        if isinstance(scene, SplatMesh):
+            if self.max_splats is not None:
+                raise UsageError("--max-splats is for splats: this is a mesh already")
+            return scene
+        from meshsplats.conversion import convert
+
+        # Crossed ellipses stand upright on the surface, where they catch too little light.
+        mode: Literal["flat"] | None = "flat" if self.is_lit else None
+        return convert(scene, max_splats=self.max_splats, mode=mode)
 
     def named_light(self) -> LightOptions:
         """The light of --lights, changed by the options."""
@@ -250,11 +268,11 @@ class Blender(Command):
         explicit = {
             name: value for name, value in options.items() if value is not None and value is not False
         }
-        return replace(LIGHTS[self.lights], **explicit)
+        return replace(LIGHTS[self.lights or "sun"], **explicit)
 
     def _views(self) -> ViewOptions:
         """Mirror and ball need room beside the subject."""
-        wide = self.lit and (self.light.mirror or self.light.glass) and self.views.cameras is None
+        wide = self.is_lit and (self.light.mirror or self.light.glass) and self.views.cameras is None
         if wide and self.views.look_around is None and self.views.distance == 1.0:
             return replace(self.views, distance=1.7)
         return self.views
@@ -289,40 +307,6 @@ class Blender(Command):
         print(summary)
 
 
-def _converted(scene: GaussianCloud | SplatMesh, lit: bool) -> SplatMesh:
-    if isinstance(scene, SplatMesh):
-        return scene
-    from meshsplats.conversion import convert
-
-    # Crossed ellipses stand upright on the surface, where they catch too little light.
-    return convert(scene, mode="flat") if lit else convert(scene)
-
-
-def _plan(ahead: dict[str, Any], options: SceneOptions, images: int) -> str:
-    """The work ahead of Blender, with an estimate of the time."""
-    text = f"{ahead['triangles']:,} triangles, up to {ahead['layers']:,} layers behind each other"
-    if not images:
-        return text
-    text += f" ({ahead['mean_layers']:.0f} on average), {plural(ahead['samples'], 'sample')} per pixel"
-    text += ", denoised" if options.denoise else ""
-    seconds = estimated_seconds(ahead, options)
-    return text + ("" if seconds is None else f"; about {_duration(seconds)} on {_processors(options)}")
-
-
-def _processors(options: SceneOptions) -> str:
-    from meshsplats._core.library import processors
-
-    return plural(options.threads or processors(), "thread")
-
-
-def _duration(seconds: float) -> str:
-    """In words, no more exact than an estimate."""
-    if seconds < 90:
-        return f"{max(5, 5 * round(seconds / 5))} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"
-
-
 @contextmanager
 def _progress_display(total: int) -> Iterator[Callable[[Progress], object]]:
     """A function that shows the progress of Blender: as a bar where stderr is a terminal, else in a line now
@@ -342,10 +326,11 @@ def _progress_display(total: int) -> Iterator[Callable[[Progress], object]]:
 
 class _Lines:
     def __init__(self) -> None:
-        self._next = time.monotonic() + _EVERY
+        self._next, self._phase = time.monotonic() + _EVERY, ""
 
     def __call__(self, at: Progress) -> None:
-        if at.stage and time.monotonic() >= self._next:
+        if at.stage and (time.monotonic() >= self._next or (at.phase and at.phase != self._phase)):
+            self._phase = at.phase
             self._next = time.monotonic() + _EVERY
             say(f"Blender: {_words(at)}")
 

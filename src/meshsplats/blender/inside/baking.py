@@ -6,6 +6,7 @@ long as an unlit one; the light stays as it was when it was gathered.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -22,6 +23,8 @@ POINTS = "meshsplats_light_points"
 """Property of the splats' object: the object of the points."""
 SIZE = "meshsplats_spacing"
 """Property of the points' mesh: distance of neighbouring points, scene units."""
+STATE = "meshsplats_light_state"
+"""Property of the splats: the ``state`` of the scene when their light was baked."""
 SAMPLES = 12
 """Samples at each of the three corners that a point has."""
 _AGREE = 4
@@ -108,7 +111,37 @@ def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
             if before is not None:
                 levels.show(chain, before)
             show(obj.data, smoothed(target.data))
+    for obj in chosen:
+        obj[STATE] = state(scene, obj)
     return len(chosen)
+
+
+def is_older(scene: Any, obj: Any) -> bool:
+    """Whether the splats ``obj`` show baked light, and lamps, sky, other objects or they themselves have
+    moved or changed since."""
+    shows = any(materials.shows_baked(material) for material in obj.data.materials)
+    return shows and obj.get(STATE) != state(scene, obj)
+
+
+def state(scene: Any, obj: Any) -> str:
+    """A checksum of what lights the splats ``obj``: lamps, sky and the places of all that is rendered."""
+    parts: list[Any] = [_numbers(obj.matrix_world)]
+    for other in sorted(scene.objects, key=lambda other: other.name):
+        if other.type == "LIGHT" and not other.hide_render:
+            lamp = other.data
+            parts += [_numbers(other.matrix_world), lamp.type, _numbers([[lamp.energy, *lamp.color]])]
+        elif other.type == "MESH" and other != obj and other.parent != obj and not other.hide_render:
+            parts += [other.name, _numbers(other.matrix_world), len(other.data.vertices)]
+    tree = scene.world.node_tree if scene.world is not None else None
+    for node in tree.nodes if tree is not None else ():
+        if node.type == "BACKGROUND":
+            values = [node.inputs["Strength"].default_value, *node.inputs["Color"].default_value]
+            parts.append(_numbers([values]))
+    return f"{zlib.crc32(repr(parts).encode()):08x}"
+
+
+def _numbers(rows: Any) -> list[float]:
+    return [float(f"{value:.4g}") + 0.0 for row in rows for value in row]
 
 
 def forget(objs: list[Any]) -> None:
@@ -176,9 +209,11 @@ def mean_light(centers: np.ndarray, normals: np.ndarray, light: np.ndarray, size
 def _bake(target: Any) -> None:
     layer = bpy.context.view_layer
     active, selected = layer.objects.active, list(bpy.context.selected_objects)
+    hidden = target.hide_get()  # with all else that the user has hidden
     for obj in selected:
         obj.select_set(False)
     try:
+        target.hide_set(False)
         target.select_set(True)
         layer.objects.active = target
         bpy.ops.object.bake(
@@ -190,6 +225,7 @@ def _bake(target: Any) -> None:
         )
     finally:
         target.select_set(False)
+        target.hide_set(hidden)
         for obj in selected:
             obj.select_set(True)
         layer.objects.active = active

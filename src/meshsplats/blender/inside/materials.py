@@ -56,6 +56,17 @@ def unlit(name: str = "Splats, unlit", *, attribute: str = COLOR) -> Any:
     return material
 
 
+def stock(attribute: str, name: str = "Splats") -> Any:
+    """Emits the linear colours of ``attribute``, composited by opacity, by the nodes that Blender's exporters
+    know."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    color = tree.node("ShaderNodeVertexColor", 0, 1, layer_name=attribute)
+    # A colour in place of a shader glows; the glTF exporter loses the opacity beside an Emission node.
+    _translucent(tree, material, color.outputs["Alpha"], color.outputs["Color"])
+    return material
+
+
 def lit(
     name: str = "Splats, lit",
     *,
@@ -124,6 +135,12 @@ def set_baked(material: Any, baked: bool) -> None:
     node = material.node_tree.nodes.get(BAKED) if material is not None and material.node_tree else None
     if node is not None:
         node.outputs[0].default_value = float(baked)
+
+
+def shows_baked(material: Any) -> bool:
+    """Whether the lit ``material`` shows baked light."""
+    node = material.node_tree.nodes.get(BAKED) if material is not None and material.node_tree else None
+    return node is not None and node.outputs[0].default_value > 0.5
 
 
 def stand_in(name: str = "Stand-in", *, fine: bool = False, self_shadow: float = 0.0) -> Any:

@@ -97,17 +97,38 @@ def read_colors(mesh: Any, name: str) -> np.ndarray:
     return colors.reshape(-1, 4)
 
 
-def set_faces(mesh: Any, faces: np.ndarray) -> None:
-    """Reorders the faces of ``mesh``, which has no edges."""
-    versions.set_corners(mesh, faces)
-    mesh.update()
+def triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(f, 3) int32 triangles of ``mesh``, its faces cut where they have more corners; and (f,) int32 the face
+    of each."""
+    count = len(mesh.polygons)
+    if len(mesh.loops) == 3 * count:
+        faces = np.empty(3 * count, np.int32)
+        mesh.loops.foreach_get("vertex_index", faces)
+        return faces.reshape(-1, 3), np.arange(count, dtype=np.int32)
+    mesh.calc_loop_triangles()
+    faces = np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", faces)
+    polygon = np.empty(len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("polygon_index", polygon)
+    return faces.reshape(-1, 3), polygon
 
 
-def far_to_near(vertices: np.ndarray, faces: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
-    """(f,) back-to-front order of the faces (painter's algorithm): descending depth of their centroids.
-    ``vertices`` (v, 3) in the world frame of ``world_to_camera`` (4, 4)."""
-    depth = vertices @ world_to_camera[2, :3].astype(np.float32)
-    return np.argsort(-depth[faces].sum(axis=1), kind="stable")
+def owners(mesh: Any) -> np.ndarray:
+    """(f,) int32 values of ``SPLAT``."""
+    values = np.empty(len(mesh.polygons), np.int32)
+    mesh.attributes[SPLAT].data.foreach_get("value", values)
+    return values
+
+
+def face_middles(mesh: Any) -> np.ndarray:
+    """(f, 3) float32 means of the corners of each face of ``mesh``."""
+    corners, starts = np.empty(len(mesh.loops), np.int32), np.empty(len(mesh.polygons), np.int32)
+    mesh.loops.foreach_get("vertex_index", corners)
+    mesh.polygons.foreach_get("loop_start", starts)
+    places = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", places)
+    counts = np.diff(starts, append=len(corners)).astype(np.float32)
+    return np.add.reduceat(places.reshape(-1, 3)[corners], starts) / counts[:, None]
 
 
 def world_points(obj: Any) -> np.ndarray:

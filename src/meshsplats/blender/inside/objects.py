@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.blender.inside import (
+    far_to_near,
     foreign,
     frame,
     levels,
@@ -73,6 +74,7 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
     rotation = frame.to_blender(prepared["mesh"].up)
     obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
     obj.location = (rotation @ prepared["origin"]).tolist()
+    far_to_near.add(obj, viewport=False)
     _give_stand_in(obj, prepared)
     if prepared["mesh"].binding is not None:
         priors.give_base(obj, prepared["mesh"].binding, collection)
@@ -113,13 +115,28 @@ def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
     old = obj.data
     prepared = prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
     obj.data = _data(prepared, old.name)
+    far_to_near.add(obj, viewport=False)
     stand_ins.remove(obj)
     _give_stand_in(obj, prepared)
     if old.users == 0:
         bpy.data.meshes.remove(old)
 
 
+def renew_light(scene: Any, objs: Iterable[Any]) -> list[str]:
+    """Makes the stand-ins of the lit splats among ``objs`` anew that were edited, joined or duplicated since,
+    and removes those that were left behind in ``scene``. Returns the names of the splats."""
+    stand_ins.remove_strays(scene)
+    found = []
+    for obj in objs:
+        if obj.data[LIT] and priors.base_of(obj) is None and not stand_ins.is_current(obj):
+            replace_mesh(obj, prepare(as_splat_mesh(obj), True))
+            found.append(obj.name)
+    return found
+
+
 def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
+    if prepared["lit"]:
+        obj[stand_ins.SHAPE] = stand_ins.shape(obj.data)
     if "surface_vertices" not in prepared:
         return
     origin = prepared["origin"].astype(np.float32)
@@ -183,52 +200,62 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
     Raises:
         ValueError: not a mesh of triangles that MeshSplats made.
     """
-    data: Any = getattr(obj, "data", None)
-    if obj is None or obj.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
+    return splat_mesh_of(obj, getattr(obj, "data", None))
+
+
+def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
+    """As ``as_splat_mesh``, from another mesh ``data`` of ``obj``, as its modifiers make it. Faces of more
+    corners are cut into triangles."""
+    if obj is None or obj.type != "MESH" or LIT not in obj.data or meshes.COLOR not in data.attributes:
         raise ValueError("the object was not made by MeshSplats")
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
-    faces = np.empty(len(data.loops), np.int32)
-    data.loops.foreach_get("vertex_index", faces)
-    if len(faces) != 3 * len(data.polygons):
-        raise ValueError("the object has faces that are not triangles: triangulate it first")
-    colors = _unlit_colors(data)
+    faces, polygon = meshes.triangles(data)
+    facts, colors = obj.data, _unlit_colors(data, obj.data)
     owner = None
     if meshes.SPLAT in data.attributes:
-        owner = np.empty(len(data.polygons), np.int32)
-        data.attributes[meshes.SPLAT].data.foreach_get("value", owner)
-        if (np.diff(owner) < 0).any():
-            owner = None
-    up = np.array(data[UP])
-    blending: Blending = "linear" if data[LINEAR] else "display"
-    origin = np.array(data.get(ORIGIN, (0, 0, 0)), np.float32)
+        owner = meshes.owners(data)[polygon]
+        if (
+            np.diff(owner) < 0
+        ).any():  # joined with others, or edited: what lies side by side belongs together
+            owner = np.cumsum(np.diff(owner, prepend=owner[:1]) != 0, dtype=np.int32)
+    blending: Blending = "linear" if facts[LINEAR] else "display"
     found = SplatMesh(
-        vertices.reshape(-1, 3) + origin,
-        faces.reshape(-1, 3),
+        vertices.reshape(-1, 3) + np.array(facts.get(ORIGIN, (0, 0, 0)), np.float32),
+        faces,
         colors,
         face_splat=owner,
-        up=up,
+        up=np.array(facts[UP]),
         blending=blending,
-        origin=np.array(data.get(WORLD, (0, 0, 0)), np.float64),
+        origin=np.array(facts.get(WORLD, (0, 0, 0)), np.float64),
     )
-    if priors.base_of(obj) is None:
+    if priors.base_of(obj) is None or data != obj.data:
         return found
     binding = priors.binding_of(obj)
     return found.moved(binding.positions(), normals=binding.normals(), binding=binding)
 
 
-def _unlit_colors(data: Any) -> np.ndarray:
+def unlit_colors(data: Any) -> np.ndarray:
     """(v, 4) float32 RGBA of the mesh ``data`` as composited unlit."""
+    return _unlit_colors(data, data)
+
+
+def _unlit_colors(data: Any, facts: Any) -> np.ndarray:
+    """As ``unlit_colors``, of a mesh ``data`` that has its properties from ``facts``."""
     shown = meshes.read_colors(data, meshes.COLOR)
     colors = np.clip(shown, 0, 1)
-    if not data[LIT]:
+    if not facts[LIT]:
         return colors
-    if not data[LINEAR]:
+    if not facts[LINEAR]:
         colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
     if meshes.DISPLAY in data.attributes and meshes.MADE in data.attributes:
         kept = shown == meshes.read_colors(data, meshes.MADE)
         kept[:, :3] = kept[:, :3].all(axis=1, keepdims=True)
-        colors = np.where(kept, np.clip(meshes.read_colors(data, meshes.DISPLAY), 0, 1), colors)
+        display = np.clip(meshes.read_colors(data, meshes.DISPLAY), 0, 1)
+        colors = np.where(kept, display, colors)
+        # Joined from an unlit mesh, which lacks both attributes.
+        unlit = ~(meshes.read_colors(data, meshes.MADE).any(axis=1) | display.any(axis=1))
+        colors[unlit] = np.clip(shown[unlit], 0, 1)
     return colors
 
 

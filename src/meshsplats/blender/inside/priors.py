@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.binding import Binding
-from meshsplats.blender.inside import meshes, versions
+from meshsplats.blender.inside import far_to_near, meshes, versions
 from meshsplats.blender.inside.host import bpy
 
 BASE = "meshsplats_base"
@@ -126,6 +126,7 @@ def _move(obj: Any, depsgraph: Any) -> None:
         normals = moved.normals()
         data.attributes[meshes.NORMAL].data.foreach_set("vector", normals.ravel())
         versions.set_normals(data, normals)
+    far_to_near.set_centers(data)
     data.update()
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import shutil
-import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import versions
+from meshsplats.blender.inside import versions, written
 from meshsplats.blender.inside.host import bpy
 
 _FEW = 16
@@ -142,48 +139,7 @@ def _render(scene: Any, path: Path) -> None:
     scene.render.use_overwrite = True
     scene.render.filepath = os.fspath(path)
     bpy.ops.render.render(write_still=True)
-    _check_written(path, scene.render.resolution_x * scene.render.resolution_y)
-
-
-def _whole_exr(data: bytes) -> bool:
-    """Whether an OpenEXR file holds all chunks of its offset table (https://openexr.com, file layout).
-    Blender's own reader will not do: version 5.0 aborts on a truncated file."""
-    if len(data) < 9 or data[:4] != b"\x76\x2f\x31\x01":
-        return False
-    if data[5] & 0x1A:  # tiled, deep or multi-part: Blender writes none of these here
-        return True
-    at, found = 8, {}
-    try:
-        while data[at]:
-            name_end = data.index(b"\0", at)
-            type_end = data.index(b"\0", name_end + 1)
-            (size,) = struct.unpack_from("<i", data, type_end + 1)
-            found[data[at:name_end]] = data[type_end + 5 : type_end + 5 + size]
-            at = type_end + 5 + size
-        _, top, _, bottom = struct.unpack("<4i", found[b"dataWindow"])
-        lines = {3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}.get(found[b"compression"][0], 1)
-        offsets = struct.unpack_from(f"<{-(-(bottom - top + 1) // lines)}q", data, at + 1)
-        ends = [offset + 8 + struct.unpack_from("<i", data, offset + 4)[0] for offset in offsets]
-    except (IndexError, KeyError, ValueError, struct.error):
-        return False
-    return min(offsets) > at and max(ends) <= len(data)
-
-
-def _check_written(path: Path, pixels: int) -> None:
-    """Raises OSError for a missing or truncated image: Blender does not report a full disk."""
-    try:
-        if path.suffix == ".png":
-            with open(path, "rb") as file:
-                whole = file.read()[-8:-4] == b"IEND"
-        else:
-            whole = _whole_exr(path.read_bytes())
-    except FileNotFoundError:
-        whole = False
-    if whole:
-        return
-    if shutil.disk_usage(path.parent).free < 16 * pixels:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
-    raise OSError(f"{path}: Blender wrote no image")
+    written.check_image(path, scene.render.resolution_x * scene.render.resolution_y)
 
 
 def read_pixels(path: Path) -> np.ndarray:
@@ -219,4 +175,4 @@ def _save(pixels: np.ndarray, path: Path, scene: Any) -> None:
         image.save_render(os.fspath(path), scene=scene)
     finally:
         bpy.data.images.remove(image)
-    _check_written(path, width * height)
+    written.check_image(path, width * height)

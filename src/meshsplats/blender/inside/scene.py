@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from meshsplats.blender.inside import (
     baking,
+    far_to_near,
     frame,
     levels,
     materials,
@@ -92,6 +93,7 @@ def build(
     *,
     edges: bool,
     coarser: Sequence[Subject] = (),
+    announce: Callable[[str], object] = lambda phase: None,
 ) -> Built:
     """A new file with the subject, its cameras and surroundings, ready to render.
 
@@ -99,6 +101,7 @@ def build(
         limit: that of transparent bounces.
         edges: as in ``meshes.make_mesh``.
         coarser: further levels of detail, if the subject is one; hidden at first (``levels.show``).
+        announce: told a phase of the work that takes long, before it begins.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     versions.enable_cycles()
@@ -152,12 +155,13 @@ def build(
         stage.aim(scene, cameras[0], made[0])
     bpy.context.view_layer.objects.active = obj
     if light is not None:
+        announce("gathering light")
         baking.bake(scene, objects.splat_objects(scene))
     return Built(scene, obj, made, rotation)
 
 
 def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, edges: bool, home: Any) -> Any:
-    """The object of ``subject`` in the collection ``home``, with its material and, for EEVEE's shadows, its
+    """The object of ``subject`` in the collection ``home``, with its material, its order for EEVEE and its
     stand-in."""
     mesh = meshes.make_mesh(
         subject.name,
@@ -179,6 +183,8 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         linear=subject.linear,
         layers=subject.layers,
     )
+    if edges or options.engine == "eevee":  # a file may be drawn by either
+        far_to_near.add(obj)
     if light is None:
         mesh.materials.append(materials.unlit())
         return obj

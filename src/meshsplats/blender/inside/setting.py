@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from meshsplats.blender.inside import baking, meshes, objects, scene, stage
+from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LIGHTS, LightOptions
 from meshsplats.blender.subject import ground_height, lowest
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 
 UP = (0.0, 0.0, 1.0)
+_AWAY = 2.5
+"""Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
 
 
 def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
@@ -29,6 +32,7 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
+    objects.renew_light(view, objs)
     light, bounds = LIGHTS[lights], scene_bounds(points)
     low = lowest(bounds, np.array(UP))
     for obj in objs:
@@ -49,3 +53,40 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     objects.render_settings(view, objs, True, light)
     baking.bake(view, objs)
     return light
+
+
+def hide_start_scene(scene: Any) -> list[str]:
+    """Hides the cube and the lamp that Blender starts with, from a file that was not saved yet: one stands
+    in the middle of what is imported, the other would be baked into its light. Returns their names."""
+    if bpy.data.filepath:
+        return []
+    hidden = []
+    for name, kind in (("Cube", "MESH"), ("Light", "LIGHT")):
+        obj = scene.objects.get(name)
+        if obj is None or obj.type != kind or obj.hide_render:
+            continue
+        cube = kind == "MESH" and len(obj.data.vertices) == 8 and not obj.location.length
+        if cube or (kind == "LIGHT" and obj.data.energy == 1000):
+            obj.hide_render = True
+            obj.hide_set(True)
+            hidden.append(name)
+    return hidden
+
+
+def frame_in_viewports(windows: Any, objs: list[Any]) -> None:
+    """Turns the 3D views of ``windows`` to ``objs``, from the direction that they have."""
+    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
+    if not len(points):
+        return
+    bounds = scene_bounds(points)
+    spaces = [
+        area.spaces.active for window in windows for area in window.screen.areas if area.type == "VIEW_3D"
+    ]
+    for space in spaces:
+        view = space.region_3d
+        if view.view_perspective == "CAMERA":
+            view.view_perspective = "PERSP"
+        view.view_location = bounds.center.tolist()
+        view.view_distance = _AWAY * bounds.radius * space.lens / 36
+        space.clip_end = max(space.clip_end, 100 * bounds.radius)
+        space.clip_start = min(space.clip_start, bounds.radius / 100)

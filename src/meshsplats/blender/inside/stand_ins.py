@@ -3,6 +3,7 @@ file."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +19,10 @@ ARRAYS = (
 """Fields of ``StandIn``, as ``subject.lit_subject`` names them."""
 STAND_IN = "meshsplats_stand_in"
 """Property of the objects made here: True."""
+OWNER = "meshsplats_splats"
+"""Property of the objects made here: the object of the splats that they were made for."""
+SHAPE = "meshsplats_shape"
+"""Property of lit splats: the ``shape`` that their mesh had when their stand-in was made."""
 
 
 def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow: float, home: Any) -> None:
@@ -68,7 +73,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
 def _child(obj: Any, mesh: Any, home: Any) -> Any:
     """A child of ``obj`` at its place, invisible to cameras, mirrors and glass."""
     child = bpy.data.objects.new(mesh.name, mesh)
-    child[STAND_IN] = True
+    child[STAND_IN], child[OWNER] = True, obj
     for way in ("camera", "glossy", "transmission", "volume_scatter"):
         setattr(child, f"visible_{way}", False)
     child.parent = obj
@@ -78,13 +83,48 @@ def _child(obj: Any, mesh: Any, home: Any) -> Any:
     return child
 
 
+def shape(data: Any) -> str:
+    """Counts and a checksum of the mesh ``data``, which edits change."""
+    co = np.empty(3 * len(data.vertices), np.float32)
+    data.vertices.foreach_get("co", co)
+    corners = np.empty(len(data.loops), np.int32)
+    data.loops.foreach_get("vertex_index", corners)
+    checksum = zlib.crc32(corners.tobytes(), zlib.crc32(co.tobytes()))
+    return f"{len(data.vertices)} {len(data.polygons)} {checksum:08x}"
+
+
+def is_current(obj: Any, *, counts_only: bool = False) -> bool:
+    """Whether the lit splats ``obj`` have a stand-in of their own that was made for their mesh as it is now,
+    or were found to have none. ``counts_only``: at once, but without noticing moved vertices."""
+    if baking.POINTS in obj:
+        points = baking.points_of(obj)
+        if points is None or points.get(OWNER) != obj:
+            return False
+    before, data = obj.get(SHAPE, ""), obj.data
+    if counts_only:
+        return before.startswith(f"{len(data.vertices)} {len(data.polygons)} ")
+    return bool(before == shape(data))
+
+
+def remove_strays(scene: Any) -> None:
+    """Removes what was made here for splats of ``scene`` that were deleted, or joined with others."""
+    for obj in [o for o in scene.objects if o.get(STAND_IN)]:
+        owner = obj.get(OWNER, obj.parent)
+        if owner is None or obj.parent != owner or not owner.users_collection:
+            _delete(obj)
+
+
+def _delete(obj: Any) -> None:
+    mesh = obj.data
+    bpy.data.objects.remove(obj)
+    if mesh.users == 0:
+        bpy.data.meshes.remove(mesh)
+
+
 def remove(obj: Any) -> None:
     """Removes the stand-in of ``obj``, which then casts its own shadow."""
     for child in [c for c in obj.children if c.get(STAND_IN)]:
-        mesh = child.data
-        bpy.data.objects.remove(child)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
+        _delete(child)
     if baking.POINTS in obj:
         del obj[baking.POINTS]
     obj.visible_shadow = obj.visible_diffuse = True

@@ -93,3 +93,13 @@ def enable_cycles() -> None:
 
     if not hasattr(bpy.types.Scene, "cycles"):
         addon_utils.enable("cycles", default_set=False, persistent=False)
+
+
+def set_input(modifier: Any, name: str, value: Any) -> None:
+    """Gives the input ``name`` of a Geometry Nodes ``modifier`` a value."""
+    sockets = modifier.node_group.interface.items_tree
+    (key,) = (s.identifier for s in sockets if s.name == name and s.in_out == "INPUT")
+    if hasattr(modifier, "properties"):  # since 5.2
+        getattr(modifier.properties.inputs, key).value = value
+    else:
+        modifier[key] = value

@@ -12,11 +12,6 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from meshsplats.blender.inside.scene import Subject
-    from meshsplats.camera import Camera
 
 if __package__ in (None, ""):  # run as a file by Blender, whose Python does not know this package
     sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
@@ -71,7 +66,7 @@ def main(job_path: str) -> None:
         sys.exit(1)
 
     from meshsplats._files.atomic import atomic_path
-    from meshsplats.blender.inside import meshes, rendering, stage, versions
+    from meshsplats.blender.inside import far_to_near, rendering, stage, versions, written
     from meshsplats.blender.inside.scene import Subject, build
     from meshsplats.blender.options import LightOptions, SceneOptions
     from meshsplats.camera import Camera
@@ -96,10 +91,16 @@ def main(job_path: str) -> None:
     blend, targets = job["blend"], [Path(target) for target in job["images"]]
 
     start, processor = time.perf_counter(), time.process_time()
-    sort = options.engine == "eevee"
-    if sort and cameras:
-        subject, *coarser = (_for_painter(level, cameras[0]) for level in (subject, *coarser))
-    built = build(subject, cameras, options, job["limit"], edges=bool(blend), coarser=coarser)
+    report(stage="building the scene", share=0.0, left=None)
+    built = build(
+        subject,
+        cameras,
+        options,
+        job["limit"],
+        edges=bool(blend),
+        coarser=coarser,
+        announce=lambda phase: report(stage=phase, share=0.0, left=None),
+    )
     report(
         built=round(time.perf_counter() - start, 3),
         processor=round(time.process_time() - processor, 3),
@@ -109,16 +110,15 @@ def main(job_path: str) -> None:
         bpy.context.preferences.filepaths.save_version = 0
         with atomic_path(blend, temporary=Path(temporary[blend]), new=blend in new) as path:
             bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=True, check_existing=False)
+            written.check_blend(path)
         report(saved=blend)
     factor = options.samples if light is None else 1
     bpy.app.handlers.render_stats.append(report_stage)
     for i, target in enumerate(targets):
         camera, obj = cameras[i], built.cameras[i]
-        if sort and i > 0:
-            order = meshes.far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
-            meshes.set_faces(built.obj.data, subject.faces[order])
         built.scene.frame_set(i)  # the timeline makes camera i the active one
         stage.aim(built.scene, camera, obj, factor)
+        far_to_near.follow_camera(built.scene)
         start, processor = time.perf_counter(), time.process_time()
         name = str(target)
         with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as path:
@@ -129,15 +129,6 @@ def main(job_path: str) -> None:
             processor=round(time.process_time() - processor, 3),
         )
     report(done=True)
-
-
-def _for_painter(subject: Subject, camera: Camera) -> Subject:
-    """``subject`` with its faces sorted back to front for ``camera``, as EEVEE needs them."""
-    from meshsplats.blender.inside.meshes import far_to_near
-
-    order = far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
-    of_faces = {"faces": subject.faces, "face_splat": subject.face_splat, "fine_faces": subject.fine_faces}
-    return replace(subject, **{name: a[order] for name, a in of_faces.items() if a is not None})
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats._arrays import joined_rows
 from meshsplats._origin import choose_origin, lost_detail, sampled, zero_origin
+from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.writer import up_quaternion
@@ -27,6 +28,8 @@ from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.spherical_harmonics import TERMS, moved_harmonics
 
+_BLENDER = "userProperties:meshsplats_"
+"""Beginning of the names of attributes that Blender makes of the extension's properties."""
 _LIBRARY_BYTES = 2 << 30
 _FACTOR = 256
 """Limit of address space: that at the start, ``_LIBRARY_BYTES``, and ``_FACTOR`` times the file's size."""
@@ -155,6 +158,8 @@ def _visible(stage: Any) -> tuple[list[Any], int]:
             continue
         if imageable.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
             continue
+        if prim.GetParent().HasAttribute(_BLENDER + "stand_in"):
+            continue  # only takes light in Blender
         if prim.IsA(UsdGeom.Mesh):
             meshes.append(UsdGeom.Mesh(prim))
         elif prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer):
@@ -211,6 +216,8 @@ def _piece(shape: Any, budget: Budget) -> dict[str, np.ndarray]:
         raise FileFormatError(f"mesh {at}: corners {corners.min()} to {corners.max()} of {v:,} points")
     color, color_kind = _primvar(shape, "displayColor", 3, v, n, len(corners), at)
     opacity, opacity_kind = _primvar(shape, "displayOpacity", 1, v, n, len(corners), at)
+    if color is None and shape.GetPrim().HasAttribute(_BLENDER + "lit"):
+        color, color_kind, opacity, opacity_kind = _from_blender(shape, v, n, len(corners), at)
     linear = np.ones((v, 4 if color is not None or opacity is not None else 0), np.float32)
     normals, kind = _primvar(shape, "normals", 3, v, n, len(corners), at)
     if kind not in ("vertex", "varying"):
@@ -237,6 +244,22 @@ def _piece(shape: Any, budget: Budget) -> dict[str, np.ndarray]:
         faces = faces[:, ::-1]
     piece = {"vertices": points, "faces": faces.astype(np.int32), "linear": linear}
     return piece if normals is None else piece | {"normals": normals}
+
+
+def _from_blender(
+    shape: Any, v: int, n: int, corners: int, at: str
+) -> tuple[np.ndarray | None, str, np.ndarray | None, str]:
+    """Linear colours and opacities, and their interpolations, of a splat mesh of ours that Blender's exporter
+    wrote: as RGBA in a primvar of its attribute's name, display values unless its note says linear."""
+
+    def noted(name: str) -> bool:
+        return bool(shape.GetPrim().GetAttribute(_BLENDER + name).Get())
+
+    rgba, kind = _primvar(shape, "DisplayColor" if noted("lit") else "Color", 4, v, n, corners, at)
+    if rgba is None:
+        return None, "", None, ""
+    color = rgba[:, :3] if noted("linear") else srgb_to_linear(rgba[:, :3])
+    return color, kind, rgba[:, 3:], kind
 
 
 def _primvar(

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""File > Export > Splat Mesh, and help for Blender's own glTF exporter, which by itself loses our colours."""
+
+import warnings
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy_extras.io_utils import ExportHelper
+
+from .work import waiting
+
+FORMATS = [
+    (".glb", "glTF (.glb)", "For viewers and engines: colours in linear light, blended"),
+    (".npz", "MeshSplats (.npz)", "Everything exactly, for meshsplats' own commands"),
+    (".ply", "Stanford (.ply)", "Triangles with float colours and opacities, as they are shown"),
+    (".usdc", "USD (.usdc)", "Colour and opacity as primvars; needs the Python module pxr"),
+]
+LIT = "meshsplats_lit"
+
+
+class ExportMeshSplats(bpy.types.Operator, ExportHelper):
+    """Export splat meshes with colours and opacities, where they are and as their modifiers make them"""
+
+    bl_idname = "export_scene.meshsplats"
+    bl_label = "Export Splat Mesh"
+    bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
+
+    filename_ext = ".glb"
+    filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix, *_ in FORMATS), options={"HIDDEN"})
+    format: EnumProperty(name="Format", description="Of a name without suffix", items=FORMATS)
+    use_selection: BoolProperty(
+        name="Selected Only", description="Otherwise all visible splat meshes", default=False
+    )
+
+    def check(self, context):
+        stem = self.filepath
+        for suffix, *_ in FORMATS:
+            stem = stem.removesuffix(suffix)
+        changed = stem + self.format
+        different, self.filepath = changed != self.filepath, changed
+        return different
+
+    def execute(self, context):
+        from meshsplats.blender.inside import exporting
+        from meshsplats.formats.meshes import save_mesh
+
+        path = self.filepath
+        if not path.lower().endswith(tuple(suffix for suffix, *_ in FORMATS)):
+            path += self.format
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        try:
+            with waiting(context), warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                objs = exporting.chosen(context.view_layer, selected=self.use_selection)
+                mesh = exporting.exported(objs)
+                save_mesh(mesh, path)
+        except (ValueError, OSError, ImportError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for warning in caught:
+            self.report({"WARNING"}, str(warning.message))
+        self.report({"INFO"}, f"MeshSplats: {path}, {len(objs)} objects, {len(mesh.faces):,} triangles")
+        return {"FINISHED"}
+
+
+_stock = None
+"""The splat meshes of an export by Blender's exporter, which is not done yet."""
+
+
+def glTF2_pre_export_callback(export_settings):
+    """Gives splat meshes the names and nodes that Blender's glTF exporter knows."""
+    global _stock
+    _restore()
+    objs = [obj for obj in bpy.context.scene.objects if obj.type == "MESH" and LIT in obj.data]
+    if objs:
+        from meshsplats.blender.inside import exporting
+
+        _stock = exporting.Stock(objs)
+        # An exporter that fails does not call back. The timer runs after it, where there is a window.
+        if not bpy.app.background and not bpy.app.timers.is_registered(_restore):
+            bpy.app.timers.register(_restore, first_interval=0.1)
+
+
+def glTF2_post_export_callback(export_settings):
+    _restore()
+
+
+def _restore():
+    global _stock
+    if _stock is not None:
+        stock, _stock = _stock, None
+        stock.restore()
+
+
+class glTF2ExportUserExtension:
+    """Leaves out what only serves images in Blender: stand-ins, points of light, the ground."""
+
+    def gather_tree_filter_tag_hook(self, tree, export_settings):
+        from meshsplats.blender.inside import exporting
+
+        for node in tree.nodes.values():
+            obj = getattr(node, "blender_object", None)
+            if obj is not None and exporting.is_helper(obj):
+                node.keep_tag = False
+
+
+def menu(self, context):
+    self.layout.operator(ExportMeshSplats.bl_idname, text="Splat Mesh (.glb, .npz, .ply, .usdc)")
+
+
+def register():
+    bpy.utils.register_class(ExportMeshSplats)
+    bpy.types.TOPBAR_MT_file_export.append(menu)
+
+
+def unregister():
+    _restore()
+    bpy.types.TOPBAR_MT_file_export.remove(menu)
+    bpy.utils.unregister_class(ExportMeshSplats)

@@ -1,0 +1,83 @@
+"""Cuts splat meshes between splats: by another object, by opacity and by size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.inside import objects
+from meshsplats.mesh import SplatMesh
+
+
+def chosen_splats(
+    obj: Any,
+    region: Any = None,
+    *,
+    shape: str = "box",
+    outside: bool = False,
+    below_opacity: float = 1.0,
+    above_size: float = 0.0,
+) -> tuple[SplatMesh, np.ndarray]:
+    """The mesh of the splats ``obj``, and (f,) bool: the triangles of its splats that meet all conditions.
+
+    Args:
+        region: an object; its centre must lie in its bounds (``outside``: not in them). None: anywhere.
+        shape: 'box', the bounds of ``region``, turned as it is, or 'sphere', the ellipsoid within them.
+        below_opacity: no corner of the splat is more opaque.
+        above_size: least distance of its farthest corner from its centre, scene units.
+
+    Raises:
+        ValueError: not a splat mesh, a mesh prior, or a region without extent.
+    """
+    mesh = objects.as_splat_mesh(obj)
+    if mesh.binding is not None:
+        raise ValueError("the splats follow a base: cutting would lose that; unbind them first")
+    world = np.array(obj.matrix_world)
+    origin = np.array(obj.data.get(objects.ORIGIN, (0, 0, 0)))
+    corners = (mesh.vertices[mesh.faces] - origin) @ world[:3, :3].T + world[:3, 3]
+    splats = mesh.splats
+    centers = splats.sums(corners.mean(axis=1)) / splats.counts[:, None]
+    found = np.ones(len(splats), bool)
+    if region is not None:
+        within = _within(region, centers, shape)
+        found &= ~within if outside else within
+    if below_opacity < 1 and len(found):
+        found &= np.maximum.reduceat(mesh.colors[mesh.faces, 3].max(axis=1), splats.starts) <= below_opacity
+    if above_size > 0 and len(found):
+        away = np.linalg.norm(corners - centers[splats.of_face][:, None], axis=2).max(axis=1)
+        found &= np.maximum.reduceat(away, splats.starts) >= above_size
+    return mesh, found[splats.of_face]
+
+
+def _within(region: Any, points: np.ndarray, shape: str) -> np.ndarray:
+    """(n,) bool: the ``points`` (n, 3), Blender's world, inside the bounds of the object ``region``."""
+    bounds = np.array([tuple(corner) for corner in region.bound_box])
+    half = np.ptp(bounds, axis=0) / 2
+    matrix = np.array(region.matrix_world)
+    if not (half > 0).all() or abs(np.linalg.det(matrix)) < 1e-30:
+        raise ValueError(f"{region.name} encloses nothing: take an object with length, width and height")
+    local = (points - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T
+    share = (local - bounds.mean(axis=0)) / half
+    return (np.square(share).sum(axis=1) <= 1) if shape == "sphere" else (np.abs(share) <= 1).all(axis=1)
+
+
+def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collection: Any) -> Any:
+    """Takes the triangles ``faces`` (f,) bool of ``mesh``, as from ``chosen_splats``, out of ``obj``. With
+    ``separate``, returns a new object of them at the same place; else None.
+
+    Raises:
+        ValueError: none are chosen, or all.
+    """
+    count = int(np.count_nonzero(faces))
+    if count in (0, len(faces)):
+        raise ValueError(f"{'all' if count else 'none'} of the splats meet the conditions: nothing was cut")
+    lit = bool(obj.data[objects.LIT])
+    made = None
+    if separate:
+        made = objects.add(objects.prepare(mesh.take(np.flatnonzero(faces)), lit), obj.name, collection)
+        away = np.array(made.data[objects.ORIGIN]) - np.array(obj.data[objects.ORIGIN])
+        made.matrix_world = obj.matrix_world.copy()
+        made.location = obj.matrix_world @ type(made.location)(away.tolist())
+    objects.replace_mesh(obj, objects.prepare(mesh.take(np.flatnonzero(~faces)), lit))
+    return made

@@ -1,0 +1,145 @@
+# ruff: noqa: E402
+"""EEVEE blends splats far to near: in images of any camera, and in viewports as they turn."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats, random_mesh
+
+from meshsplats import convert, orbit, psnr, render
+from meshsplats.blender import SceneOptions, draw
+from meshsplats.blender.inside import far_to_near, frame, meshes, objects, rendering, stage
+
+
+@pytest.fixture
+def scene():
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return bpy.context.scene
+
+
+def evaluated_centers(obj) -> np.ndarray:
+    """(f, 3) centres of splats in the order in which they are drawn, Blender's world."""
+    bpy.context.view_layer.update()
+    data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    flat = np.empty(3 * len(data.polygons), np.float32)
+    data.attributes[far_to_near.CENTER].data.foreach_get("vector", flat)
+    world = np.array(obj.matrix_world)
+    return flat.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+
+
+def assert_far_to_near(obj, direction) -> None:
+    heights = evaluated_centers(obj) @ np.array(direction, float)
+    assert len(heights) == len(obj.data.polygons)
+    assert (np.diff(heights) >= -1e-5).all()
+
+
+def test_a_viewport_is_sorted_for_its_viewer_and_the_mesh_keeps_its_order(scene):
+    mesh = convert(ball_splats(300)[0])
+    obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
+    obj.scale = (1, 3, 0.5)
+    obj.rotation_euler = (0.3, 0.2, 1)
+    modifier = far_to_near.modifier_of(obj)
+    for direction in ((1, 0, 0), (0.3, -0.8, 0.5), (0, 0, -1)):
+        far_to_near.look(modifier, direction)
+        assert_far_to_near(obj, direction)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    camera.rotation_euler = (1.2, 0, 2.5)
+    far_to_near.look(modifier, (0, 0, 0))
+    bpy.context.view_layer.update()
+    assert_far_to_near(obj, np.array(camera.matrix_world)[:3, 2])
+    np.testing.assert_array_equal(objects.as_splat_mesh(obj).faces, mesh.faces)
+    far_to_near.look(modifier, None)
+    centers = evaluated_centers(obj)
+    first = np.flatnonzero(np.diff(mesh.face_splat, prepend=-1))
+    assert (np.diff(centers[:, 2]) < -1e-3).any(), "its own order"
+    assert len(np.unique(centers.round(5), axis=0)) == len(first)
+
+
+def test_triangles_of_a_splat_keep_their_order(scene):
+    mesh = convert(ball_splats(60)[0])
+    obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
+    number = obj.data.attributes.new("number", "INT", "FACE")
+    number.data.foreach_set("value", np.arange(len(mesh.faces), dtype=np.int32))
+    far_to_near.look(far_to_near.modifier_of(obj), (0.2, -1, 0.1))
+    bpy.context.view_layer.update()
+    data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    order = np.empty(len(mesh.faces), np.int32)
+    data.attributes["number"].data.foreach_get("value", order)
+    assert (order != np.arange(len(order))).any()
+    owner = mesh.face_splat[order]
+    inside = np.diff(owner) == 0
+    assert inside.sum() == len(order) - len(np.unique(owner)), "splats stay together"
+    assert (np.diff(order)[inside] == 1).all()
+
+
+def test_centres_follow_edits(scene):
+    obj = objects.add(objects.prepare(convert(ball_splats(100)[0]), False), "ball", scene.collection)
+    before = evaluated_centers(obj)
+    handlers = bpy.app.handlers.depsgraph_update_post
+    handlers.append(lambda _, depsgraph: far_to_near.after_update(depsgraph))
+    try:
+        for vertex in obj.data.vertices:
+            vertex.co.x += 5
+        obj.data.update()
+        bpy.context.view_layer.update()
+    finally:
+        handlers.clear()
+    far_to_near.look(far_to_near.modifier_of(obj), (0, 0, 1))
+    after = evaluated_centers(obj)
+    assert after[:, 0].mean() == pytest.approx(before[:, 0].mean() + 5, abs=1e-3)
+
+
+def test_meshes_without_splats_are_sorted_by_the_triangle(scene):
+    mesh = replace(random_mesh(50), face_splat=None)
+    obj = objects.add(objects.prepare(mesh, False), "mesh", scene.collection)
+    assert far_to_near.CENTER not in obj.data.attributes
+    far_to_near.look(far_to_near.modifier_of(obj), (0, 0, 1))
+    bpy.context.view_layer.update()
+    data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    world = np.array(obj.matrix_world)[:3, :3]
+    assert (np.diff((meshes.face_middles(data) @ world.T)[:, 2]) >= -1e-5).all()
+
+
+def test_eevee_draws_by_the_splat_from_all_sides(tmp_path):
+    """The command line, and the saved file, whose cameras are markers of the timeline: more than 60 dB."""
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        pytest.skip("EEVEE needs libEGL")
+    mesh = convert(ball_splats(200)[0])
+    views = [view.with_near_plane(mesh.vertices) for view in orbit(mesh, 3, width=40, height=40)]
+    paths = [tmp_path / f"{i}.exr" for i in range(3)]
+    draw(mesh, views, images=paths, blend=tmp_path / "s.blend", options=SceneOptions(engine="eevee"))
+    expected = [render(mesh, view, order="splat").color for view in views]
+    for path, image in zip(paths, expected, strict=True):
+        assert psnr(rendering.read_pixels(path)[..., :3], image) > 60
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
+    scene = bpy.context.scene
+    if bpy.app.version < (4, 5, 0):
+        bpy.app.handlers.frame_change_post.append(lambda scene, _: far_to_near.follow_camera(scene))
+    # The same camera moves, too.
+    camera = scene.timeline_markers[2].camera
+    for at in (1, 2):
+        scene.timeline_markers[at].camera = camera
+        from mathutils import Matrix
+
+        rotation = frame.to_blender(mesh.up)
+        camera.matrix_world = Matrix(frame.camera_pose(views[at], rotation).tolist())
+        camera.keyframe_insert("location", frame=at)
+        camera.keyframe_insert("rotation_euler", frame=at)
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_depth = "32"
+    scene.render.filepath = str(tmp_path / "again_")
+    bpy.ops.render.render(animation=True)
+    for i, image in enumerate(expected):
+        assert psnr(rendering.read_pixels(tmp_path / f"again_{i:04d}.exr")[..., :3], image) > 60
+    stage.clear()
