@@ -51,11 +51,13 @@ from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
 from meshsplats.finetuning.on_splats import SAVE_SECONDS, SplatRun, SplatTuning, log_scores
+from meshsplats.finetuning.ordered import finetune_ordered
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.ordering import drawing_order
 
 if TYPE_CHECKING:
     from meshsplats.finetuning.cells import CellScene
@@ -106,6 +108,10 @@ class Finetune(TrainingCommand):
 
     def check(self) -> None:
         check_mesh_suffix(self.output)
+        if self.tuning.order == "file" and self.output.suffix.lower() != ".glb":
+            raise UsageError(
+                f"--order file is for .glb files, which list triangles in an order, not {self.output.name}"
+            )
         if self.cluster.cluster is not None and self.cell_splats is None:
             raise UsageError("--cluster is for the cells of --cell-splats")
         super().check()
@@ -134,8 +140,13 @@ class Finetune(TrainingCommand):
         assert isinstance(mesh, SplatMesh)
         start = mesh
 
-        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
-            return self._trained(finetune(start, dataset, config, run=run, on_progress=show), config)
+        def optimise(run: RunOptions, show: Display) -> Trained:
+            if config.order != "file":
+                return self._trained(finetune(start, dataset, config, run=run, on_progress=show), config)
+            show.phase("ordering triangles")
+            order = drawing_order(start, [view.camera for view in dataset.train], threads=self.threads)
+            tuned = finetune_ordered(start, order, dataset, config, run=run, on_progress=show)
+            return replace(self._trained(tuned.mesh, config), order=tuned.order)
 
         reserve = SAVE_SECONDS * len(mesh.faces)
         return Plan(mesh, dataset, _summary(mesh, scene), background, optimise, reserve)
@@ -164,8 +175,8 @@ class Finetune(TrainingCommand):
         tuning = SplatTuning(run, setup)
 
         def optimise(options: RunOptions, show: Display) -> Trained:
-            mesh, sizes = tuning.optimise(options, show)
-            return self._trained(mesh, tuning.config, sizes)
+            tuned = tuning.optimise(options, show)
+            return replace(self._trained(tuned.mesh, tuning.config, tuned.sizes), order=tuned.order)
 
         summary = _summary(tuning.mesh, cloud)
         return Plan(tuning.mesh, tuning.dataset, summary, None, optimise, tuning.reserve, rates=tuning.rates)
@@ -203,7 +214,10 @@ class Finetune(TrainingCommand):
         earlier: Checkpoint | None,
         zooms: Sequence[int] | None = None,
     ) -> Dataset:
-        return self.target.make(
+        target, below = self.target, self.target.below
+        if config.order == "file" and below is None and target.data is None and target.cameras is None:
+            target = replace(target, below=True)
+        return target.make(
             scene,
             self.input,
             default_background(config),
@@ -249,6 +263,8 @@ class Finetune(TrainingCommand):
 
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
         """The command that scores the result on held-out views, or one that renders it if there are none."""
+        if config.order == "file":
+            return ["web viewers and engines that cull back sides show this file; our own commands sort it"]
         target, dataset, folder = self.target, plan.dataset, self.output.with_suffix("")
         if self.conversion.crop is not None or (target.data is None and not dataset.test):
             words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
