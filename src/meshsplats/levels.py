@@ -213,8 +213,8 @@ def views_to_score(triangles: int, splats: int) -> int:
 def likeness_to_views(
     mesh: SplatMesh, views: Sequence[View], threads: int | None, listing: DrawOrder | None = None
 ) -> float:
-    """Mean PSNR in dB of the mesh at 2 x 2 samples per pixel against the images of ``views``; drawn as viewers
-    draw a file with the order ``listing``."""
+    """Mean PSNR in dB of the mesh at 2 x 2 samples per pixel against the images of ``views``; drawn as
+    viewers draw a file with the order ``listing``."""
     options: dict[str, Any] = {"samples": SAMPLES, "threads": threads, "listing": listing}
     pairs = (images_of_view(mesh, view, **options) for view in views)
     return float(np.mean([min(psnr(*pair), 200.0) for pair in pairs]))
