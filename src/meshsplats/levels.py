@@ -144,7 +144,7 @@ def make_ordered_level(
     such viewers draw it."""
     threads = run.threads if run else None
     if config is None:
-        mesh = _converted_level(cloud, level, targets, None, up, run)
+        mesh = _converted_level(cloud, level, targets, None, up, run).plain
         return OrderedMesh(mesh, drawing_order(mesh, threads=threads))
     mesh = _starting_level(cloud, level, targets, config, None, up)
     order = drawing_order(mesh, threads=threads)

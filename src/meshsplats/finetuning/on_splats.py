@@ -117,6 +117,7 @@ class SplatTuning:
         self._order = None
         if self.config.order == "file":
             setup.phase("ordering triangles")
+            conversion = conversion.plain  # as files have it
             check_for_file_order(conversion, self.config)
             cameras = [view.camera for view in self.dataset.train]
             self._order = drawing_order(conversion, cameras, threads=run.threads)

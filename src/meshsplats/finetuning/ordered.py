@@ -39,7 +39,8 @@ def finetune_ordered(
     each triangle at its place in the list, where the side that it shows has it.
 
     Args:
-        mesh: the mesh, with display blending and without a filter.
+        mesh: the mesh, with display blending and without a filter. Its colours are the plain ones, which do
+            not depend on the view: viewers know no others.
         listing: the order, of ``drawing_order(mesh)``. It stays, but for triangles that are pruned.
         dataset, config, run, on_progress, changes: as in ``finetune``; ``order`` is 'file'.
 
@@ -51,7 +52,7 @@ def finetune_ordered(
     listing.listed(mesh.faces)
     changes["order"] = "file"
     config = with_changes(config or FinetuneConfig(), **changes)
-    loop = ready_loop(mesh, dataset, config, run, listing=listing, on_progress=on_progress)
+    loop = ready_loop(mesh.plain, dataset, config, run, listing=listing, on_progress=on_progress)
     tuned = loop.run()
     assert loop.phase.listing is not None
     return OrderedMesh(tuned, loop.phase.listing)

@@ -35,7 +35,7 @@ FEW_NODES = (1, 2, 4)
 """What 'auto' tries, besides ``NODES``."""
 NODE_LOSS = 0.5
 """Largest loss in dB, of the images against sorted ones, for fewer nodes."""
-SCORED_VIEWS = 6
+SCORED_VIEWS = 8
 """Views in which it is measured."""
 ROUNDS = 12
 """Of k-means."""
@@ -144,8 +144,12 @@ def drawing_order(
 
     if nodes != "auto":
         return ordered(int(nodes))
-    scored = [camera.within(SIDE) for camera in subsample(views, SCORED_VIEWS)]
-    plain = replace(mesh, order="fragment", filter_px2=0)  # viewers have no filter
+    # Other views than those that are solved for, where there are others.
+    scored = (
+        subsample(cameras, SCORED_VIEWS) if cameras else dome(mesh, SCORED_VIEWS, whole=True, distance=0.8)
+    )
+    scored = [camera.within(SIDE) for camera in scored]
+    plain = replace(mesh.plain, order="fragment", filter_px2=0)  # viewers have no filter
     truths = [image_of(plain, camera, (1, 1, 1), threads=threads)[0] for camera in scored]
 
     def score(order: DrawOrder) -> float:
