@@ -22,8 +22,8 @@ CONFIG = make_config(steps=48, order="file", prune_epochs=1, prune_opacity=0.02,
 @pytest.fixture(scope="module", name="scene")
 def scene_fixture():
     cloud = make_scene(400)
-    dataset = splat_dataset(cloud, train=16, test=3, width=48, below=True)
-    mesh = convert(cloud)
+    dataset = splat_dataset(cloud, train=16, test=3, width=48, sh_degree=0, below=True)
+    mesh = convert(cloud, colors="base")
     return mesh, drawing_order(mesh, nodes=2), dataset
 
 
@@ -82,6 +82,20 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
         for v in dataset.test
     ]
     assert lines[-1]["psnr"] == pytest.approx(np.mean(own), abs=1e-3)
+
+
+def test_files_have_plain_colours(scene):
+    _, _, dataset = scene
+    mesh = convert(make_scene(200))
+    assert mesh.sh_degree > 0
+    order = drawing_order(mesh, quick=True)
+    tuned, _ = finetune_ordered(mesh, order, dataset, steps=1)
+    assert tuned.sh_degree == 0
+    same = finetune_ordered(mesh.plain, order, dataset, steps=1).mesh
+    np.testing.assert_array_equal(tuned.colors, same.colors)
+    view = dataset.test[0]
+    shown, plain = (image_of(m, view.camera, (1, 1, 1), listing=order)[0] for m in (mesh, mesh.plain))
+    np.testing.assert_array_equal(shown, plain)
 
 
 def test_what_it_is_not_for(scene):

@@ -40,7 +40,7 @@ from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Device
-from meshsplats.rendering.ordering import drawing_order
+from meshsplats.rendering.ordering import VIEWS, default_views, drawing_order
 
 SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""
@@ -119,8 +119,10 @@ class SplatTuning:
             setup.phase("ordering triangles")
             conversion = conversion.plain  # as files have it
             check_for_file_order(conversion, self.config)
-            cameras = [view.camera for view in self.dataset.train]
-            self._order = drawing_order(conversion, cameras, threads=run.threads)
+            # Views from all sides, too: around an object in its surroundings, none trains from below.
+            cameras = subsample([view.camera for view in self.dataset.train], VIEWS // 2)
+            around = subsample(default_views(conversion), VIEWS // 2)
+            self._order = drawing_order(conversion, [*cameras, *around], threads=run.threads)
         setup.phase("scoring the conversion")
         seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
         self._baseline = measure_baseline(

@@ -107,12 +107,12 @@ def image_of(
     """(h, w, 3) display RGB over a display ``background``, and (h, w) alpha.
 
     The mesh is blended in its own space: one with linear colours in linear light, encoded for display
-    afterwards. With ``listing``, a mesh for display blending is drawn as viewers draw a file with that order,
-    all layers by the processor. The other arguments are those of ``render``.
+    afterwards. With ``listing``, a mesh for display blending is drawn as viewers draw a file with that order:
+    in its plain colours, all layers, by the processor. The other arguments are those of ``render``.
     """
     if listing is not None:
         options = TapeOptions(background, samples, listing=listing)
-        shown = TapedRendering(mesh.triangles, camera, options, threads=threads, tape_bytes=None)
+        shown = TapedRendering(mesh.plain.triangles, camera, options, threads=threads, tape_bytes=None)
         return shown.color, shown.alpha
     linear = mesh.blending == "linear"
     backdrop = srgb_to_linear(np.asarray(background)) if linear else background
