@@ -3,8 +3,8 @@
     python benchmarks/orders.py SPLATS [SPLATS ...] [--steps 150] [--threads 2]
 
 PSNR in dB at 400 pixels and 2 x 2 samples against means over pixels of the splats at degree 0, on white, in
-eight views at elevations of 5 and 30 degrees. All runs begin as the same conversion and see the same views, an
-object's from below, too.
+eight views at elevations of 5 and 30 degrees. All runs begin as the same conversion and see the same views,
+an object's from below, too.
 """
 
 from __future__ import annotations

@@ -61,7 +61,10 @@ class ChainOptions:
     threads: int | None = None
 
     def plan(self, splats: int) -> list[Level]:
-        """The levels of so many ``splats`` (``plan_levels``)."""
+        """The levels of so many ``splats`` (``plan_levels``). ValueError for orders that contradict each
+        other."""
+        if self.alpha == "ordered" and self.order not in (None, "fragment"):
+            raise ValueError("alpha 'ordered' has an order of its own: leave out order")
         most = splats if self.max_splats is None else min(self.max_splats, splats)
         return plan_levels(most, self.levels, factor=self.factor, width=self.width)
 

@@ -566,7 +566,7 @@ def test_what_has_no_order_of_its_own_is_refused_before_the_work(splats, tmp_pat
     for options, message in (
         (
             ("-o", tmp_path / "x.npz"),
-            "--order file is for .glb files, which list triangles in an order, not x.npz",
+            "order 'file' is for .glb files, which list triangles in an order, not x.npz",
         ),
         (("-o", tmp_path / "x.glb", "--cell-splats", "100"), "order is for a whole scene, not for cells"),
         (("-o", tmp_path / "x.glb", "--look", "splats"), "viewers, which have no filter"),

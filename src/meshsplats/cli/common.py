@@ -23,7 +23,6 @@ from meshsplats.cli.arguments import spelled
 from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import Dataset
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import listed, y_up_suffixes
@@ -534,16 +533,13 @@ def plural(count: int, noun: str) -> str:
 
 
 def draw_preview(
-    scene: SplatMesh | GaussianCloud,
-    path: Path,
-    camera: Camera | None = None,
-    listing: DrawOrder | None = None,
+    scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None, **how: Any
 ) -> None:
     """Saves a preview (``save_preview``), or says why there is none."""
     from meshsplats.rendering.layers import layers
     from meshsplats.rendering.previews import preview_camera, save_preview
 
-    if not save_preview(scene, path, camera, listing):
+    if not save_preview(scene, path, camera, **how):
         count = layers(scene, camera or preview_camera(scene))
         say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
 

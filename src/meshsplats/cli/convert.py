@@ -151,8 +151,7 @@ class Convert(Command):
     with soft_share: solid and blended triangles apart; ordered (.glb), for web viewers and engines alone:
     every triangle twice, for either side, in an order of blending that suits views from all around."""
     nodes: tyro.conf.Fixed[int | Literal["auto"] | None] = None
-    """--alpha ordered: parts that viewers sort, each a draw call. auto: 1, 2 or 4 where that is within 0.5 dB
-    of 8, in up to four times the time. Default: 8."""
+    """--alpha ordered: parts that viewers sort, each a draw call; auto: few, if they do. Default: 8."""
     quick: tyro.conf.Fixed[bool] = False
     """--alpha ordered: an order by a formula, in a second, and several dB worse."""
     cutoff: tyro.conf.Fixed[float | None] = None

@@ -38,26 +38,15 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import Background
-from meshsplats.finetuning import (
-    FinetuneConfig,
-    RunOptions,
-    finetune,
-    make_config,
-    starting_mesh,
-    worthwhile_views,
-)
-from meshsplats.finetuning.baseline import SizeScores
+from meshsplats.finetuning import FinetuneConfig, RunOptions, make_config, on_splats, starting_mesh
 from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.config import worthwhile_zooms
+from meshsplats.finetuning.config import worthwhile_views, worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
-from meshsplats.finetuning.on_splats import SAVE_SECONDS, SplatRun, SplatTuning, log_scores
-from meshsplats.finetuning.ordered import finetune_ordered
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.ordering import drawing_order
 
 if TYPE_CHECKING:
     from meshsplats.finetuning.cells import CellScene
@@ -108,10 +97,7 @@ class Finetune(TrainingCommand):
 
     def check(self) -> None:
         check_mesh_suffix(self.output)
-        if self.tuning.order == "file" and self.output.suffix.lower() != ".glb":
-            raise UsageError(
-                f"--order file is for .glb files, which list triangles in an order, not {self.output.name}"
-            )
+        on_splats.check_order_of_file(self.configured(), self.output)
         if self.cluster.cluster is not None and self.cell_splats is None:
             raise UsageError("--cluster is for the cells of --cell-splats")
         super().check()
@@ -141,14 +127,9 @@ class Finetune(TrainingCommand):
         start = mesh
 
         def optimise(run: RunOptions, show: Display) -> Trained:
-            if config.order != "file":
-                return self._trained(finetune(start, dataset, config, run=run, on_progress=show), config)
-            show.phase("ordering triangles")
-            order = drawing_order(start, [view.camera for view in dataset.train], threads=self.threads)
-            tuned = finetune_ordered(start, order, dataset, config, run=run, on_progress=show)
-            return replace(self._trained(tuned.mesh, config), order=tuned.order)
+            return self._trained(on_splats.tuned_as_configured(start, dataset, config, run, show), config)
 
-        reserve = SAVE_SECONDS * len(mesh.faces)
+        reserve = on_splats.SAVE_SECONDS * len(mesh.faces)
         return Plan(mesh, dataset, _summary(mesh, scene), background, optimise, reserve)
 
     def _plan_on_splats(
@@ -160,7 +141,7 @@ class Finetune(TrainingCommand):
         setup: Setup,
     ) -> Plan:
         """On images of the splats (``SplatTuning``)."""
-        run = SplatRun(
+        run = on_splats.SplatRun(
             cloud,
             lambda chosen, zooms: dataset if zooms is None else self._targets(cloud, chosen, earlier, zooms),
             config,
@@ -172,20 +153,20 @@ class Finetune(TrainingCommand):
             threads=self.threads,
             device=self.device,
         )
-        tuning = SplatTuning(run, setup)
+        tuning = on_splats.SplatTuning(run, setup)
 
         def optimise(options: RunOptions, show: Display) -> Trained:
-            tuned = tuning.optimise(options, show)
-            return replace(self._trained(tuned.mesh, tuning.config, tuned.sizes), order=tuned.order)
+            return self._trained(tuning.optimise(options, show), tuning.config)
 
         summary = _summary(tuning.mesh, cloud)
         return Plan(tuning.mesh, tuning.dataset, summary, None, optimise, tuning.reserve, rates=tuning.rates)
 
-    def _trained(self, mesh: SplatMesh, config: FinetuneConfig, sizes: SizeScores | None = None) -> Trained:
+    def _trained(self, tuned: on_splats.Tuned, config: FinetuneConfig) -> Trained:
+        mesh, order, sizes = tuned
         count = len(mesh.faces)
         hybrid = config.soft_share and self.output.suffix.lower() == ".glb" and not (sizes and sizes.loses)
-        alpha: Literal["hybrid"] | None = "hybrid" if hybrid else None
-        return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", alpha, sizes)
+        saving = {"order": order} if order is not None else {"alpha": "hybrid"} if hybrid else {}
+        return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", saving, sizes)
 
     def _start(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig | None) -> SplatMesh:
         return starting_mesh(
@@ -214,10 +195,8 @@ class Finetune(TrainingCommand):
         earlier: Checkpoint | None,
         zooms: Sequence[int] | None = None,
     ) -> Dataset:
-        target, below = self.target, self.target.below
-        if config.order == "file" and below is None and target.data is None and target.cameras is None:
-            target = replace(target, below=True)
-        return target.make(
+        below = config.order == "file" if self.target.below is None else self.target.below
+        return replace(self.target, below=below).make(
             scene,
             self.input,
             default_background(config),
@@ -249,7 +228,7 @@ class Finetune(TrainingCommand):
                 shared = Shared(partial(_cell_scene, command, color))
                 shared.hold(CellScene(scene, dataset))
                 mesh = finetune_cells(shared, config, options, run, workers=workers, on_progress=show).mesh()
-            log_scores(self.files().folder, mesh, dataset, config, self.threads)
+            on_splats.log_scores(self.files().folder, mesh, dataset, config, self.threads)
             triangles = len(mesh.faces)
             return Trained(mesh, mesh, {"triangles": triangles, "cells": count}, f"{triangles:,} triangles")
 

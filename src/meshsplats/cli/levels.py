@@ -73,8 +73,7 @@ class Levels(Command):
     alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
     """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
     not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
-    cut there. ordered: in an order of blending, and tuned through it, for web viewers and engines that
-    cull."""
+    cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
     no_tune: bool = False
     """Convert only: seconds in place of minutes."""
     minutes: Number = None
@@ -168,8 +167,6 @@ class Levels(Command):
             raise UsageError("--resume continues, --force starts again: give one of them")
         if self.alpha not in ("auto", "opaque") and self.format != "glb":
             raise UsageError(f"--alpha {self.alpha} is for .glb files, not .{self.format}")
-        if self.alpha == "ordered" and self.order != "fragment":
-            raise UsageError("--alpha ordered has an order of its own: leave out --order")
         if self.up is not None:
             parse_up(self.up)
         if self.no_tune:

@@ -91,10 +91,28 @@ class Tuned(NamedTuple):
     """The end of a run."""
 
     mesh: SplatMesh
-    sizes: SizeScores
-    """Of the conversion and of the tuned mesh."""
-    order: DrawOrder | None
+    order: DrawOrder | None = None
     """In which a file lists its triangles, of a run with order 'file'."""
+    sizes: SizeScores | None = None
+    """Of the conversion of splats and of the tuned mesh."""
+
+
+def tuned_as_configured(
+    mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, run: RunOptions, show: Display
+) -> Tuned:
+    """``finetune``, or with order 'file' ``finetune_ordered`` in an order that suits the training views."""
+    if config.order != "file":
+        return Tuned(finetune(mesh, dataset, config, run=run, on_progress=show))
+    show.phase("ordering triangles")
+    check_for_file_order(mesh, config)
+    order = drawing_order(mesh, [view.camera for view in dataset.train], threads=run.threads)
+    return Tuned(*finetune_ordered(mesh, order, dataset, config, run=run, on_progress=show))
+
+
+def check_order_of_file(config: FinetuneConfig, path: Path) -> None:
+    """ValueError if the order of triangles of a run is to be in a file, and that of ``path`` has none."""
+    if config.order == "file" and path.suffix.lower() != ".glb":
+        raise ValueError(f"order 'file' is for .glb files, which list triangles in an order, not {path.name}")
 
 
 class SplatTuning:
@@ -156,7 +174,7 @@ class SplatTuning:
         run, baseline, config = self._run, self._baseline, self.config
         if not run.resumed:
             if not self._has_time():
-                return Tuned(self.mesh, baseline.compared_with_itself(), self._order)
+                return Tuned(self.mesh, self._order, baseline.compared_with_itself())
             self._record.save(run.folder)
         order = self._order
         if order is None:
@@ -168,7 +186,7 @@ class SplatTuning:
         show.phase("scoring the result")
         sizes = baseline.compare(tuned, config, run.threads, order)
         if not sizes.loses:
-            return Tuned(tuned, sizes, order)
+            return Tuned(tuned, order, sizes)
         for share in SHARES if self._begins_converted else ():
             late = self._setup.spent + baseline.seconds + self._saving - (self._setup.seconds or np.inf)
             if late > OVERTIME:
@@ -176,10 +194,10 @@ class SplatTuning:
             less = partly(self.mesh, tuned, share)
             if less is not None and not (found := baseline.compare(less, config, run.threads, order)).loses:
                 log_scores(run.folder, less, self.dataset, config, run.threads, order)
-                return Tuned(less, found, order)
+                return Tuned(less, order, found)
         best = self.mesh if self._begins_converted else self._converted()
         log_scores(run.folder, best, self.dataset, config, run.threads, self._order)
-        return Tuned(best, sizes, self._order)
+        return Tuned(best, self._order, sizes)
 
     def _converted(self) -> SplatMesh:
         cameras = [view.camera for view in self.dataset.train]
