@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _stock_viewer import stock_image
 
 from meshsplats import ConversionOptions, convert, load_mesh, orbit, psnr, render, save_gaussians, simplify
 from meshsplats.chains import ChainOptions, make_chain
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.levels import (
     FOOTPRINTS_PX2,
     Level,
@@ -281,6 +283,32 @@ def test_alpha_modes(splats, tmp_path, capsys):
     assert f"  {table['levels'][0]['alpha']['alpha']}\n" in capsys.readouterr().out
     assert run(splats, "-o", tmp_path / "x", *QUICK, "--alpha", "mask", "--format", "ply") == 2
     assert "--alpha mask is for .glb files, not .ply" in capsys.readouterr().err
+
+
+def test_levels_with_an_order(splats, tmp_path, capsys):
+    """Tuned through it and converted alone: what an independent viewer shows is what the table says."""
+    import meshsplats.levels as module
+    from meshsplats import load_gaussians
+    from meshsplats.finetuning import make_config
+
+    for length in (("--steps", 20), ("--no-tune",)):
+        out = tmp_path / str(length[0])
+        assert run(splats, "-o", out, "--alpha", "ordered", "--width", 48, "--levels", 2, *length) == 0
+        cloud = load_gaussians(splats)
+        table = json.loads((out / "levels.json").read_text())
+        for row, level in zip(table["levels"], module.plan_levels(len(cloud), 2, width=48), strict=True):
+            assert row["alpha"] == {"alpha": "ordered"}
+            assert listed_nodes(out / row["file"]) > 1
+            views = module.level_targets(cloud, level, make_config(steps=20)).test[: row["views"]]
+            mesh = load_mesh(out / row["file"])
+            cameras = [view.camera.with_near_plane(mesh.vertices) for view in views]
+            shown = [stock_image(out / row["file"], camera, samples=2) for camera in cameras]
+            scores = [psnr(a, v.image.clip(0, 1)) for a, v in zip(shown, views, strict=True)]
+            assert row["psnr"] == pytest.approx(np.mean(scores), abs=0.15)
+    tuned = json.loads((tmp_path / "--steps" / "levels.json").read_text())["levels"][0]["psnr"]
+    assert tuned > table["levels"][0]["psnr"]
+    assert run(splats, "-o", tmp_path / "x", *QUICK, "--alpha", "ordered", "--order", "splat") != 0
+    assert "has an order of its own: leave out order" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
             {"mesh": MESH, "dataset": DATASET},
             {"mesh": "mesh", "dataset": "dataset", "config": "finetune config", "run": "options"},
         ),
+        (
+            "finetune_ordered",
+            {"mesh": MESH, "listing": ms.drawing_order(MESH, CAMERAS), "dataset": DATASET},
+            {"mesh": "mesh", "dataset": "dataset", "config": "finetune config", "run": "options"},
+        ),
         *(
             (name, {}, {"path": "path"})
             for name in ("load_base", "load_cameras", "load_dataset", "load_mesh")

@@ -2,13 +2,14 @@
 
     npm install three babylonjs babylonjs-loaders puppeteer-core    (in some folder; Chromium installed)
     python benchmarks/viewers/ordered.py SPLATS [SPLATS ...] --node-folder FOLDER [--max-triangles N]
-        [--nodes 1 8] [--viewers three babylon] [--keep FOLDER]
+        [--nodes 1 8] [--viewers three babylon] [--keep FOLDER] [--tuned TUNED.glb ...]
 
 PSNR in dB at a pixel ratio of 2 with MSAA against means over pixels of the splats at degree 0, on white.
 Views: around, at elevations of 5 and 30 degrees; from 40 degrees below; near, from 40 degrees above at half
 the distance; each at least 10 degrees from every one that the order is solved for. Rows: the file without an
-order (blend), and files with one, of so many nodes; 'emulated' is our own image of the same file
-(ordered_image), 'exact' that of the sorted mesh at 2 x 2 samples a pixel.
+order (blend), files with one, of so many nodes, and one of `finetune --order file` for each of SPLATS;
+'emulated' is our own image of the same file (ordered_image), 'exact' that of the sorted mesh at 2 x 2 samples
+a pixel. Tuned files have been trained on views nearer than 10 degrees.
 """
 
 from __future__ import annotations
@@ -40,15 +41,19 @@ def main() -> None:
     parser.add_argument("splats", type=Path, nargs="+")
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
     parser.add_argument("--max-triangles", type=int, help="merge similar splats to this size")
-    parser.add_argument("--nodes", type=int, nargs="+", default=[8])
+    parser.add_argument("--nodes", type=int, nargs="*", default=[8])
     parser.add_argument("--viewers", nargs="+", default=["three", "babylon"])
+    parser.add_argument("--tuned", type=Path, nargs="+", default=[], help="a tuned file for each of SPLATS")
     parser.add_argument("--keep", type=Path, help="keep files and images here")
     args = parser.parse_args()
+    if args.tuned and len(args.tuned) != len(args.splats):
+        parser.error("--tuned needs a file for each of SPLATS")
     with Report(args) as report:
         report.table("scene", "file", "MB", "processor s", "image of", *PLACES)
-        for path in args.splats:
+        for number, path in enumerate(args.splats):
             with tempfile.TemporaryDirectory() as scratch:
-                measure(path, args, args.keep or Path(scratch), report)
+                tuned = args.tuned[number] if args.tuned else None
+                measure(path, tuned, args, args.keep or Path(scratch), report)
 
 
 def unsolved(mesh: ms.SplatMesh, elevation: float, distance: float, count: int = 4) -> list[ms.Camera]:
@@ -65,7 +70,7 @@ def unsolved(mesh: ms.SplatMesh, elevation: float, distance: float, count: int =
     return [found[k * len(found) // count] for k in range(count)]
 
 
-def measure(path: Path, args: argparse.Namespace, folder: Path, report: Report) -> None:
+def measure(path: Path, tuned: Path | None, args: argparse.Namespace, folder: Path, report: Report) -> None:
     cloud = ms.load_gaussians(path)
     mesh = ms.convert(cloud, max_triangles=args.max_triangles)
     cameras, truths = {}, {}
@@ -77,6 +82,8 @@ def measure(path: Path, args: argparse.Namespace, folder: Path, report: Report) 
     ms.save_cameras(every, folder / "cameras.json")
     files, orders, seconds = {"blend": folder / "blend.glb"}, {}, {"blend": 0.0}
     ms.save_mesh(mesh, files["blend"], alpha="blend")
+    if tuned is not None:
+        files["tuned"] = tuned
     for nodes in args.nodes:
         for quick in (True, False):
             name = f"{'quick' if quick else 'solved'}, {nodes}"

@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         Progress,
         RunOptions,
         finetune,
+        finetune_ordered,
         make_config,
         starting_mesh,
     )
@@ -87,7 +88,7 @@ _HOME = {
     "meshsplats.evaluation.report": ("Report", "evaluate"),
     "meshsplats.finetuning": (
         *("FinetuneConfig", "Interrupted", "Progress", "RunOptions"),
-        *("finetune", "make_config", "starting_mesh"),
+        *("finetune", "finetune_ordered", "make_config", "starting_mesh"),
     ),
     "meshsplats.formats.base_meshes": ("load_base",),
     "meshsplats.formats.cutting": ("cut_mesh",),
@@ -159,6 +160,7 @@ __all__ = [
     "find_background",
     "find_cameras",
     "finetune",
+    "finetune_ordered",
     "gaussians_from_tensors",
     "gaussians_to_tensors",
     "load_base",

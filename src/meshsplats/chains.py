@@ -22,7 +22,9 @@ from meshsplats.levels import (
     Level,
     level_targets,
     likeness,
+    likeness_to_views,
     make_level,
+    make_ordered_level,
     merged,
     merges_further,
     plan_levels,
@@ -48,8 +50,9 @@ class ChainOptions:
     """Of the finest level; None: all."""
     format: str = "glb"
     """Suffix of the files, without a dot."""
-    alpha: Literal["auto", "blend", "mask", "opaque"] = "auto"
-    """As for ``save_mesh``; 'auto': measured for each level (``choose_alpha``), for a .glb."""
+    alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
+    """As for ``save_mesh``; 'auto': measured for each level (``choose_alpha``), for a .glb. 'ordered' (.glb):
+    in an order of blending, and optimised through it."""
     up: Sequence[float] | np.ndarray | None = None
     sh_degree: int | None = None
     """Of the images of the splats; None: all that are stored."""
@@ -58,7 +61,10 @@ class ChainOptions:
     threads: int | None = None
 
     def plan(self, splats: int) -> list[Level]:
-        """The levels of so many ``splats`` (``plan_levels``)."""
+        """The levels of so many ``splats`` (``plan_levels``). ValueError for orders that contradict each
+        other."""
+        if self.alpha == "ordered" and self.order not in (None, "fragment"):
+            raise ValueError("alpha 'ordered' has an order of its own: leave out order")
         most = splats if self.max_splats is None else min(self.max_splats, splats)
         return plan_levels(most, self.levels, factor=self.factor, width=self.width)
 
@@ -147,16 +153,25 @@ def _made(
     run = RunOptions(threads=threads, spent=time.perf_counter() - start)
     if chosen.order is not None and config is not None:
         config = replace(config, order=chosen.order)
-    mesh = make_level(own, level, targets, config, run=run, on_progress=show, up=chosen.up)
+    how: dict[str, Any] = {"run": run, "on_progress": show, "up": chosen.up}
+    order = None
+    if chosen.alpha == "ordered":
+        mesh, order = make_ordered_level(own, level, targets, config, **how)
+    else:
+        mesh = make_level(own, level, targets, config, **how)
     if chosen.order is not None:
         mesh = replace(mesh, order=chosen.order)
     choice = None
     if chosen.alpha == "auto" and chosen.format == "glb":
         choice = choose_alpha(mesh, cameras, threads=threads)
     asked = {} if chosen.alpha == "auto" else {"alpha": chosen.alpha}
-    save_mesh(place(mesh), path, **(asked if choice is None else choice.options))
     scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces), len(cloud))]
-    score = likeness(mesh, cloud, scored, sh_degree=chosen.sh_degree, threads=threads)
+    if order is None:
+        save_mesh(place(mesh), path, **(asked if choice is None else choice.options))
+        score = likeness(mesh, cloud, scored, sh_degree=chosen.sh_degree, threads=threads)
+    else:
+        save_mesh(place(mesh), path, order=order)
+        score = likeness_to_views(mesh, targets.test[: len(scored)], threads, order)
     row = {
         "file": path.name,
         "splats": mesh.splat_count,

@@ -42,6 +42,13 @@ class DrawOrder:
     def node_count(self) -> int:
         return len(self.starts) - 1
 
+    def take(self, keep: np.ndarray) -> DrawOrder:
+        """The order of the triangles of a mesh that ``keep`` marks, (f,) bool: at least one."""
+        left = self.copies[np.tile(keep, 2)[self.copies]]
+        renumber = np.cumsum(np.tile(keep, 2)) - 1
+        ends = np.concatenate([[0], np.cumsum(np.tile(keep, 2)[self.copies])])[self.starts]
+        return DrawOrder(renumber[left], np.unique(ends))
+
     def listed(self, faces: np.ndarray) -> np.ndarray:
         """(2 f, 3) the copies of ``faces``, the (f, 3) vertex indices of the mesh. Raises ValueError for
         another number of triangles."""

@@ -14,13 +14,16 @@ from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.footprint import FILTER_PX2
 from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import compare, images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning import (
     FinetuneConfig,
+    OrderedMesh,
     Progress,
     RunOptions,
     finetune,
+    finetune_ordered,
     starting_mesh,
     worthwhile_views,
 )
@@ -28,6 +31,7 @@ from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starting_sides
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.ordering import drawing_order
 
 SMALLEST = 16
 """Minimum image width of a level in pixels."""
@@ -121,27 +125,71 @@ def make_level(
     ``options`` and ``up`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
     """
     if config is None:
-        cameras = [view.camera for view in targets.test]
-        cloud = merged(cloud, level, cameras)
-        if options is not None or level.splats == level.finest:
-            return convert(cloud, options, cameras=cameras, up=up)
-        best, found = -math.inf, None
-        for px2 in FOOTPRINTS_PX2:
-            mesh = convert(cloud, cameras=cameras, up=up, footprint_px2=px2)
-            score = _against(mesh, targets.train[:PLAIN_VIEWS], run.threads if run else None)
-            if score <= best:
-                break
-            best, found = score, mesh
-        assert found is not None
-        return found
+        return _converted_level(cloud, level, targets, options, up, run)
+    mesh = _starting_level(cloud, level, targets, config, options, up)
+    return finetune(mesh, targets, config, run=run, on_progress=on_progress)
+
+
+def make_ordered_level(
+    cloud: GaussianCloud,
+    level: Level,
+    targets: Dataset,
+    config: FinetuneConfig | None = None,
+    *,
+    up: Sequence[float] | np.ndarray | None = None,
+    run: RunOptions | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> OrderedMesh:
+    """``make_level`` for viewers that cull and do not sort: with an order of its triangles, and optimised as
+    such viewers draw it."""
+    threads = run.threads if run else None
+    if config is None:
+        mesh = _converted_level(cloud, level, targets, None, up, run).plain
+        return OrderedMesh(mesh, drawing_order(mesh, threads=threads))
+    mesh = _starting_level(cloud, level, targets, config, None, up)
+    order = drawing_order(mesh, threads=threads)
+    return finetune_ordered(mesh, order, targets, config, run=run, on_progress=on_progress)
+
+
+def _converted_level(
+    cloud: GaussianCloud,
+    level: Level,
+    targets: Dataset,
+    options: ConversionOptions | None,
+    up: Sequence[float] | np.ndarray | None,
+    run: RunOptions | None,
+) -> SplatMesh:
+    cameras = [view.camera for view in targets.test]
+    cloud = merged(cloud, level, cameras)
+    if options is not None or level.splats == level.finest:
+        return convert(cloud, options, cameras=cameras, up=up)
+    best, found = -math.inf, None
+    for px2 in FOOTPRINTS_PX2:
+        mesh = convert(cloud, cameras=cameras, up=up, footprint_px2=px2)
+        score = likeness_to_views(mesh, targets.train[:PLAIN_VIEWS], run.threads if run else None)
+        if score <= best:
+            break
+        best, found = score, mesh
+    assert found is not None
+    return found
+
+
+def _starting_level(
+    cloud: GaussianCloud,
+    level: Level,
+    targets: Dataset,
+    config: FinetuneConfig,
+    options: ConversionOptions | None,
+    up: Sequence[float] | np.ndarray | None,
+) -> SplatMesh:
+    """The mesh of which a fine-tuning begins."""
     cameras = [view.camera for view in targets.train]
     if options is None:
         # A level is seen at the size of its targets: their own footprint, not that of larger images.
         px2 = FILTER_PX2["area"][cloud.kernel]
         sides = starting_sides(level.finest, config, len(cameras))
         options = ConversionOptions(sides=sides, footprint_px2=px2)
-    mesh = starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
-    return finetune(mesh, targets, config, run=run, on_progress=on_progress)
+    return starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
 
 
 def merged(
@@ -162,10 +210,14 @@ def views_to_score(triangles: int, splats: int) -> int:
     return min(max(SCORED_TRIANGLES // max(triangles, splats // 2, 1), PLAIN_VIEWS), HELD_OUT)
 
 
-def _against(mesh: SplatMesh, views: Sequence[View], threads: int | None) -> float:
-    """Mean PSNR in dB of the mesh against the images of ``views``."""
-    images = (images_of_view(mesh, view, samples=SAMPLES, threads=threads) for view in views)
-    return float(np.mean([psnr(*pair) for pair in images]))
+def likeness_to_views(
+    mesh: SplatMesh, views: Sequence[View], threads: int | None, listing: DrawOrder | None = None
+) -> float:
+    """Mean PSNR in dB of the mesh at 2 x 2 samples per pixel against the images of ``views``; drawn as
+    viewers draw a file with the order ``listing``."""
+    options: dict[str, Any] = {"samples": SAMPLES, "threads": threads, "listing": listing}
+    pairs = (images_of_view(mesh, view, **options) for view in views)
+    return float(np.mean([min(psnr(*pair), 200.0) for pair in pairs]))
 
 
 def likeness(

@@ -29,6 +29,7 @@ from meshsplats.finetuning import make_config, worthwhile_views
 from meshsplats.finetuning.checkpoint import load_checkpoint
 from meshsplats.finetuning.pace import Pace
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.rendering import render_splats
 
@@ -548,3 +549,28 @@ def test_a_run_without_time_for_steps_is_not_begun(splats, tmp_path, capsys, mon
     assert "there was no time for steps: this is the mesh at the start; more --minutes help" in printed
     assert "metrics.jsonl" not in printed
     assert np.array_equal(load_mesh(tmp_path / "t.npz").vertices, convert(load_gaussians(splats)).vertices)
+
+
+def test_a_file_that_is_tuned_through_its_order(splats, tmp_path, capsys):
+    path = tmp_path / "ordered.glb"
+    assert run(splats, "-o", path, "--order", "file", "--steps", "3", *SMALL) == 0
+    assert "web viewers and engines" in capsys.readouterr().out
+    assert listed_nodes(path) == 8
+    assert len(load_mesh(path).faces) == 300 * 8
+    assert 'order = "file"' in (tmp_path / "ordered.glb.config.toml").read_text()
+    lines = (tmp_path / "ordered.glb.run/metrics.jsonl").read_text().splitlines()
+    assert json.loads(lines[0])["psnr"] > 10
+
+
+def test_what_has_no_order_of_its_own_is_refused_before_the_work(splats, tmp_path, capsys):
+    for options, message in (
+        (
+            ("-o", tmp_path / "x.npz"),
+            "order 'file' is for .glb files, which list triangles in an order, not x.npz",
+        ),
+        (("-o", tmp_path / "x.glb", "--cell-splats", "100"), "order is for a whole scene, not for cells"),
+        (("-o", tmp_path / "x.glb", "--look", "splats"), "viewers, which have no filter"),
+    ):
+        assert run(splats, *options, "--order", "file", "--steps", "3", *SMALL) != 0
+        assert message in " ".join(capsys.readouterr().err.split())
+        assert not list(tmp_path.iterdir())

@@ -113,8 +113,21 @@ def test_an_independent_viewer_draws_the_file_alike(mesh, tmp_path, nodes):
         assert psnr(shown, ordered_image(stored, order, near, multisample=False)) > 45
 
 
+def test_as_few_nodes_as_are_enough(mesh, monkeypatch):
+    views = default_views(mesh)[::8]
+    counts = []
+    for loss in (0.0, 2.0, 100.0):
+        monkeypatch.setattr(ordering, "NODE_LOSS", loss)
+        order = drawing_order(mesh, views, nodes="auto")
+        counts.append(order.node_count)
+        alone = drawing_order(mesh, views, nodes=order.node_count)
+        assert order.copies.tobytes() == alone.copies.tobytes()
+    assert counts[0] > counts[-1] == 1
+    assert counts == sorted(counts, reverse=True)
+
+
 def test_wrong_arguments_are_named(mesh):
-    with pytest.raises(ValueError, match="nodes must be a number from 1 to 256, got 0"):
+    with pytest.raises(ValueError, match="nodes must be a number from 1 to 256, or 'auto', got 0"):
         drawing_order(mesh, nodes=0)
     with pytest.raises(ValueError, match="threads must be at least 1"):
         drawing_order(mesh, threads=0)

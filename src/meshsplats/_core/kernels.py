@@ -19,6 +19,7 @@ from meshsplats._core.structures import (
     ComparisonStruct,
     EdgesStruct,
     FansStruct,
+    ListingStruct,
     OrderingStruct,
     ViewerStruct,
 )
@@ -303,3 +304,38 @@ def order_triangles(
     )
     run("ms_order_triangles", struct)
     return Ordered(result, struct.pairs, struct.weight, struct.before, struct.after)
+
+
+def listed_triangles(
+    triangles: tuple[np.ndarray, np.ndarray, np.ndarray | None],
+    order: tuple[np.ndarray, np.ndarray],
+    camera: CameraStruct,
+    threads: int | None = None,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """What a viewer draws of a file that lists triangles with both windings: (f, 3) int32 triangles in the
+    order of blending, and (f,) int32 their splats.
+
+    Args:
+        triangles: vertices (v, 3) float32, faces (f, 3) int32, splats (f,) int32 or None.
+        order: copies and starts, as in ``DrawOrder``.
+    """
+    vertices, faces, splats = triangles
+    copies, starts = order
+    listed = np.empty_like(faces)
+    listed_splats = None if splats is None else np.empty_like(splats)
+    struct = ListingStruct(
+        camera=camera,
+        vertex_count=len(vertices),
+        face_count=len(faces),
+        vertices=pointer(vertices),
+        faces=pointer(faces),
+        face_splat=pointer(splats),
+        copies=pointer(copies),
+        starts=pointer(starts),
+        listed=pointer(listed),
+        listed_splat=pointer(listed_splats),
+        node_count=len(starts) - 1,
+        threads=min(threads or processors(), 256),
+    )
+    run("ms_list_triangles", struct)
+    return listed, listed_splats

@@ -233,6 +233,23 @@ class OrderingStruct(CoreStruct):
     ]
 
 
+class ListingStruct(CoreStruct):
+    _fields_ = [
+        ("camera", CameraStruct),
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("vertices", c_void_p),
+        ("faces", c_void_p),
+        ("face_splat", c_void_p),
+        ("copies", c_void_p),
+        ("starts", c_void_p),
+        ("listed", c_void_p),
+        ("listed_splat", c_void_p),
+        ("node_count", c_int32),
+        ("threads", c_int32),
+    ]
+
+
 class NearestStruct(CoreStruct):
     _fields_ = [
         ("count", c_int64),

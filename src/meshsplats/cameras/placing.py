@@ -24,6 +24,7 @@ STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
 evenly in every run of successive points. The first two are powers of the inverse of the plastic number, the
 most even pair known: directions matter most."""
 OBJECT_ELEVATIONS = (0.0, 60.0)
+ALL_ELEVATIONS = (-60.0, 60.0)
 SURROUNDED_ELEVATIONS = (3.0, 60.0)
 """Degrees above the horizon. Few captures show anything from below, and flat ground seen from the side is so
 hard to match that such views make the others worse."""

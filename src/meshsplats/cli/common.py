@@ -532,12 +532,14 @@ def plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
-def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None) -> None:
-    """Saves a preview, or says why there is none."""
+def draw_preview(
+    scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None, **how: Any
+) -> None:
+    """Saves a preview (``save_preview``), or says why there is none."""
     from meshsplats.rendering.layers import layers
     from meshsplats.rendering.previews import preview_camera, save_preview
 
-    if not save_preview(scene, path, camera):
+    if not save_preview(scene, path, camera, **how):
         count = layers(scene, camera or preview_camera(scene))
         say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
 

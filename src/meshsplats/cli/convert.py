@@ -150,8 +150,8 @@ class Convert(Command):
     what has at least ``cutoff``; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
     with soft_share: solid and blended triangles apart; ordered (.glb), for web viewers and engines alone:
     every triangle twice, for either side, in an order of blending that suits views from all around."""
-    nodes: tyro.conf.Fixed[int | None] = None
-    """--alpha ordered: parts that viewers sort, each a draw call. Default: 8."""
+    nodes: tyro.conf.Fixed[int | Literal["auto"] | None] = None
+    """--alpha ordered: parts that viewers sort, each a draw call; auto: few, if they do. Default: 8."""
     quick: tyro.conf.Fixed[bool] = False
     """--alpha ordered: an order by a formula, in a second, and several dB worse."""
     cutoff: tyro.conf.Fixed[float | None] = None

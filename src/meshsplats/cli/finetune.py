@@ -38,19 +38,10 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import Background
-from meshsplats.finetuning import (
-    FinetuneConfig,
-    RunOptions,
-    finetune,
-    make_config,
-    starting_mesh,
-    worthwhile_views,
-)
-from meshsplats.finetuning.baseline import SizeScores
+from meshsplats.finetuning import FinetuneConfig, RunOptions, make_config, on_splats, starting_mesh
 from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.config import worthwhile_zooms
+from meshsplats.finetuning.config import worthwhile_views, worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
-from meshsplats.finetuning.on_splats import SAVE_SECONDS, SplatRun, SplatTuning, log_scores
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
@@ -106,6 +97,7 @@ class Finetune(TrainingCommand):
 
     def check(self) -> None:
         check_mesh_suffix(self.output)
+        on_splats.check_order_of_file(self.configured(), self.output)
         if self.cluster.cluster is not None and self.cell_splats is None:
             raise UsageError("--cluster is for the cells of --cell-splats")
         super().check()
@@ -134,10 +126,10 @@ class Finetune(TrainingCommand):
         assert isinstance(mesh, SplatMesh)
         start = mesh
 
-        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
-            return self._trained(finetune(start, dataset, config, run=run, on_progress=show), config)
+        def optimise(run: RunOptions, show: Display) -> Trained:
+            return self._trained(on_splats.tuned_as_configured(start, dataset, config, run, show), config)
 
-        reserve = SAVE_SECONDS * len(mesh.faces)
+        reserve = on_splats.SAVE_SECONDS * len(mesh.faces)
         return Plan(mesh, dataset, _summary(mesh, scene), background, optimise, reserve)
 
     def _plan_on_splats(
@@ -149,7 +141,7 @@ class Finetune(TrainingCommand):
         setup: Setup,
     ) -> Plan:
         """On images of the splats (``SplatTuning``)."""
-        run = SplatRun(
+        run = on_splats.SplatRun(
             cloud,
             lambda chosen, zooms: dataset if zooms is None else self._targets(cloud, chosen, earlier, zooms),
             config,
@@ -161,20 +153,20 @@ class Finetune(TrainingCommand):
             threads=self.threads,
             device=self.device,
         )
-        tuning = SplatTuning(run, setup)
+        tuning = on_splats.SplatTuning(run, setup)
 
         def optimise(options: RunOptions, show: Display) -> Trained:
-            mesh, sizes = tuning.optimise(options, show)
-            return self._trained(mesh, tuning.config, sizes)
+            return self._trained(tuning.optimise(options, show), tuning.config)
 
         summary = _summary(tuning.mesh, cloud)
         return Plan(tuning.mesh, tuning.dataset, summary, None, optimise, tuning.reserve, rates=tuning.rates)
 
-    def _trained(self, mesh: SplatMesh, config: FinetuneConfig, sizes: SizeScores | None = None) -> Trained:
+    def _trained(self, tuned: on_splats.Tuned, config: FinetuneConfig) -> Trained:
+        mesh, order, sizes = tuned
         count = len(mesh.faces)
         hybrid = config.soft_share and self.output.suffix.lower() == ".glb" and not (sizes and sizes.loses)
-        alpha: Literal["hybrid"] | None = "hybrid" if hybrid else None
-        return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", alpha, sizes)
+        saving = {"order": order} if order is not None else {"alpha": "hybrid"} if hybrid else {}
+        return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", saving, sizes)
 
     def _start(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig | None) -> SplatMesh:
         return starting_mesh(
@@ -203,7 +195,8 @@ class Finetune(TrainingCommand):
         earlier: Checkpoint | None,
         zooms: Sequence[int] | None = None,
     ) -> Dataset:
-        return self.target.make(
+        below = config.order == "file" if self.target.below is None else self.target.below
+        return replace(self.target, below=below).make(
             scene,
             self.input,
             default_background(config),
@@ -235,7 +228,7 @@ class Finetune(TrainingCommand):
                 shared = Shared(partial(_cell_scene, command, color))
                 shared.hold(CellScene(scene, dataset))
                 mesh = finetune_cells(shared, config, options, run, workers=workers, on_progress=show).mesh()
-            log_scores(self.files().folder, mesh, dataset, config, self.threads)
+            on_splats.log_scores(self.files().folder, mesh, dataset, config, self.threads)
             triangles = len(mesh.faces)
             return Trained(mesh, mesh, {"triangles": triangles, "cells": count}, f"{triangles:,} triangles")
 
@@ -249,6 +242,8 @@ class Finetune(TrainingCommand):
 
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
         """The command that scores the result on held-out views, or one that renders it if there are none."""
+        if config.order == "file":
+            return ["web viewers and engines that cull back sides show this file; our own commands sort it"]
         target, dataset, folder = self.target, plan.dataset, self.output.with_suffix("")
         if self.conversion.crop is not None or (target.data is None and not dataset.test):
             words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]

@@ -70,10 +70,10 @@ class Levels(Command):
     """Maximum number of splats of the finest level. Default: all."""
     format: Literal["glb", "npz", "ply", "usdc", "usda", "obj"] = "glb"
     """File format of the meshes."""
-    alpha: Literal["auto", "blend", "mask", "opaque"] = "auto"
+    alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
     """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
     not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
-    cut there."""
+    cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
     no_tune: bool = False
     """Convert only: seconds in place of minutes."""
     minutes: Number = None

@@ -45,6 +45,8 @@ class TargetOptions:
     distance: tyro.conf.Fixed[tuple[float, float]] = (0.9, 1.1)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
     sphere with 90 % of the splats' opacity just fits the image."""
+    below: tyro.conf.Fixed[bool | None] = None
+    """Without --data: views of an object from below, too. Default: with --order file."""
     placement: Literal["auto", "object", "surrounded", "inside", "found"] = "auto"
     """Without --data: cameras all around an object, above the ground around an object in its surroundings,
     in free places inside a room, or found from the splats as 'meshsplats cameras' does. auto: found, except
@@ -67,13 +69,13 @@ class TargetOptions:
 
     def check(self) -> None:
         """UsageError for options without effect."""
-        idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "look", "sh_degree")
+        idle = ("views", "held_out", "width", *PLACING, "below", "cameras", "look", "sh_degree")
         of_data = ("downscale", "test_every", "missing")
         names, source = (idle, "--data") if self.data is not None else (of_data, "splats")
         for name in names:
             if self._is_set(name):
                 raise UsageError(f"{spelled(type(self), name)} has no effect with {source}")
-        for name in PLACING:
+        for name in (*PLACING, "below"):
             if self.cameras is not None and self._is_set(name):
                 raise UsageError(f"{spelled(type(self), name)} has no effect with --cameras")
         if self.views is not None and self.views < 1:
@@ -136,6 +138,7 @@ class TargetOptions:
             test=self.held_out,
             width=self.width,
             distance=self.distance,
+            below=bool(self.below),
             up=None if self.up is None else parse_up(self.up),
             look=self.look_for(preset),
             zooms=zooms,

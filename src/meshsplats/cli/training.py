@@ -90,8 +90,8 @@ class Trained:
     """Sizes, for JSON."""
     summary: str
     """Sizes, in words."""
-    alpha: Literal["hybrid"] | None = None
-    """As in ``save_mesh``."""
+    saving: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of ``save_mesh``; none: the alpha mode is measured."""
     sizes: SizeScores | None = None
     """The conversion of splats against the tuned mesh."""
 
@@ -209,14 +209,14 @@ class TrainingCommand(Command):
             return self.report_interrupt(stop, files)
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
-        given = {"alpha": trained.alpha} if trained.alpha else alpha_for_viewers(trained.saved, files.mesh)
+        given = trained.saving or alpha_for_viewers(trained.saved, files.mesh)
         mesh = written(trained.saved, self.origin)
         scored = self._scored(config, plan.dataset)
         background = {} if plan.background is None else plan.background.to_dict()
         with together():  # a run that is killed before has no result, and its checkpoint
             save_mesh(mesh, files.mesh, **given)
             write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
-            draw_preview(trained.shown, files.preview, self.preview_camera(plan))
+            draw_preview(trained.shown, files.preview, self.preview_camera(plan), listing=given.get("order"))
         self.save_more(files, plan, trained)  # which may fail: the mesh is there by now
         self._print_result(files, time.perf_counter() - start, earlier, trained, scored)
         if not self.json:

@@ -13,6 +13,7 @@
 #include "hidden_new.h"
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
+#include "listing.h"
 #include "merging.h"
 #include "ordering.h"
 #include "viewer.h"
@@ -353,6 +354,10 @@ MS_EXPORT int ms_viewer_images(const MsViewer *viewer, char *message, int messag
 
 MS_EXPORT int ms_order_triangles(MsOrdering *ordering, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::Ordering(*ordering).run(); });
+}
+
+MS_EXPORT int ms_list_triangles(const MsListing *listing, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::Listing(*listing).run(); });
 }
 #endif
 

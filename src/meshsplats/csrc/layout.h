@@ -9,6 +9,7 @@
 #include "edges.h"
 #include "fans.h"
 #ifndef MS_WIDE_ONLY
+#include "listing.h"
 #include "merging.h"
 #include "ordering.h"
 #include "viewer.h"
@@ -234,6 +235,19 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsOrdering, weight),
     MS_FIELD(MsOrdering, before),
     MS_FIELD(MsOrdering, after),
+    MS_WHOLE(MsListing),
+    MS_FIELD(MsListing, camera),
+    MS_FIELD(MsListing, vertex_count),
+    MS_FIELD(MsListing, face_count),
+    MS_FIELD(MsListing, vertices),
+    MS_FIELD(MsListing, faces),
+    MS_FIELD(MsListing, face_splat),
+    MS_FIELD(MsListing, copies),
+    MS_FIELD(MsListing, starts),
+    MS_FIELD(MsListing, listed),
+    MS_FIELD(MsListing, listed_splat),
+    MS_FIELD(MsListing, node_count),
+    MS_FIELD(MsListing, threads),
 #endif
 };
 

@@ -61,7 +61,7 @@ struct Scene {
     std::vector<int32_t> group_start;  // group g: the triangles [group_start[g], group_start[g + 1])
     std::vector<DepthPlane> planes;    // by depth group
     PooledVector<TileBox> boxes;       // by triangle
-    std::vector<float> splat_keys;     // by group, for the order by the splat
+    std::vector<float> splat_keys;     // by group, for the orders by the splat and of the list
     std::vector<BinItem> items;        // groups that may cover samples, nearest first
 
     // Rasterization needs items; replaying a tape does not. `known_filter` is the filter of an earlier scene
@@ -70,7 +70,8 @@ struct Scene {
           const FanFilter *known_filter = nullptr)
         : mesh(mesh), grid(grid), projection(camera, grid.samples), filtered(mesh.filter_px2 > 0) {
         MS_ASSERT(mesh.vertex_count >= 0 && mesh.face_count >= 0 && mesh.face_count <= INT32_MAX);
-        MS_ASSERT((!filtered && !mesh.by_splat) || mesh.face_splat);
+        MS_ASSERT((!filtered && mesh.by_splat != 1) || mesh.face_splat);
+        MS_ASSERT(!filtered || mesh.by_splat != 2);
         if (filtered && !known_filter) {
             filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, threads);
             known_filter = filter.get();
@@ -141,10 +142,14 @@ struct Scene {
     }
 
     // The key of all groups of a splat: minus the depth of its centre, the mean of the corners of its
-    // triangles.
+    // triangles; of a list, the number of each group.
     void find_splat_keys(int threads) {
         const int64_t groups = (int64_t)group_start.size() - 1;
         splat_keys.resize(groups);
+        if (mesh.by_splat == 2) {  // rounding keeps ties, of which the later group is in front
+            for (int64_t g = 0; g < groups; ++g) splat_keys[g] = (float)g;
+            return;
+        }
         auto splat = [&](int64_t group) { return mesh.face_splat[group_start[group]]; };
         parallel_blocks(threads, groups, 1 << 12, [&](int64_t begin, int64_t end, int) {
             for (int64_t g = begin; g < end; ++g) {

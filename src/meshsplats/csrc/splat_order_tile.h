@@ -1,6 +1,7 @@
-// Rasterizes a mesh into one tile by the splat: blends whole splats in the order of the tile list.
+// Rasterizes a mesh into one tile by the splat, or as its triangles are listed: blends whole groups in the
+// order of the tile list.
 //
-// The triangles of a splat are blended from the last to the first, as if splats were painted far to near,
+// The triangles of a group are blended from the last to the first, as if splats were painted far to near,
 // each triangle over those before it. Nothing waits: what arrives lies behind everything that is blended.
 #pragma once
 

@@ -37,7 +37,9 @@ struct MsMesh {
     const float *normals;        // (vertex_count, 3), or null: the faces' own normals
     const float *attributes;     // (vertex_count, attribute_count), or null
     int32_t attribute_count;
-    int32_t by_splat;   // 1: whole splats in the order of their centres' depths; needs face_splat, no cutoff
+    // 1: whole splats in the order of their centres' depths, which needs face_splat; 2: triangles as they are
+    // listed, the last in front. Without a cutoff.
+    int32_t by_splat;
     double filter_px2;  // variance of the fans' low-pass filter in square pixels; > 0 needs face_splat
 };
 

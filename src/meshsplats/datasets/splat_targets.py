@@ -11,6 +11,7 @@ import numpy as np
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.placing import (
+    ALL_ELEVATIONS,
     DISTANCES,
     OBJECT_ELEVATIONS,
     STEPS,
@@ -52,6 +53,7 @@ def splat_dataset(
     height: int | None = None,
     fov: float | None = None,
     distance: tuple[float, float] = DISTANCES,
+    below: bool = False,
     up: Sequence[float] | np.ndarray | None = None,
     look: Look = "area",
     zooms: Sequence[int] | None = None,
@@ -82,6 +84,7 @@ def splat_dataset(
         distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance at
             which the sphere with 90 % of the splats' opacity (or the whole subject, if that is smaller) just
             fits into the image.
+        below: of 'object', also from below.
         up: (3,) direction; None: ``framing.guess_up``.
         look: 'area': means over each pixel's area, for programs that take several samples a pixel. 'splats':
             as a 3DGS viewer shows them.
@@ -119,10 +122,11 @@ def splat_dataset(
     else:
         if placement == "auto":
             placement = "surrounded" if has_surroundings(cloud) else "object"
+        of_object = ALL_ELEVATIONS if below else OBJECT_ELEVATIONS
         placed = outside_cameras(
             cloud,
             first + train,
-            elevations=SURROUNDED_ELEVATIONS if placement == "surrounded" else OBJECT_ELEVATIONS,
+            elevations=SURROUNDED_ELEVATIONS if placement == "surrounded" else of_object,
             distance=distance,
             up=up,
             width=width,

@@ -15,6 +15,7 @@ from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.datasets.views import View
+from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -120,11 +121,25 @@ def compare_views(
 
 
 def images_of_view(
-    mesh: SplatMesh, view: View, *, samples: int, threads: int | None = None, device: Device = "cpu"
+    mesh: SplatMesh,
+    view: View,
+    *,
+    samples: int,
+    threads: int | None = None,
+    device: Device = "cpu",
+    listing: DrawOrder | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(h, w, 3) display RGB: the image of ``mesh`` in ``view``, and the view's own, clipped to [0, 1].
-    Options are those of ``render``."""
-    image, _ = image_of(mesh, view.camera, view.background, samples=samples, threads=threads, device=device)
+    Options are those of ``image_of``."""
+    image, _ = image_of(
+        mesh,
+        view.camera,
+        view.background,
+        samples=samples,
+        threads=threads,
+        device=device,
+        listing=listing,
+    )
     return np.clip(image, 0, 1), np.clip(view.image, 0, 1)
 
 

@@ -37,7 +37,7 @@ class MeshFileOptions:
     """.glb."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb."""
-    nodes: int = NODES
+    nodes: int | Literal["auto"] = NODES
     """Of 'ordered'."""
     quick: bool = False
     """Of 'ordered': an order by a formula."""

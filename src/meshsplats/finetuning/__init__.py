@@ -12,6 +12,7 @@ from meshsplats.finetuning.config import (
 )
 from meshsplats.finetuning.initial import starting_mesh
 from meshsplats.finetuning.interruption import Interrupted
+from meshsplats.finetuning.ordered import OrderedMesh, finetune_ordered
 from meshsplats.finetuning.run import Progress, RunOptions, finetune
 
 __all__ = [
@@ -19,9 +20,11 @@ __all__ = [
     "PRESETS",
     "FinetuneConfig",
     "Interrupted",
+    "OrderedMesh",
     "Progress",
     "RunOptions",
     "finetune",
+    "finetune_ordered",
     "make_config",
     "starting_mesh",
     "worthwhile_views",

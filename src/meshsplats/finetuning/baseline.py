@@ -18,6 +18,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.datasets.splat_targets import RenderedSplats, splat_views, window_centers, window_of_image
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning.config import FinetuneConfig
@@ -74,9 +75,15 @@ class Baseline:
         """The scores of the conversion, also as those of the result."""
         return SizeScores(self.scores, self.scores)
 
-    def compare(self, mesh: SplatMesh, config: FinetuneConfig, threads: int | None = None) -> SizeScores:
-        """Scores ``mesh`` likewise."""
-        return SizeScores(self.scores, _scores(mesh, self.views, config, threads))
+    def compare(
+        self,
+        mesh: SplatMesh,
+        config: FinetuneConfig,
+        threads: int | None = None,
+        listing: DrawOrder | None = None,
+    ) -> SizeScores:
+        """Scores ``mesh`` likewise; drawn as a file with the order ``listing``."""
+        return SizeScores(self.scores, _scores(mesh, self.views, config, threads, listing))
 
 
 def converted(
@@ -140,10 +147,11 @@ def measure_baseline(
     *,
     threads: int | None = None,
     seconds: float | None = None,
+    listing: DrawOrder | None = None,
 ) -> Baseline:
     """Scores ``mesh``, the conversion of ``cloud``, in held-out views of ``dataset``, which are images of
     ``cloud``; in training views if none are held out. Of each size ``VIEWS``, or as few as take
-    ``seconds``."""
+    ``seconds``. ``listing``: the order of the file as which it is drawn."""
     views = _views(cloud, dataset, threads)
     used: dict[int, Sequence[View]] = dict.fromkeys(views, ())
     start, spent = time.perf_counter(), 0.0
@@ -154,7 +162,7 @@ def measure_baseline(
         for width, same in views.items():
             same[place].load()
             began = time.perf_counter()
-            scores[width].append(_psnr(mesh, same[place], config, threads))
+            scores[width].append(_psnr(mesh, same[place], config, threads, listing))
             spent += time.perf_counter() - began
             used[width] = same[: place + 1]
     means = {width: float(np.mean(found)) for width, found in scores.items()}
@@ -185,14 +193,20 @@ def _views(cloud: GaussianCloud, dataset: Dataset, threads: int | None) -> dict[
 
 
 def _scores(
-    mesh: SplatMesh, views: Mapping[int, Sequence[View]], config: FinetuneConfig, threads: int | None
+    mesh: SplatMesh,
+    views: Mapping[int, Sequence[View]],
+    config: FinetuneConfig,
+    threads: int | None,
+    listing: DrawOrder | None,
 ) -> dict[int, float]:
     return {
-        width: float(np.mean([_psnr(mesh, view, config, threads) for view in same]))
+        width: float(np.mean([_psnr(mesh, view, config, threads, listing) for view in same]))
         for width, same in views.items()
     }
 
 
-def _psnr(mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None) -> float:
-    images = images_of_view(mesh, view, samples=samples_of(view, config), threads=threads)
+def _psnr(
+    mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None, listing: DrawOrder | None
+) -> float:
+    images = images_of_view(mesh, view, samples=samples_of(view, config), threads=threads, listing=listing)
     return min(psnr(*images), 200.0)

@@ -201,6 +201,7 @@ def check_for_cells(config: FinetuneConfig) -> None:
         ("exposure", (False,)),
         ("opacity", ("blended",)),
         ("blending", ("mesh", "display")),
+        ("order", ("mesh", "fragment", "splat")),
     ):
         if getattr(config, name) not in possible:
             raise ValueError(f"{name} is for a whole scene, not for cells")

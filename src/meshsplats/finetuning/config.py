@@ -105,9 +105,10 @@ class FinetuneConfig:
     blending: Literal["mesh", "display", "linear"] = "mesh"
     """Colour space in which triangles are blended. mesh: that of the mesh. display: display values. linear:
     linear light, for exports to engines that light or blend in linear light."""
-    order: Literal["mesh", "fragment", "splat"] = "mesh"
+    order: Literal["mesh", "fragment", "splat", "file"] = "mesh"
     """Order in which triangles are blended. mesh: that of the mesh. fragment: exact at every sample, as ray
-    tracers draw. splat: whole splats by their centres, for programs that sort those; faster."""
+    tracers draw. splat: whole splats by their centres, for programs that sort those; faster. file: as a .glb
+    lists them, for web viewers and engines that sort nothing."""
     samples: Annotated[int | None, Range(1, 16)] = None
     """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
     photographs; 1 for images of a splat viewer (``Dataset.look``)."""
@@ -159,8 +160,10 @@ class FinetuneConfig:
         """ValueError for options that have no meaning, or were never tried, without blending."""
         if self.blending == "linear":
             raise ValueError("blending 'linear' is for opacity 'blended': opaque triangles are not blended")
-        if self.order == "splat":
-            raise ValueError("order 'splat' is for opacity 'blended': opaque triangles have a depth buffer")
+        if self.order in ("splat", "file"):
+            raise ValueError(
+                f"order {self.order!r} is for opacity 'blended': opaque triangles have a depth buffer"
+            )
         if self.expected_share and not self.l2_weight:
             raise ValueError("expected_share is a share of l2_weight, which is 0: set l2_weight, or it to 0")
         if self.opaque_share < 1 and self.anneal_share + self.settling > 1:
@@ -253,7 +256,7 @@ class FinetuneChanges(TypedDict, total=False):
     prune_epochs: float
     prune_opacity: float
     blending: Literal["mesh", "display", "linear"]
-    order: Literal["mesh", "fragment", "splat"]
+    order: Literal["mesh", "fragment", "splat", "file"]
     samples: int | None
     opacity: Literal["blended", "cutoff"]
     cutoff: float

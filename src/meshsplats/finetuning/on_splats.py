@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,11 +16,13 @@ from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
+from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.baseline import SHARES, SizeScores, converted, measure_baseline, partly
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import starting_mesh
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import available_memory
+from meshsplats.finetuning.ordered import finetune_ordered
 from meshsplats.finetuning.pace import (
     BRIEF_RATES,
     BRIEF_ZOOMS,
@@ -30,12 +33,14 @@ from meshsplats.finetuning.pace import (
     of_brief_run,
     worthwhile_steps,
 )
+from meshsplats.finetuning.phases.listed import check_for_file_order
 from meshsplats.finetuning.reports import SCORED_VIEWS, held_out_scores, scored_count
 from meshsplats.finetuning.run import RunOptions, finetune
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Device
+from meshsplats.rendering.ordering import VIEWS, default_views, drawing_order
 
 SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""
@@ -82,6 +87,34 @@ def as_bright_as(options: ConversionOptions, dataset: Dataset) -> ConversionOpti
     return replace(options, colors="view", sh_degree=degree) if degree else replace(options, colors="base")
 
 
+class Tuned(NamedTuple):
+    """The end of a run."""
+
+    mesh: SplatMesh
+    order: DrawOrder | None = None
+    """In which a file lists its triangles, of a run with order 'file'."""
+    sizes: SizeScores | None = None
+    """Of the conversion of splats and of the tuned mesh."""
+
+
+def tuned_as_configured(
+    mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, run: RunOptions, show: Display
+) -> Tuned:
+    """``finetune``, or with order 'file' ``finetune_ordered`` in an order that suits the training views."""
+    if config.order != "file":
+        return Tuned(finetune(mesh, dataset, config, run=run, on_progress=show))
+    show.phase("ordering triangles")
+    check_for_file_order(mesh, config)
+    order = drawing_order(mesh, [view.camera for view in dataset.train], threads=run.threads)
+    return Tuned(*finetune_ordered(mesh, order, dataset, config, run=run, on_progress=show))
+
+
+def check_order_of_file(config: FinetuneConfig, path: Path) -> None:
+    """ValueError if the order of triangles of a run is to be in a file, and that of ``path`` has none."""
+    if config.order == "file" and path.suffix.lower() != ".glb":
+        raise ValueError(f"order 'file' is for .glb files, which list triangles in an order, not {path.name}")
+
+
 class SplatTuning:
     """A run on images of splats that is ready to begin. Reads or makes the record of its start."""
 
@@ -99,12 +132,28 @@ class SplatTuning:
             self._cloud = simplify_in_blocks(run.cloud, self._record.max_splats, threads=run.threads)
         setup.phase(f"converting {len(self._cloud):,} splats")
         conversion = self._converted()
+        self._order = None
+        if self.config.order == "file":
+            setup.phase("ordering triangles")
+            conversion = conversion.plain  # as files have it
+            check_for_file_order(conversion, self.config)
+            # Views from all sides, too: around an object in its surroundings, none trains from below.
+            cameras = subsample([view.camera for view in self.dataset.train], VIEWS // 2)
+            around = subsample(default_views(conversion), VIEWS // 2)
+            self._order = drawing_order(conversion, [*cameras, *around], threads=run.threads)
         setup.phase("scoring the conversion")
         seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
         self._baseline = measure_baseline(
-            conversion, run.cloud, self.dataset, self.config, threads=run.threads, seconds=seconds
+            conversion,
+            run.cloud,
+            self.dataset,
+            self.config,
+            threads=run.threads,
+            seconds=seconds,
+            listing=self._order,
         )
-        self.mesh = conversion if self.is_brief else self._started()
+        self._begins_converted = self.is_brief or self._order is not None
+        self.mesh = conversion if self._begins_converted else self._started()
         """The mesh at the start."""
         self._saving = SAVE_SECONDS * len(self.mesh.faces)
         self.reserve = (2 if self.is_brief else 1) * self._baseline.seconds + self._saving
@@ -120,29 +169,35 @@ class SplatTuning:
         """Learning rates that differ from those of the configuration."""
         return {name: getattr(self.config, name) for name in BRIEF_RATES} if self.is_brief else {}
 
-    def optimise(self, options: RunOptions, show: Display) -> tuple[SplatMesh, SizeScores]:
-        """The tuned mesh, or the conversion where that is better at some size; and the scores of both."""
+    def optimise(self, options: RunOptions, show: Display) -> Tuned:
+        """The tuned mesh, or the conversion where that is better at some size."""
         run, baseline, config = self._run, self._baseline, self.config
         if not run.resumed:
             if not self._has_time():
-                return self.mesh, baseline.compared_with_itself()
+                return Tuned(self.mesh, self._order, baseline.compared_with_itself())
             self._record.save(run.folder)
-        tuned = finetune(self.mesh, self.dataset, config, run=options, on_progress=show)
+        order = self._order
+        if order is None:
+            tuned = finetune(self.mesh, self.dataset, config, run=options, on_progress=show)
+        else:
+            tuned, order = finetune_ordered(
+                self.mesh, order, self.dataset, config, run=options, on_progress=show
+            )
         show.phase("scoring the result")
-        sizes = baseline.compare(tuned, config, run.threads)
+        sizes = baseline.compare(tuned, config, run.threads, order)
         if not sizes.loses:
-            return tuned, sizes
-        for share in SHARES if self.is_brief else ():
+            return Tuned(tuned, order, sizes)
+        for share in SHARES if self._begins_converted else ():
             late = self._setup.spent + baseline.seconds + self._saving - (self._setup.seconds or np.inf)
             if late > OVERTIME:
                 break
             less = partly(self.mesh, tuned, share)
-            if less is not None and not (found := baseline.compare(less, config, run.threads)).loses:
-                log_scores(run.folder, less, self.dataset, config, run.threads)
-                return less, found
-        best = self.mesh if self.is_brief else self._converted()
-        log_scores(run.folder, best, self.dataset, config, run.threads)
-        return best, sizes
+            if less is not None and not (found := baseline.compare(less, config, run.threads, order)).loses:
+                log_scores(run.folder, less, self.dataset, config, run.threads, order)
+                return Tuned(less, order, found)
+        best = self.mesh if self._begins_converted else self._converted()
+        log_scores(run.folder, best, self.dataset, config, run.threads, self._order)
+        return Tuned(best, self._order, sizes)
 
     def _converted(self) -> SplatMesh:
         cameras = [view.camera for view in self.dataset.train]
@@ -212,15 +267,20 @@ class SplatTuning:
 
 
 def log_scores(
-    folder: Path, mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, threads: int | None = None
+    folder: Path,
+    mesh: SplatMesh,
+    dataset: Dataset,
+    config: FinetuneConfig,
+    threads: int | None = None,
+    listing: DrawOrder | None = None,
 ) -> None:
     """Logs the scores of ``mesh``, which is not that of the last step, on the held-out views in the journal
-    of the run in ``folder``."""
+    of the run in ``folder``; drawn as a file with the order ``listing``."""
     if not dataset.test:
         return
     journal = Journal(folder)
     views = subsample(dataset.test, scored_count(journal) or SCORED_VIEWS)
-    decibels, similarity = held_out_scores(mesh, views, config, threads)
+    decibels, similarity = held_out_scores(mesh, views, config, threads, listing=listing)
     lines = journal.metrics()
     if lines and lines[-1].get("psnr") == decibels:
         return  # of a run that had ended, resumed again

@@ -27,6 +27,7 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.engine import Device
+from meshsplats.rendering.ordering import drawing_order
 
 FEWEST_STEPS = 150
 """Steps that a run for opaque triangles should have."""
@@ -164,7 +165,8 @@ def measure_pace(
         view.load()
         times.append(time.perf_counter() - start)
     state = State.begin(mesh, len(views), config, threads, device=device)
-    phase = first_phase(config, mesh, state)
+    listing = drawing_order(mesh, quick=True) if config.order == "file" else None
+    phase = first_phase(config, mesh, state, listing=listing)
     steps = []
     for number in range(2):  # the first one allocates
         start = time.perf_counter()

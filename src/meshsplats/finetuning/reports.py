@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
@@ -54,33 +55,38 @@ class Reports:
         self._limited = config.minutes is None
         self.views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
 
-    def scores(self, mesh: SplatMesh) -> tuple[float, float]:
-        """Means of PSNR and SSIM over ``views``, of which there must be one."""
+    def scores(self, mesh: SplatMesh, listing: DrawOrder | None = None) -> tuple[float, float]:
+        """Means of PSNR and SSIM over ``views``, of which there must be one; drawn as a file with the order
+        ``listing``."""
         if not self._limited and len(self.views) > 1:
             self._limited = True
-            self._limit(mesh)
-        return self._of_views(mesh, self.views)
+            self._limit(mesh, listing)
+        return self._of_views(mesh, self.views, listing)
 
-    def _limit(self, mesh: SplatMesh) -> None:
+    def _limit(self, mesh: SplatMesh, listing: DrawOrder | None) -> None:
         """Leaves as many views as there is time for; all reports of a run have the same."""
         count, minutes = self._scored, self._config.minutes
         if count is None:
             assert minutes is not None
             start = time.perf_counter()
-            self._of_views(mesh, self.views[:1])
+            self._of_views(mesh, self.views[:1], listing)
             cost = time.perf_counter() - start
             count = int(REPORT_SHARE * 60 * minutes / cost) if cost > 0 else SCORED_VIEWS
             count = min(max(count, FEWEST_SCORED), SCORED_VIEWS)
         self.views = subsample(self._dataset.test, count)
 
-    def _of_views(self, mesh: SplatMesh, views: Sequence[View]) -> tuple[float, float]:
-        return held_out_scores(mesh, views, self._config, self._threads, self._device)
+    def _of_views(
+        self, mesh: SplatMesh, views: Sequence[View], listing: DrawOrder | None
+    ) -> tuple[float, float]:
+        return held_out_scores(mesh, views, self._config, self._threads, self._device, listing=listing)
 
-    def save_preview(self, journal: Journal, step: int, mesh: SplatMesh) -> None:
+    def save_preview(
+        self, journal: Journal, step: int, mesh: SplatMesh, listing: DrawOrder | None = None
+    ) -> None:
         view = (self.views or self._dataset.train)[0]
         samples = samples_of(view, self._config)
         image, target = images_of_view(
-            mesh, view, samples=samples, threads=self._threads, device=self._device
+            mesh, view, samples=samples, threads=self._threads, device=self._device, listing=listing
         )
         journal.save_preview(step, target, image)
 
@@ -97,12 +103,17 @@ def held_out_scores(
     config: FinetuneConfig,
     threads: int | None,
     device: Device = "cpu",
+    *,
+    listing: DrawOrder | None = None,
 ) -> tuple[float, float]:
-    """Means of PSNR, in dB and at most 200, and SSIM of ``mesh`` in ``views``, at least one."""
+    """Means of PSNR, in dB and at most 200, and SSIM of ``mesh`` in ``views``, at least one; drawn as a file
+    with the order ``listing``."""
     scores = []
     for view in views:
         samples = samples_of(view, config)
-        image, target = images_of_view(mesh, view, samples=samples, threads=threads, device=device)
+        image, target = images_of_view(
+            mesh, view, samples=samples, threads=threads, device=device, listing=listing
+        )
         decibels = min(psnr(image, target, mask=view.mask), 200.0)
         scores.append((decibels, masked_ssim(image, target, view.mask, threads)))
     mean_psnr, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))

@@ -16,6 +16,7 @@ from meshsplats._kinds import described, need, need_path
 from meshsplats._options import Range, check_options
 from meshsplats._origin import need_one_origin
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
+from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.checkpoint import (
     Checkpoint,
     OtherRunError,
@@ -156,30 +157,47 @@ def finetune(
             a run that starts, nothing was written. Or the GPU failed, or did not finish an image.
         Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
+    need(FinetuneConfig, config=config, optional=True)
+    config = with_changes(config or FinetuneConfig(), **changes)
+    if config.order == "file":
+        raise ValueError("order 'file' gives a mesh and the order of its triangles: call finetune_ordered")
+    if loss is not None:
+        _check_loss(loss, config, changes)
+    return ready_loop(mesh, dataset, config, run, frozen=frozen, loss=loss, on_progress=on_progress).run()
+
+
+def ready_loop(
+    mesh: SplatMesh,
+    dataset: Dataset,
+    config: FinetuneConfig,
+    run: RunOptions | None = None,
+    *,
+    frozen: np.ndarray | None = None,
+    loss: Loss | None = None,
+    listing: DrawOrder | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> TrainingLoop:
+    """The loop of a run, checked and begun or resumed. Arguments and errors as in ``finetune``; ``listing``:
+    of a run with order 'file', which needs one unless it is resumed."""
     need(SplatMesh, mesh=mesh)
     need(Dataset, dataset=dataset)
-    need(FinetuneConfig, config=config, optional=True)
     need(RunOptions, run=run, optional=True)
     need_one_origin({"mesh": mesh, "dataset": dataset})
-    config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
+    run = run or RunOptions()
     if not dataset.train:
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
         raise ValueError("the mesh has no triangles: there is nothing to fine-tune")
     if frozen is not None:
         frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
-    if loss is not None:
-        _check_loss(loss, config, changes)
     check_phases(config, mesh, engine(run.device, run.threads), frozen)
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     start = run_start(mesh, dataset, config, run, journal, frozen=frozen, loss=loss)
     clock = start.clock(run)
     resumed = clock.fraction if start.step else None
-    phase = first_phase(config, mesh, start.state, resumed=resumed, arrays=start.arrays)
-    loop = TrainingLoop(start, clock, phase, run, on_progress)
-    del start
-    return loop.run()
+    phase = first_phase(config, mesh, start.state, resumed=resumed, arrays=start.arrays, listing=listing)
+    return TrainingLoop(start, clock, phase, run, on_progress)
 
 
 def _check_loss(loss: Loss, config: FinetuneConfig, changes: Mapping[str, object]) -> None:
@@ -373,7 +391,7 @@ class TrainingLoop:
         loss = float(np.mean(self.losses)) if self.losses else None
         mean_ssim = None
         if self.reports.views:
-            self.held_out, mean_ssim = self.reports.scores(self.result())
+            self.held_out, mean_ssim = self.reports.scores(self.result(), self.phase.listing)
         if self.journal is not None:
             self.journal.log_metrics(
                 self.clock.step,
@@ -394,7 +412,8 @@ class TrainingLoop:
 
     def _save_preview(self) -> None:
         if self.journal is not None and self.options.preview_every:
-            self.reports.save_preview(self.journal, self.clock.step, self.result())
+            step, listing = self.clock.step, self.phase.listing
+            self.reports.save_preview(self.journal, step, self.result(), listing)
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()

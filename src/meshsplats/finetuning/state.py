@@ -424,7 +424,7 @@ class State:
 
 def order_of(mesh: SplatMesh, config: FinetuneConfig) -> Order:
     """The order in which the triangles of ``mesh`` are blended and optimised."""
-    if config.cuts:
+    if config.cuts or config.order == "file":
         return "fragment"
     return mesh.order if config.order == "mesh" else checked_order(config.order, mesh.face_splat)
 

@@ -11,6 +11,7 @@ import numpy as np
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
+from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
@@ -51,6 +52,8 @@ class Plan(NamedTuple):
     """Share of the expected error in the loss."""
     edges: float | None = None
     """Least opacity at which edges are visible and move positions; None: their motion does not count."""
+    listing: DrawOrder | None = None
+    """Order of a file in which triangles are blended; None: that of the mesh."""
 
 
 class Schedule(Protocol):
@@ -140,6 +143,7 @@ def tape_options(state: State, background: Sequence[float], plan: Plan) -> TapeO
         plan.samples,
         TRAINING_MIN_TRANSMITTANCE[blending],
         ramp=plan.ramp,
+        listing=plan.listing,
     )
 
 

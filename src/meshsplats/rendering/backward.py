@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._core import library, structures
+from meshsplats._core import kernels, library, structures
 from meshsplats.camera import Camera
+from meshsplats.draw_order import DrawOrder
 from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_cutoff
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options, mesh_struct
 from meshsplats.rendering.shading import Shading
@@ -72,6 +73,9 @@ class TapeOptions:
     """(4, 4) float64 world to camera, overrides that of the camera."""
     ramp: OpacityRamp | None = None
     """Changes opacities."""
+    listing: DrawOrder | None = None
+    """Blend as viewers do that cull and do not sort, from a file with this order; in place of the order of
+    the mesh."""
 
 
 class TapedRendering:
@@ -105,7 +109,7 @@ class TapedRendering:
         self._options = checked_options(keep, camera, options.background, options.samples, threads)
         self._options.min_transmittance = options.min_transmittance
         if ramp is not None:
-            if triangles.order == "splat":
+            if triangles.order == "splat" or options.listing is not None:
                 raise ValueError(
                     "a ramp stands in for a cutoff, and cut triangles are for a depth buffer: render with"
                     " order='fragment'"
@@ -120,7 +124,12 @@ class TapedRendering:
         self._camera = camera_struct(camera.with_near_plane(triangles.vertices, pose))
         if pose is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*pose[:3].ravel())
-        self._mesh = mesh_struct(keep, triangles._replace(normals=None))
+        triangles = triangles._replace(normals=None)
+        if options.listing is not None:
+            triangles = self._listed(triangles, options.listing, threads)
+        self._mesh = mesh_struct(keep, triangles)
+        if options.listing is not None:
+            self._mesh.by_splat = 2
         width = self._mesh.attribute_count
         h, w = camera.height, camera.width
         self.color = np.empty((h, w, 3), np.float32)
@@ -142,6 +151,18 @@ class TapedRendering:
                 ctypes.byref(self._tape),
             )
         self.fragments = int(image.fragments)
+
+    def _listed(self, triangles: Triangles, order: DrawOrder, threads: int | None) -> Triangles:
+        """``triangles`` as a viewer draws them, one after another."""
+        if 2 * len(triangles.faces) != len(order.copies):
+            raise ValueError(
+                f"the order is of {len(order.copies) // 2:,} triangles, the mesh has {len(triangles.faces):,}"
+            )
+        if triangles.filter_px2:
+            raise ValueError("viewers of files have no filter: an order of triangles needs filter_px2=0")
+        shown = (triangles.vertices, triangles.faces, triangles.face_splat)
+        faces, splats = kernels.listed_triangles(shown, (order.copies, order.starts), self._camera, threads)
+        return triangles._replace(faces=faces, face_splat=splats, depth_group=None, order="fragment")
 
     @property
     def vertex_count(self) -> int:

@@ -24,6 +24,7 @@ from meshsplats.webgpu.training import MAX_PIXELS, Parameters, Rates, Sums, Trai
 
 CANNOT: Mapping[Need, str] = {
     "cutoff": "opacity 'cutoff' needs device 'cpu': the GPU has no gradients for a cutoff",
+    "file order": "order 'file' needs device 'cpu': the GPU draws sorted fragments and splats alone",
 }
 """What is refused, and how."""
 RUN_BY_RUN: frozenset[Need] = frozenset(

@@ -10,9 +10,11 @@ import numpy as np
 from meshsplats._kinds import need
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.draw_order import DrawOrder
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import Rendering, render, render_splats
+from meshsplats.rendering.backward import TapedRendering, TapeOptions
 from meshsplats.rendering.engine import Device
 from meshsplats.rendering.samples import needed_samples
 
@@ -100,12 +102,18 @@ def image_of(
     max_layers: int | None = None,
     threads: int | None = None,
     device: Device = "cpu",
+    listing: DrawOrder | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(h, w, 3) display RGB over a display ``background``, and (h, w) alpha.
 
     The mesh is blended in its own space: one with linear colours in linear light, encoded for display
-    afterwards. The other arguments are those of ``render``.
+    afterwards. With ``listing``, a mesh for display blending is drawn as viewers draw a file with that order:
+    in its plain colours, all layers, by the processor. The other arguments are those of ``render``.
     """
+    if listing is not None:
+        options = TapeOptions(background, samples, listing=listing)
+        shown = TapedRendering(mesh.plain.triangles, camera, options, threads=threads, tape_bytes=None)
+        return shown.color, shown.alpha
     linear = mesh.blending == "linear"
     backdrop = srgb_to_linear(np.asarray(background)) if linear else background
     drawn = render(

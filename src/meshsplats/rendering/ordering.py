@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from meshsplats.draw_order import DrawOrder
 from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.core_arguments import camera_struct
+from meshsplats.rendering.looks import image_of
+from meshsplats.rendering.viewers import ordered_image
 
 VIEWS = 96
 """Largest number of views that an order is solved for."""
@@ -28,6 +31,12 @@ MAX_PAIRS = 24_000_000
 NODES = 8
 """Parts of a mesh by default."""
 MAX_NODES = 256
+FEW_NODES = (1, 2, 4)
+"""What 'auto' tries, besides ``NODES``."""
+NODE_LOSS = 0.5
+"""Largest loss in dB, of the images against sorted ones, for fewer nodes."""
+SCORED_VIEWS = 8
+"""Views in which it is measured."""
 ROUNDS = 12
 """Of k-means."""
 PLANES = 3
@@ -89,7 +98,7 @@ def drawing_order(
     mesh: SplatMesh,
     cameras: Sequence[Camera] | None = None,
     *,
-    nodes: int = NODES,
+    nodes: int | Literal["auto"] = NODES,
     quick: bool = False,
     threads: int | None = None,
 ) -> DrawOrder:
@@ -108,7 +117,9 @@ def drawing_order(
             default, all around it, from above and below, near and far.
         nodes: number of parts by place, which viewers sort by the middles of their bounds, 1 to
             ``MAX_NODES``; fewer if there are fewer splats. Each is a draw call, and a border where triangles
-            may be in the wrong order; but inside them, fewer pairs contradict each other.
+            may be in the wrong order; but inside them, fewer pairs contradict each other. 'auto': the fewest
+            of ``FEW_NODES`` and ``NODES`` that are within ``NODE_LOSS`` dB of the last, which takes up to
+            four times as long.
         quick: the order that is the start of the search: by how far outward of the middle a triangle lies
             along its normal. Seconds, and several dB worse.
         threads: at most this many; all processors by default. The result does not depend on it.
@@ -119,17 +130,47 @@ def drawing_order(
     need_all(Camera, optional=True, cameras=cameras)
     if not len(mesh.faces):
         raise ValueError("a mesh without triangles has no order")
-    if not (isinstance(nodes, (int, np.integer)) and 1 <= nodes <= MAX_NODES):
-        raise ValueError(f"nodes must be a number from 1 to {MAX_NODES}, got {nodes!r}")
+    if nodes != "auto" and not (isinstance(nodes, (int, np.integer)) and 1 <= nodes <= MAX_NODES):
+        raise ValueError(f"nodes must be a number from 1 to {MAX_NODES}, or 'auto', got {nodes!r}")
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
         raise ValueError(f"threads must be at least 1, got {threads!r}")
     if cameras is not None and not len(cameras):
         raise ValueError("cameras must hold a camera, or be None for views from all around")
+    views = default_views(mesh) if cameras is None else subsample(cameras, VIEWS)
     pieces = pieces_of(mesh)
-    node = _nodes(mesh, pieces, int(nodes))
+
+    def ordered(count: int) -> DrawOrder:
+        return _order(mesh, pieces, count, None if quick else views, threads)
+
+    if nodes != "auto":
+        return ordered(int(nodes))
+    # Other views than those that are solved for, where there are others.
+    scored = (
+        subsample(cameras, SCORED_VIEWS) if cameras else dome(mesh, SCORED_VIEWS, whole=True, distance=0.8)
+    )
+    scored = [camera.within(SIDE) for camera in scored]
+    plain = replace(mesh.plain, order="fragment", filter_px2=0)  # viewers have no filter
+    truths = [image_of(plain, camera, (1, 1, 1), threads=threads)[0] for camera in scored]
+
+    def score(order: DrawOrder) -> float:
+        """PSNR against sorted triangles."""
+        options: dict[str, Any] = {"multisample": False, "threads": threads}
+        images = [ordered_image(mesh, order, camera, **options) for camera in scored]
+        errors = [np.square(a - b, dtype=np.float64).mean() for a, b in zip(images, truths, strict=True)]
+        return float(-10 * np.log10(max(np.mean(errors), 1e-30)))
+
+    best = ordered(NODES)
+    least = score(best) - NODE_LOSS
+    return next((order for order in map(ordered, FEW_NODES) if score(order) >= least), best)
+
+
+def _order(
+    mesh: SplatMesh, pieces: Pieces, count: int, views: Sequence[Camera] | None, threads: int | None
+) -> DrawOrder:
+    """An order of ``count`` nodes, solved for ``views``; None: by the formula."""
+    node = _nodes(mesh, pieces, count)
     rank = _outward(mesh, pieces, node)
-    if not quick:
-        views = default_views(mesh) if cameras is None else subsample(cameras, VIEWS)
+    if views is not None:
         rank = solve(mesh, pieces, node, rank, views, threads).rank
     turned = pieces.turned.astype(np.int64)
     units = np.concatenate([2 * pieces.of_face + turned, 2 * pieces.of_face + 1 - turned])

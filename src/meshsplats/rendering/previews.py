@@ -6,6 +6,7 @@ import os
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.draw_order import DrawOrder
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_image
 from meshsplats.mesh import SplatMesh
@@ -28,10 +29,14 @@ def preview_camera(scene: SplatMesh | GaussianCloud) -> Camera:
 
 
 def save_preview(
-    scene: SplatMesh | GaussianCloud, path: str | os.PathLike[str], camera: Camera | None = None
+    scene: SplatMesh | GaussianCloud,
+    path: str | os.PathLike[str],
+    camera: Camera | None = None,
+    listing: DrawOrder | None = None,
 ) -> bool:
-    """Saves an image of ``scene`` from ``camera``, by default ``preview_camera``. Returns False, and saves
-    nothing, if it would have more than ``FRAGMENTS`` at an eighth of the size, too."""
+    """Saves an image of ``scene`` from ``camera``, by default ``preview_camera``; of a mesh as viewers draw a
+    file with the order ``listing``, where there is one. Returns False, and saves nothing, if it would have
+    more than ``FRAGMENTS`` at an eighth of the size, too."""
     camera = preview_camera(scene) if camera is None else camera
     samples = 1
     if isinstance(scene, SplatMesh):
@@ -43,7 +48,7 @@ def save_preview(
     if small is None:
         return False
     if isinstance(scene, SplatMesh):
-        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples)[0])
+        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples, listing=listing)[0])
     else:
         save_image(path, render_splats(scene, small).color)
     return True

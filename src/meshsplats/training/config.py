@@ -32,6 +32,7 @@ class TrainConfig(FinetuneConfig):
     blending: Annotated[
         Literal["mesh", "display", "linear"], Fixed("while training: fine-tune the result with another")
     ] = "mesh"
+    order: Literal["mesh", "fragment", "splat"] = "mesh"
     opacity_decay: float = 0.003
     epsilon: float = 1e-8
     """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a

@@ -37,6 +37,7 @@ class Growing:
     """
 
     usual = 0.0
+    listing = None
 
     def __init__(
         self, config: TrainConfig, start: SplatMesh, views: Sequence[View], fraction: float, cache_bytes: int

@@ -21,6 +21,7 @@ class Blended:
 
     config: FinetuneConfig
     usual: float = 0.0
+    listing: None = None
 
     def plan(self, view: View, step: int, fraction: float) -> Plan:
         points = uses_point_targets(view, self.config, fraction)

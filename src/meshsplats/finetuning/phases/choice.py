@@ -6,17 +6,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.checkpoint import reading_arrays
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.cutting import Cutting, check_for_cutoff
 from meshsplats.finetuning.phases.hybrid import Hybrid
+from meshsplats.finetuning.phases.listed import Listed, check_for_file_order
 from meshsplats.finetuning.phases.phase import Phase
 from meshsplats.finetuning.state import State
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Engine, Need
 
-PHASE_ARRAYS = ("color_limits",)
+PHASE_ARRAYS = ("color_limits", "listing.copies", "listing.starts")
 """Names of the arrays of all phases in a checkpoint (``Phase.arrays``)."""
 
 
@@ -25,10 +27,15 @@ def check_phases(
 ) -> None:
     """ValueError if a phase of the run is not for ``mesh``, ``frozen`` vertices or the ``engine``, whose own
     errors are those of ``Engine.check``."""
+    needs: tuple[Need, ...] = ("file order",) if config.order == "file" else ()
+    if needs:
+        engine.check(needs)
+        check_for_file_order(mesh, config)
+        return
     if not config.cuts:
         engine.check()
         return
-    needs: tuple[Need, ...] = ("cutoff",)
+    needs = ("cutoff",)
     engine.check(needs)
     check_for_cutoff(mesh, config, frozen)
 
@@ -40,6 +47,7 @@ def first_phase(
     *,
     resumed: float | None = None,
     arrays: Mapping[str, np.ndarray] | None = None,
+    listing: DrawOrder | None = None,
 ) -> Phase:
     """The phase in which a run begins, or goes on.
 
@@ -49,9 +57,16 @@ def first_phase(
         state: the state now.
         resumed: the fraction at which the run is resumed; None: it begins.
         arrays: of its checkpoint.
+        listing: for order 'file', the order in which it begins.
 
     Raises FileFormatError if these do not fit.
     """
+    if config.order == "file":
+        if resumed is None:
+            assert listing is not None
+            return Listed(config, listing)
+        with reading_arrays():
+            return Listed.resume(config, state, arrays or {})
     if not config.cuts:
         return Blended(config)
     if state.solid is None:

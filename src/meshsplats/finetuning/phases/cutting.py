@@ -43,6 +43,7 @@ class Cutting:
     """
 
     usual = 0.6
+    listing = None
 
     def __init__(self, config: FinetuneConfig, start: SplatMesh, resumed: float | None = None) -> None:
         self.config = config

@@ -24,6 +24,7 @@ class Hybrid:
     """
 
     usual = 1.0
+    listing = None
 
     def __init__(self, config: FinetuneConfig, limits: ColorLimits | None = None) -> None:
         self.config, self.limits = config, limits

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from meshsplats.datasets.views import View
+from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.clock import Clock
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.state import State
@@ -32,6 +33,10 @@ class Phase(Schedule, Protocol):
     @property
     def usual(self) -> float:
         """A fraction at which a step costs what most do."""
+
+    @property
+    def listing(self) -> DrawOrder | None:
+        """The order of a file in which the mesh is drawn; None: that of the mesh."""
 
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         """The training ``views``, as the next step sees them."""

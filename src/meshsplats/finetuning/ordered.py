@@ -1,0 +1,58 @@
+"""finetune_ordered: optimises a mesh through the order in which a file lists its triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from meshsplats._kinds import need
+from meshsplats.datasets.views import Dataset
+from meshsplats.draw_order import DrawOrder
+from meshsplats.finetuning.config import FinetuneConfig, with_changes
+from meshsplats.finetuning.run import Progress, RunOptions, ready_loop
+from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from meshsplats.finetuning.config import FinetuneChanges
+
+
+class OrderedMesh(NamedTuple):
+    """A mesh for viewers that do not sort: ``save_mesh(mesh, "scene.glb", order=order)``."""
+
+    mesh: SplatMesh
+    order: DrawOrder
+
+
+def finetune_ordered(
+    mesh: SplatMesh,
+    listing: DrawOrder,
+    dataset: Dataset,
+    config: FinetuneConfig | None = None,
+    *,
+    run: RunOptions | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    **changes: Unpack[FinetuneChanges],
+) -> OrderedMesh:
+    """Optimises ``mesh`` as ``finetune`` does, drawn as web viewers and engines draw a `.glb` with an order:
+    each triangle at its place in the list, where the side that it shows has it.
+
+    Args:
+        mesh: the mesh, with display blending and without a filter. Its colours are the plain ones, which do
+            not depend on the view: viewers know no others.
+        listing: the order, of ``drawing_order(mesh)``. It stays, but for triangles that are pruned.
+        dataset, config, run, on_progress, changes: as in ``finetune``; ``order`` is 'file'.
+
+    Raises as ``finetune``, and ValueError for the order of another mesh.
+    """
+    need(DrawOrder, listing=listing)
+    need(SplatMesh, mesh=mesh)
+    need(FinetuneConfig, config=config, optional=True)
+    listing.listed(mesh.faces)
+    changes["order"] = "file"
+    config = with_changes(config or FinetuneConfig(), **changes)
+    loop = ready_loop(mesh.plain, dataset, config, run, listing=listing, on_progress=on_progress)
+    tuned = loop.run()
+    assert loop.phase.listing is not None
+    return OrderedMesh(tuned, loop.phase.listing)
