@@ -4,9 +4,9 @@
     python benchmarks/view_dependence.py --data ../shared/data --splats capture.ply --steps 150
 
 PSNR of conversions against the splats with all their harmonics, look "area", in eight views from around, in
-both orders of blending; processor milliseconds of shading, and of a picture of 800 pixels with it; for sizes of
-files, see view_colors.py. With --steps also of a fine-tuning of that many steps, on views that it was not tuned on, and of what
-programs without harmonics then show (``plain``).
+both orders of blending; processor milliseconds of shading, and of a picture of 800 pixels with it. With
+--steps also of a fine-tuning of that many steps, on views that it was not tuned on, and of what programs
+without harmonics then show (``plain``). Sizes of files: view_colors.py.
 """
 
 from __future__ import annotations

@@ -216,7 +216,7 @@ def test_every_option_does_something():
         max_triangles=99,
         budget="drop",
         colors="mean",
-        sh_degree=1,
+        color_degree=1,
     )
     assert set(other) == {f.name for f in fields(ConversionOptions)}
     for name, value in other.items():

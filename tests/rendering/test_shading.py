@@ -187,15 +187,15 @@ def test_convert_keeps_what_the_file_has():
     assert mesh.colors[:, :3].max() > 1
     assert mesh.plain.colors.max() <= 1
     assert mesh.plain.harmonics is None
-    assert np.array_equal(convert(cloud, sh_degree=1).harmonics, mesh.harmonics[:, :3])
+    assert np.array_equal(convert(cloud, color_degree=1).harmonics, mesh.harmonics[:, :3])
     assert np.array_equal(mesh.of_degree(1).harmonics, mesh.harmonics[:, :3])
     plain = convert(cloud, colors="base")
     assert plain.harmonics is None
     assert np.array_equal(plain.colors, mesh.of_degree(0).colors)
     assert convert(replace(cloud, sh=cloud.sh[:, :1])).harmonics is None
     assert convert(cloud, preset="paper").harmonics is None
-    with pytest.raises(ValueError, match="sh_degree has no effect without colors"):
-        convert(cloud, colors="base", sh_degree=2)
+    with pytest.raises(ValueError, match="color_degree has no effect without colors"):
+        convert(cloud, colors="base", color_degree=2)
 
 
 def test_plain_colors_take_the_place_of_colors_in_other_programs():

@@ -25,7 +25,7 @@ def drawn_part(cloud: GaussianCloud, rows: np.ndarray, options: ConversionOption
     """The splats ``rows`` (k,) of ``cloud``, ascending, with the harmonics that the mesh depends on."""
     part = cloud if options.colors != "base" else cloud.of_degree(0)
     if options.colors == "view":
-        part = part.of_degree(min(part.sh_degree, options.sh_degree or 3))
+        part = part.of_degree(min(part.sh_degree, options.color_degree or 3))
     return part if len(rows) == len(cloud) else part.take(rows)
 
 

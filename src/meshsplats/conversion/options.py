@@ -104,7 +104,7 @@ class ConversionOptions:
     """view: as the splats, the mesh has colours that depend on the view, where the splats have spherical
     harmonics (``SplatMesh.harmonics``). mean: one colour, the mean of those that the cameras see. base: one
     colour, the part of degree 0. Programs that do not know the harmonics show the base colour of 'view'."""
-    sh_degree: Annotated[int | None, Range(1, 3), With(colors="view"), Advanced] = None
+    color_degree: Annotated[int | None, Range(1, 3), With(colors="view"), Advanced] = None
     """Degree of the spherical harmonics that 'view' keeps. Default: all that the splats have."""
 
     def resolved(self, preset: str, *, has_cameras: bool) -> ConversionOptions:
@@ -221,7 +221,7 @@ class ConversionChanges(TypedDict, total=False):
     max_triangles: int | None
     budget: Budget | None
     colors: Colors | None
-    sh_degree: int | None
+    color_degree: int | None
 
 
 def make_options(

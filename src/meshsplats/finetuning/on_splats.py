@@ -81,10 +81,10 @@ def as_bright_as(options: ConversionOptions, dataset: Dataset) -> ConversionOpti
     """``options`` with the harmonics that images of splats in ``dataset`` show, unless they name colours."""
     sources = [view.source for view in dataset.train if isinstance(view.source, RenderedSplats)]
     degrees = {source.sh_degree for source in sources}
-    if options.colors is not None or options.sh_degree is not None or degrees <= {None}:
+    if options.colors is not None or options.color_degree is not None or degrees <= {None}:
         return options
     degree = max(degree or 0 for degree in degrees)
-    return replace(options, colors="view", sh_degree=degree) if degree else replace(options, colors="base")
+    return replace(options, colors="view", color_degree=degree) if degree else replace(options, colors="base")
 
 
 class Tuned(NamedTuple):
