@@ -373,3 +373,58 @@ def gltf(accessors=None, spz_data=None, nodes=None, kind="glb", properties=None)
     data += b"\0" * (-len(data) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+# -- USD
+
+
+def usda(
+    values, up="Y", half=(), colors=None, xform="", degree=None, drop=(), prim="ParticleField3DGaussianSplat"
+):
+    """Text of a stage with one field, in the axes of ``values``. ``half``: attributes of half precision;
+    ``colors``: name of a colour space; ``xform``: lines of the prim above; ``drop``: attributes left out."""
+    n = len(values["x"])
+    sh = [[[float(values[f"f_dc_{c}"][i]) for c in range(3)], *rest(values, i).tolist()] for i in range(n)]
+    columns = {
+        "positions": ("point3f", "point3h", [tuple(float(values[k][i]) for k in "xyz") for i in range(n)]),
+        "orientations": ("quatf", "quath", [tuple(unit_quaternion(values, i)) for i in range(n)]),
+        "scales": (
+            *("float3", "half3"),
+            [tuple(np.exp(float(values[f"scale_{k}"][i])) for k in range(3)) for i in range(n)],
+        ),
+        "opacities": ("float", "half", [sigmoid(x) for x in values["opacity"]]),
+        "radiance:sphericalHarmonicsCoefficients": (
+            *("float3", "half3"),
+            [tuple(c) for splat in sh for c in splat],
+        ),
+    }
+    lines = []
+    for name, (kind, short, rows) in columns.items():
+        if name in drop:
+            continue
+        text = ", ".join(
+            repr(float(row)) if np.ndim(row) == 0 else "(" + ", ".join(repr(float(x)) for x in row) + ")"
+            for row in rows
+        )
+        lines.append(f"{short}[] {name}h = [{text}]" if name in half else f"{kind}[] {name} = [{text}]")
+    stated = int(len(sh[0]) ** 0.5) - 1 if degree is None else degree
+    lines.append(f"uniform int radiance:sphericalHarmonicsDegree = {stated}")
+    schemas = ""
+    if colors:
+        lines.append(f'uniform token colorSpace:name = "{colors}"')
+        schemas = '(prepend apiSchemas = ["ColorSpaceAPI"])'
+    body = "\n        ".join(lines)
+    return f"""#usda 1.0
+(
+    defaultPrim = "World"
+    upAxis = "{up}"
+)
+def Xform "World"
+{{
+    {xform}
+    def {prim} "Splats" {schemas}
+    {{
+        {body}
+    }}
+}}
+"""

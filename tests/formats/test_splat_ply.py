@@ -328,7 +328,7 @@ def test_2dgs_cloud_with_thick_splats_keeps_its_scales(tmp_path):
 def test_saving_refuses_what_cannot_be_read(tmp_path):
     cloud = make_cloud(3)
     with pytest.raises(ValueError, match=r"\.ply"):
-        save_gaussians(cloud, tmp_path / "a.spz")
+        save_gaussians(cloud, tmp_path / "a.xyz")
     with pytest.raises(ValueError, match="empty"):
         save_gaussians(cloud.take(np.zeros(3, bool)), tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []

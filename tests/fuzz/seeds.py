@@ -15,7 +15,8 @@ import _splat_encoders as encode
 import numpy as np
 from _splat_files import Table, random_splats, splat_table, write_ply
 
-from meshsplats import load_gaussians
+from meshsplats import load_gaussians, save_gaussians
+from meshsplats.formats.sniff import identify
 
 Change = Callable[[bytes], bytes]
 
@@ -87,6 +88,25 @@ def _zstandard_seeds() -> list[Seed]:
     return [Seed("spz-4", {"a.spz": whole}, "a.spz", inside)]
 
 
+def _usd_seeds() -> list[Seed]:
+    """USD, where usd-core is installed; and what of it is read without that: the tokens of a binary file."""
+    if importlib.util.find_spec("pxr") is None:
+        return []
+    text = encode.usda(_VALUES)
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a.usda").write_text(text)
+        cloud = load_gaussians(Path(folder) / "a.usda")
+        save_gaussians(cloud, Path(folder) / "a.usdc")
+        save_gaussians(cloud, Path(folder) / "a.usdz")
+        binary, package = ((Path(folder) / name).read_bytes() for name in ("a.usdc", "a.usdz"))
+    return [
+        Seed("usd-tokens", {"a.usdc": binary}, "a.usdc", load=identify),
+        Seed("splat-usda", {"a.usda": text.encode()}, "a.usda", slow=True),
+        Seed("splat-usdc", {"a.usdc": binary}, "a.usdc", slow=True),
+        Seed("splat-usdz", {"a.usdz": package}, "a.usdz", slow=True),
+    ]
+
+
 _VALUES = random_splats(9, degree=1)
 _SPZ = {version: encode.spz(_VALUES, version, extensions=bytes(8), flags=2) for version in (1, 2, 3)}
 _GLB = encode.gltf(encode.splat_accessors(_VALUES), nodes=[{"mesh": 0, "scale": [1, 2, 3]}])
@@ -115,4 +135,5 @@ SEEDS = [
     Seed("splat-glb", {"a.glb": _GLB}, "a.glb"),
     Seed("splat-gltf", {"a.gltf": encode.gltf(encode.splat_accessors(_VALUES), kind="gltf")}, "a.gltf"),
     Seed("spz-glb", {"a.glb": encode.gltf(spz_data=_SPZ[3])}, "a.glb"),
+    *_usd_seeds(),
 ]

@@ -25,7 +25,7 @@ from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.sniff import identify
-from meshsplats.formats.splat_formats import listed, y_up_suffixes
+from meshsplats.formats.splat_formats import listed, written_suffixes, y_up_suffixes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -400,7 +400,7 @@ def say_origin(found: np.ndarray, origin: Origin, *, splats: bool = False) -> No
     """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
     ``splats`` does not tell other programs."""
     if origin == "keep" and found.any():
-        splats_only = ", in a comment of the file: other programs see the splats around 0 0 0"
+        splats_only = ", in a note of the file: other programs see the splats of .ply and .sog around 0 0 0"
         say(f"origin: {in_words(found)}" + (splats_only if splats else "; --origin local leaves it out"))
     elif origin == "local" and found.any():
         say(f"origin: left out; coordinates are relative to {in_words(found)}")
@@ -498,6 +498,13 @@ def check_mesh_suffix(path: Path) -> None:
 
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
+
+
+def check_splat_endings(*kinds: str) -> None:
+    """Raises UsageError if no splats can be written to files that end in ``kinds``, without a dot."""
+    for kind in kinds:
+        if f".{kind}" not in written_suffixes():
+            raise UsageError(f"splats are written as {listed(written_suffixes())}, not as .{kind}")
 
 
 @contextmanager

@@ -194,8 +194,8 @@ def _without_splats(content: Content) -> Literal["mesh", "cameras"]:
 
 def _holds_arrays(content: Content) -> bool:
     """Whether a zip archive is an .npz."""
-    if content.path.suffix.lower() == ".usdz":  # its reader says what to do
-        return True
+    if content.path.suffix.lower() == ".usdz":
+        return not any(kind.reader.matches(content) for kind in splat_formats.FORMATS if kind.name == "usd")
     try:
         return any(name.endswith(".npy") for name in content.archive.names)
     except FileFormatError:
