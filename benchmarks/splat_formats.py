@@ -58,7 +58,8 @@ def main() -> None:
             report.table(
                 "format", "bytes a splat", "dB", "s", "theirs: bytes a splat", "dB", "s", "size ratio"
             )
-            cameras = ms.orbit(cloud, options.views, elevation=20, width=400, height=400)
+            place = {"elevation": 20, "width": 400, "height": 400}
+            cameras = ms.orbit(cloud, options.views, **place) if options.views else []
             truths = [ms.draw_splats(cloud, camera).color for camera in cameras]
             source = Path(folder) / "source.ply"
             ms.save_gaussians(replace(cloud, up=None), source)

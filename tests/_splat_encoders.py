@@ -117,6 +117,64 @@ def dot_splat(values):
     return data
 
 
+# -- .ksplat
+
+
+def ksplat(values, level=1, capacity=4, block=5.0, sections=1, limits=(-2.0, 2.0)):
+    """As the viewer GaussianSplats3D saves them: buckets of splats that lie in one cell of side ``block``,
+    those that are full first."""
+    n = len(values["x"])
+    bands = {0: 0, 9: 1, 24: 2, 45: 3}[sum(key.startswith("f_rest_") for key in values)]
+    heads, bodies = b"", b""
+    for part in np.array_split(np.arange(n), sections):
+        cells = {}
+        for i in part:
+            cells.setdefault(tuple(int(np.floor(float(values[k][i]) / block)) for k in "xyz"), []).append(i)
+        buckets = [
+            (cell, members[first : first + capacity])
+            for cell, members in cells.items()
+            for first in range(0, len(members), capacity)
+        ]
+        buckets.sort(key=lambda bucket: len(bucket[1]) < capacity)
+        full = sum(len(members) == capacity for _, members in buckets)
+        centers, records = b"", b""
+        for cell, members in buckets:
+            center = [(c + 0.5) * block for c in cell]
+            centers += struct.pack("<3f", *center)
+            for i in members:
+                place = [float(values[k][i]) for k in "xyz"]
+                scale = [np.exp(float(values[f"scale_{k}"][i])) for k in range(3)]
+                turn = unit_quaternion(values, i)
+                if level == 0:
+                    records += struct.pack("<3f3f4f", *place, *scale, *turn)
+                else:
+                    steps = [
+                        round((p - c) / (block / 2 / 32767)) + 32767
+                        for p, c in zip(place, center, strict=True)
+                    ]
+                    records += struct.pack("<3H3e4e", *steps, *scale, *turn)
+                rgb = [byte(255 * (0.5 + C0 * float(values[f"f_dc_{c}"][i]))) for c in range(3)]
+                records += bytes([*rgb, byte(255 * sigmoid(values["opacity"][i]))])
+                table = rest(values, i)
+                for band in range(1, bands + 1):
+                    for x in table[band * band - 1 : (band + 1) ** 2 - 1].T.ravel():
+                        low, high = limits
+                        share = byte(255 * (x - low) / (high - low))
+                        records += [struct.pack("<f", x), struct.pack("<e", x), bytes([share])][level]
+        sizes = b"".join(struct.pack("<I", len(members)) for _, members in buckets[full:])
+        if level == 0:
+            centers, sizes, count, stated, partials = b"", b"", 0, 0, 0
+        else:
+            count, stated, partials = len(buckets), full, len(buckets) - full
+        head = struct.pack(
+            "<4IfH2xI4xIIH", len(part), len(part), capacity, count, block, 12, 0, stated, partials, bands
+        )
+        heads += head.ljust(1024, b"\0")
+        bodies += sizes + centers + records
+    header = struct.pack("<BB2x4IH2x3fff", 0, 1, sections, sections, n, n, level, 0, 0, 0, *limits)
+    return header.ljust(4096, b"\0") + heads + bodies
+
+
 # -- SPZ
 
 

@@ -140,6 +140,7 @@ def test_the_first_format_that_matches_is_the_only_one(tmp_path):
     """But for compressed .ply and what the order of the table decides: names in JSON."""
     values = random_splats(9, degree=1)
     files = {
+        "ksplat": encode.ksplat(values),
         "splat": encode.dot_splat(values),
         "spz": encode.spz(values),
         "sog": encode.bundle(encode.sog(values)),
@@ -188,10 +189,11 @@ def test_every_written_format_has_its_writer_and_is_read_back(tmp_path):
 
 
 def test_the_documents_say_what_is_in_memory():
-    rows = table("docs/tiles.md", "`.ply` (binary, ASCII, gzipped), compressed `.ply`, `.splat`")
+    rows = table("docs/tiles.md", "`.ply` (binary, ASCII, gzipped), compressed `.ply`, `.splat`, `.ksplat`")
     told = {name.strip(): text for names, text in rows.items() for name in names.split(", ")}
     shown = {"ply": "gzipped)", "compressed.ply": "compressed `.ply`", "splat": "`.splat`", "gltf": "glTF"}
     shown |= {"spz": "SPZ", "sog": "SOG", "streamed sog": "streamed SOG", "usd": "USD"}
+    shown["ksplat"] = "`.ksplat`"
     assert {kind.name: told[shown[kind.name]] for kind in FORMATS} == {k.name: k.in_memory for k in FORMATS}
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -359,34 +356,24 @@ def test_commands_refuse_names_that_are_of_no_splats(tmp_path, capsys):
 # ---- Readers of others
 
 
-def node(tmp_path, package):
-    """Runs node with the packages that the tests need, which are no part of the project."""
-    place = os.environ.get("MESHSPLATS_NODE_FOLDER")
-    if not place or shutil.which("node") is None or not (Path(place) / "node_modules" / package).exists():
-        pytest.skip(
-            f"{package} is not here: npm install {package} in a folder, and name it in MESHSPLATS_NODE_FOLDER"
-        )
-
-    def run(*words):
-        done = subprocess.run(
-            ["node", *map(str, words)], cwd=place, capture_output=True, text=True, timeout=120
-        )
-        assert done.returncode == 0, done.stderr[-2000:]
-        return done.stdout
-
-    return run
+def node(folder, *words):
+    """What node prints, run in the ``folder`` of its packages."""
+    words = ["node", *map(str, words)]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
-def test_the_khronos_validator_finds_nothing_but_the_names_of_the_extension(tmp_path, degree):
-    run = node(tmp_path, "gltf-validator")
+def test_the_khronos_validator_finds_nothing_but_the_names_of_the_extension(tmp_path, node_package, degree):
+    folder = node_package("gltf-validator")
     script = (
         "const v = require('gltf-validator'), fs = require('fs');"
         "v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])))"
         ".then(r => console.log(JSON.stringify(r.issues)))"
     )
     ms.save_gaussians(cloud_of(50, degree, up=UP, origin=[5e5, 4.5e6, 0]), tmp_path / "a.glb")
-    issues = json.loads(run("-e", script, tmp_path / "a.glb"))
+    issues = json.loads(node(folder, "-e", script, tmp_path / "a.glb"))
     # Its release of 2024 does not know the extension, nor the names of attributes that it prescribes.
     known = {"UNSUPPORTED_EXTENSION", "MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     others = [issue for issue in issues["messages"] if issue["code"] not in known]
@@ -399,8 +386,8 @@ def test_the_khronos_validator_finds_nothing_but_the_names_of_the_extension(tmp_
 
 @pytest.mark.parametrize("name", ["a.compressed.ply", "a.splat", "a.spz", "b.spz", "a.sog"])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_splat_transform_reads_what_is_written(tmp_path, name, degree):
-    run = node(tmp_path, "@playcanvas/splat-transform")
+def test_splat_transform_reads_what_is_written(tmp_path, node_package, name, degree):
+    folder = node_package("@playcanvas/splat-transform")
     cloud = cloud_of(500, degree)
     options = {"spz_version": 4} if name == "b.spz" else {}
     if options:
@@ -408,8 +395,12 @@ def test_splat_transform_reads_what_is_written(tmp_path, name, degree):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # .splat leaves out harmonics
         mine = written(cloud, tmp_path / name, **options)
-    run(
-        "node_modules/@playcanvas/splat-transform/bin/cli.mjs", "-q", tmp_path / name, tmp_path / "theirs.ply"
+    node(
+        folder,
+        "node_modules/@playcanvas/splat-transform/bin/cli.mjs",
+        "-q",
+        tmp_path / name,
+        tmp_path / "theirs.ply",
     )
     theirs = paired(mine, ms.load_gaussians(tmp_path / "theirs.ply"))
     np.testing.assert_allclose(theirs.means, mine.means, atol=2e-6)

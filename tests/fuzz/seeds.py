@@ -125,6 +125,7 @@ SEEDS = [
     _moving_ply("ply-4d", "t", "scale_t_0", *(f"rot_r_{i}" for i in range(4))),
     _ply("ply-far", "binary_little_endian", 0, False, away=5e6),
     Seed("compressed-ply", {"a.ply": encode.compressed_ply(_VALUES)}, "a.ply"),
+    Seed("ksplat", {"a.ksplat": encode.ksplat(_VALUES, 1, sections=2)}, "a.ksplat"),
     Seed("splat", {"a.splat": encode.dot_splat(_VALUES)}, "a.splat"),
     *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", _in_gzip) for version, data in _SPZ.items()),
     *_zstandard_seeds(),

@@ -114,8 +114,6 @@ def _unread(content: Content) -> str:
             ".splatv files, of splats that move, are not read here; the .ply that they are made of is"
             " (Spacetime Gaussians)"
         )
-    if content.name.endswith(".ksplat"):
-        return f".ksplat files are not read here; {convert}"
     if text and (
         content.name.endswith((".lcc", ".lcc2")) or (b'"splats"' in text and b'"totalLevel"' in text)
     ):

@@ -89,6 +89,14 @@ FORMATS: tuple[SplatFormat, ...] = (
         written_as="`.compressed.ply`",
     ),
     SplatFormat(
+        "ksplat",
+        (".ksplat",),
+        "splats.ksplat",
+        "`.ksplat`",
+        "a block",
+        has_signature=False,
+    ),
+    SplatFormat(
         "splat",
         (".splat",),
         "splats.dot_splat",
