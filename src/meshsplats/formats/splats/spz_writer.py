@@ -28,7 +28,7 @@ _STEPS = 12
 """Steps of positions, at least, in the deviation that most splats exceed along their second axis."""
 _FIRST_BUCKET, _BUCKET = 8, 16
 """Steps of 1/128 in a step of harmonics of degree 1 and beyond."""
-_GZIP_LEVEL, _ZSTD_LEVEL = 6, 12
+_GZIP_LEVEL, _ZSTD_LEVEL = 4, 9
 
 
 def write_spz(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
