@@ -21,7 +21,6 @@ from meshsplats.formats.splats._quantising import (
     codebook,
     nearest_axes,
     nearest_entry,
-    smallest_three,
     sorted_in_space,
 )
 
@@ -234,9 +233,7 @@ def test_the_smallest_rotation_names_the_same_ellipsoid():
     np.testing.assert_allclose(covariances(same), covariances(cloud), rtol=1e-4, atol=1e-7)
     # The farthest rotation from all 24 of a cube is by 62.8 degrees.
     assert quaternions[:, 0].min() > np.cos(np.radians(62.9) / 2)
-    largest, small = smallest_three(quaternions)
-    assert (largest == 0).all()
-    np.testing.assert_array_equal(small, quaternions[:, 1:])
+    assert np.abs(quaternions[:, 1:]).max() < 0.39
 
 
 def test_a_codebook_is_near_the_best_one():

@@ -25,6 +25,7 @@ from meshsplats.cli.common import (
     File,
     Folder,
     Missing,
+    Number,
     Origin,
     Output,
     SplatOptions,
@@ -63,7 +64,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
 from meshsplats.formats.meshes import MESH_SUFFIXES
-from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats, splat_options
+from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats, scaled, splat_options
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
@@ -76,6 +77,7 @@ _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 _FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
     *("conversion", "reading", "origin", "json", "force", "skip_existing", "spz_version", "linear"),
+    *("up", "scale"),
 )
 """Options of the command that have one."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
@@ -135,6 +137,8 @@ class Convert(Command):
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
     file, else -y."""
+    scale: Number = None
+    """Factor for all lengths of the result, of meshes and splats: metres in an output unit, say."""
     lit: bool = False
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     smooth: bool = False
@@ -229,6 +233,10 @@ class Convert(Command):
             raise UsageError("give --force or --skip-existing, not both")
         if self.fidelity is not None and self.fidelity < 1:
             raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
+        if self.scale is not None and not 0 < self.scale < float("inf"):
+            raise ValueError(f"--scale must be a number above 0, got {self.scale}")
+        if self.up is not None:
+            parse_up(self.up)
         if self.stream:
             self._check_stream(kinds)
         if self.as_splats:
@@ -258,8 +266,6 @@ class Convert(Command):
             raise UsageError("give --cameras or --data, not both")
         if self.missing != "error" and self.data is None:
             raise UsageError("--missing has no effect without --data")
-        if self.up is not None:
-            parse_up(self.up)
         self._resolved(sources(self.input))  # checks the values before the work
 
     def resolved(self) -> dict[str, Any]:
@@ -400,8 +406,8 @@ class Convert(Command):
 
         if tuple(kinds) != ("ply",):
             raise UsageError("--stream writes .ply; for other programs, 'meshsplats tiles' makes .glb tiles")
-        if self.fidelity is not None or self.alpha not in ("auto", "blend"):
-            raise UsageError("--fidelity and --alpha need the whole mesh in memory: leave out --stream")
+        if self.fidelity is not None or self.alpha not in ("auto", "blend") or self.scale is not None:
+            raise UsageError("--fidelity, --alpha and --scale need all in memory: leave out --stream")
         refuse_whole(self._resolved(sources(self.input)))
 
     def _stream_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
@@ -443,10 +449,11 @@ class Convert(Command):
         if not count:
             raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
         kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
+        up = source.up if self.up is None else unit_up(parse_up(self.up))
         origin = source.origin if self.origin == "keep" else np.zeros(3)
         kept = (replace(block.take(worth_drawing(block, self.conversion)), origin=origin) for block in source)
         with self._recorded(job):
-            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=source.up)
+            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=up)
         seconds = round(time.perf_counter() - start, 4)
         return {"read": source.count, "written": count, "seconds": seconds}
 
@@ -513,7 +520,7 @@ class Convert(Command):
         choice = self._files.choice(mesh, job.outputs, cameras)
         order = self._files.order(mesh, job.outputs, cameras)
         chosen = time.perf_counter()
-        placed = written(mesh, self.origin)
+        placed = written(scaled(mesh, self.scale), self.origin)
         with self._recorded(job):
             self._files.save(placed, job.outputs, choice, order)
         comparing = "choose alpha" if order is None else "solve order"
@@ -553,7 +560,9 @@ class Convert(Command):
         from meshsplats.formats.gaussians import save_gaussians
 
         start = time.perf_counter()
-        cloud = self.reading.load(job.source)
+        cloud = self.reading.load(job.source, up=self.up)
+        if self.up is not None:
+            cloud = replace(cloud, up=unit_up(parse_up(self.up)))
         options = self.conversion
         merging, count = options.budget != "drop", options.max_splats
         kept = choose_splats(
@@ -565,7 +574,7 @@ class Convert(Command):
         if merging and count is not None:
             seen = _seen_from(cameras, job.source, kept.origin)
             kept = simplify(kept, count, cameras=seen or None)
-        result = written(kept, self.origin)
+        result = written(scaled(kept, self.scale), self.origin)
         with self._recorded(job):
             kinds = [written_ending(path.name) for path in job.outputs]
             taken = splat_options(kinds, spz_version=self.spz_version, linear=self.linear)
@@ -626,7 +635,7 @@ class Convert(Command):
         """The command that compares the mesh with the splats in its cameras, or one that renders it if only a
         part of them was converted."""
         folder, source = self.output.with_suffix(""), shown_path(self.input[0])
-        if self.conversion.crop is not None or source == "-":
+        if self.conversion.crop is not None or source == "-" or self.scale is not None:
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         words += ["--look", self._look] if self._look != "area" else []

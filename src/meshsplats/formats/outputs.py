@@ -5,8 +5,11 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
 
 from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
@@ -14,6 +17,10 @@ from meshsplats.errors import FileFormatError, OverwritingError
 from meshsplats.formats.meshes import MESH_SUFFIXES
 from meshsplats.formats.splat_formats import format_to_write, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+Scene = TypeVar("Scene", GaussianCloud, SplatMesh)
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
@@ -45,6 +52,18 @@ def splat_options(kinds: Sequence[str], **given: Any) -> list[dict[str, Any]]:
         if not any(name in options for options in taken):
             raise ValueError(f"{name} is for splats as {taken_by(name)}")
     return taken
+
+
+def scaled(scene: Scene, factor: float | None) -> Scene:
+    """``scene`` with all lengths, from the origin of the world on, times ``factor``; None: as it is.
+    ValueError for a mesh that is bound to a base mesh, whose lengths are those of the base."""
+    if factor is None:
+        return scene
+    if isinstance(scene, GaussianCloud):
+        return scene.transformed(np.eye(3) * factor)
+    if scene.binding is not None:
+        raise ValueError("a mesh prior has the lengths of its base mesh: scale the base and bind to that")
+    return replace(scene, vertices=scene.vertices * np.float32(factor), origin=scene.origin * factor)
 
 
 def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ import numpy as np
 from meshsplats.formats._activation import log_scales
 from meshsplats.formats.ply.header import origin_comments
 from meshsplats.formats.ply.notes import note_comments
-from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, smallest_three, sorted_in_space
+from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, sorted_in_space
 from meshsplats.formats.writing import FormatWriter, Writing
 from meshsplats.gaussians import SH_C0, GaussianCloud
 
@@ -83,10 +83,9 @@ def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """(n,) words: index of the largest of w, x, y, z, and the others in 10 bits each."""
-    largest, small = smallest_three(quaternions)
-    shares = np.clip(small / np.sqrt(2) + 0.5, 0, 1)
-    return largest.astype(np.uint32) << np.uint32(30) | _packed(shares, (10, 10, 10))
+    """(n,) words: 0, the index of the largest of w, x, y, z, and the others in 10 bits each."""
+    shares = quaternions[:, 1:] / np.float32(np.sqrt(2)) + np.float32(0.5)
+    return _packed(shares, (10, 10, 10))
 
 
 def _bytes_a_splat(coefficients: int) -> float:

@@ -22,7 +22,6 @@ from meshsplats.formats.splats._quantising import (
     codebook,
     nearest_axes,
     nearest_entry,
-    smallest_three,
     sorted_in_space,
 )
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
@@ -51,9 +50,9 @@ def write_sog(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     book = codebook(logs, weights)
     images["scales.webp"] = _image(nearest_entry(logs, book))
     meta["scales"] = {"codebook": _listed(book), "files": ["scales.webp"]}
-    largest, small = smallest_three(quaternions)
-    turns = as_bytes(127.5 + 127.5 * np.sqrt(2) * small)
-    images["quats.webp"] = _image(turns, (252 + largest).astype(np.uint8))
+    # x, y, z; that w is left out is told by 252 + its index.
+    turns = as_bytes(127.5 + 127.5 * np.sqrt(2) * quaternions[:, 1:])
+    images["quats.webp"] = _image(turns, np.full(len(turns), 252, np.uint8))
     meta["quats"] = {"files": ["quats.webp"]}
     book = codebook(cloud.sh[:, 0], weights)
     colors = nearest_entry(cloud.sh[:, 0], book)

@@ -18,7 +18,7 @@ import numpy as np
 from meshsplats.errors import DataWarning
 from meshsplats.formats._activation import log_scales
 from meshsplats.formats._orientation import HALF_TURN_X
-from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, smallest_three, sorted_in_space
+from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, sorted_in_space
 from meshsplats.formats.splats._spz_layout import ANTIALIASED, COLOR_SCALE, MAGIC, REST, zstandard_modules
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
 from meshsplats.gaussians import GaussianCloud
@@ -106,11 +106,11 @@ def _streams(cloud: GaussianCloud, bits: int) -> list[bytes]:
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """(n,) words: index of the largest of x, y, z, w, and the others in 9 bits and a sign each."""
-    largest, small = smallest_three(quaternions[:, [1, 2, 3, 0]])
+    """(n,) words: the index of w, the largest of x, y, z, w, and the others in 9 bits and a sign each."""
+    small = quaternions[:, 1:]
     sizes = np.minimum(np.rint(np.abs(small) * np.float32(np.sqrt(2) * 511)), 511).astype(np.uint32)
     fields = sizes | (small < 0).astype(np.uint32) << 9
-    words = largest.astype(np.uint32) << 30
+    words = np.full(len(small), 3 << 30, np.uint32)
     for i in range(3):
         words |= fields[:, i] << np.uint32(10 * (2 - i))
     return words.astype("<u4")
