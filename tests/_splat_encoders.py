@@ -433,6 +433,58 @@ def gltf(accessors=None, spz_data=None, nodes=None, kind="glb", properties=None)
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
+# -- LCC
+
+LCC_LIMITS = (0.0, 0.5), (-2.0, 2.0)
+
+
+def share(x, limits, most):
+    return round(float(np.clip((x - limits[0]) / (limits[1] - limits[0]), 0, 1)) * most)
+
+
+def lcc(values, cells=3, harmonics=True):
+    """The files of a scene of two levels, of which the second has a splat of each cell."""
+    n = len(values["x"])
+    data, harmonics_data, index = b"", b"", b""
+    for cell, part in enumerate(np.array_split(np.arange(n), cells)):
+        levels = b""
+        for members in (part, part[:1]):
+            levels += struct.pack("<iqi", len(members), len(data), 32 * len(members))
+            for i in members:
+                data += struct.pack("<3f", *(float(values[k][i]) for k in "xyz"))
+                data += bytes(byte(255 * (0.5 + C0 * float(values[f"f_dc_{c}"][i]))) for c in range(3))
+                data += bytes([byte(255 * sigmoid(values["opacity"][i]))])
+                scales = (np.exp(float(values[f"scale_{k}"][i])) for k in range(3))
+                data += struct.pack("<3H", *(share(s, LCC_LIMITS[0], 65535) for s in scales))
+                w, x, y, z = unit_quaternion(values, i)
+                largest, others = smallest_three(np.array([x, y, z, w]))
+                word = largest << 30
+                for k, c in enumerate(others):
+                    word |= round((c / np.sqrt(2) + 0.5) * 1023) << 10 * k
+                data += struct.pack("<I3H", word, 0, 0, 0)
+                for r, g, b in rest(values, i):
+                    codes = (
+                        share(r, LCC_LIMITS[1], 2047),
+                        share(g, LCC_LIMITS[1], 1023),
+                        share(b, LCC_LIMITS[1], 2047),
+                    )
+                    harmonics_data += struct.pack("<I", codes[0] | codes[1] << 11 | codes[2] << 21)
+                harmonics_data += bytes(4)
+        index += struct.pack("<hh", cell, 0) + levels
+    meta = {
+        "version": "5.0",
+        "totalLevel": 2,
+        "splats": [n, cells],
+        "fileType": "Quality" if harmonics else "Portable",
+        "attributes": [
+            {"name": "scale", "min": [LCC_LIMITS[0][0]] * 3, "max": [LCC_LIMITS[0][1]] * 3},
+            {"name": "shcoef", "min": [LCC_LIMITS[1][0]] * 3, "max": [LCC_LIMITS[1][1]] * 3},
+        ],
+    }
+    files = {"meta.lcc": json.dumps(meta).encode(), "index.bin": index, "data.bin": data}
+    return files | ({"shcoef.bin": harmonics_data} if harmonics else {})
+
+
 # -- USD
 
 

@@ -189,11 +189,13 @@ def test_every_written_format_has_its_writer_and_is_read_back(tmp_path):
 
 
 def test_the_documents_say_what_is_in_memory():
-    rows = table("docs/tiles.md", "`.ply` (binary, ASCII, gzipped), compressed `.ply`, `.splat`, `.ksplat`")
+    rows = table(
+        "docs/tiles.md", "`.ply` (binary, ASCII, gzipped), compressed `.ply`, `.splat`, `.ksplat`, LCC"
+    )
     told = {name.strip(): text for names, text in rows.items() for name in names.split(", ")}
     shown = {"ply": "gzipped)", "compressed.ply": "compressed `.ply`", "splat": "`.splat`", "gltf": "glTF"}
     shown |= {"spz": "SPZ", "sog": "SOG", "streamed sog": "streamed SOG", "usd": "USD"}
-    shown["ksplat"] = "`.ksplat`"
+    shown |= {"ksplat": "`.ksplat`", "lcc": "LCC"}
     assert {kind.name: told[shown[kind.name]] for kind in FORMATS} == {k.name: k.in_memory for k in FORMATS}
 
 

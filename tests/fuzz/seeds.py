@@ -133,6 +133,7 @@ SEEDS = [
     Seed("sog-folder", encode.sog(_VALUES), "."),
     Seed("sog-folder-1", encode.sog(_VALUES, version=1), "meta.json"),
     Seed("sog-streamed", _STREAMED, "."),
+    Seed("lcc", encode.lcc(random_splats(9, degree=3)), "meta.lcc"),
     Seed("splat-glb", {"a.glb": _GLB}, "a.glb"),
     Seed("splat-gltf", {"a.gltf": encode.gltf(encode.splat_accessors(_VALUES), kind="gltf")}, "a.gltf"),
     Seed("spz-glb", {"a.glb": encode.gltf(spz_data=_SPZ[3])}, "a.glb"),

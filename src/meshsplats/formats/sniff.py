@@ -114,10 +114,8 @@ def _unread(content: Content) -> str:
             ".splatv files, of splats that move, are not read here; the .ply that they are made of is"
             " (Spacetime Gaussians)"
         )
-    if text and (
-        content.name.endswith((".lcc", ".lcc2")) or (b'"splats"' in text and b'"totalLevel"' in text)
-    ):
-        return f".lcc scenes are not read here; {convert}"
+    if text and content.name.endswith((".lcc", ".lcc2")):
+        return f"LCC2 scenes are not read here; {convert}"
     return ""
 
 

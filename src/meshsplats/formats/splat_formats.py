@@ -140,6 +140,14 @@ FORMATS: tuple[SplatFormat, ...] = (
         folder_file="lod-meta.json",
     ),
     SplatFormat(
+        "lcc",
+        (".lcc",),
+        "splats.lcc",
+        "LCC of XGRIDS (the finest level)",
+        "a block",
+        folder_file="meta.lcc",
+    ),
+    SplatFormat(
         "gltf",
         (".glb", ".gltf"),
         "gltf.splats",
