@@ -116,6 +116,7 @@ def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
             f" {_listed([e.name for e in header.elements])})"
         )
     columns = _Columns(element, header, where)
+    _warn_of_beta(element.names, where)
     table = FloatTable(file, header, element, columns.needed, where)
     kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
     if len(columns.scale) == 2:
@@ -139,6 +140,22 @@ def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
         linear=is_linear(file, header, where),
         instant=instant,
     )
+
+
+def _warn_of_beta(names: Sequence[str], where: object) -> None:
+    """A DataWarning for columns of Deformable Beta Splatting that change the image and are not read."""
+    told = {
+        "colours that depend on the view (sb_params_*)": any(name.startswith("sb_params_") for name in names),
+        "kernels other than Gaussians (beta)": "beta" in names,
+    }
+    lost = [what for what, there in told.items() if there]
+    if lost:
+        warnings.warn(
+            f"{where}: Beta splats: {' and '.join(lost)} are left out; images are those of Gaussians with the"
+            " colours of f_dc, which were not trained as such",
+            DataWarning,
+            stacklevel=4,
+        )
 
 
 def _motion(content: Content) -> tuple[str, float, float] | None:
