@@ -117,6 +117,64 @@ def dot_splat(values):
     return data
 
 
+# -- .ksplat
+
+
+def ksplat(values, level=1, capacity=4, block=5.0, sections=1, limits=(-2.0, 2.0)):
+    """As the viewer GaussianSplats3D saves them: buckets of splats that lie in one cell of side ``block``,
+    those that are full first."""
+    n = len(values["x"])
+    bands = {0: 0, 9: 1, 24: 2, 45: 3}[sum(key.startswith("f_rest_") for key in values)]
+    heads, bodies = b"", b""
+    for part in np.array_split(np.arange(n), sections):
+        cells = {}
+        for i in part:
+            cells.setdefault(tuple(int(np.floor(float(values[k][i]) / block)) for k in "xyz"), []).append(i)
+        buckets = [
+            (cell, members[first : first + capacity])
+            for cell, members in cells.items()
+            for first in range(0, len(members), capacity)
+        ]
+        buckets.sort(key=lambda bucket: len(bucket[1]) < capacity)
+        full = sum(len(members) == capacity for _, members in buckets)
+        centers, records = b"", b""
+        for cell, members in buckets:
+            center = [(c + 0.5) * block for c in cell]
+            centers += struct.pack("<3f", *center)
+            for i in members:
+                place = [float(values[k][i]) for k in "xyz"]
+                scale = [np.exp(float(values[f"scale_{k}"][i])) for k in range(3)]
+                turn = unit_quaternion(values, i)
+                if level == 0:
+                    records += struct.pack("<3f3f4f", *place, *scale, *turn)
+                else:
+                    steps = [
+                        round((p - c) / (block / 2 / 32767)) + 32767
+                        for p, c in zip(place, center, strict=True)
+                    ]
+                    records += struct.pack("<3H3e4e", *steps, *scale, *turn)
+                rgb = [byte(255 * (0.5 + C0 * float(values[f"f_dc_{c}"][i]))) for c in range(3)]
+                records += bytes([*rgb, byte(255 * sigmoid(values["opacity"][i]))])
+                table = rest(values, i)
+                for band in range(1, bands + 1):
+                    for x in table[band * band - 1 : (band + 1) ** 2 - 1].T.ravel():
+                        low, high = limits
+                        share = byte(255 * (x - low) / (high - low))
+                        records += [struct.pack("<f", x), struct.pack("<e", x), bytes([share])][level]
+        sizes = b"".join(struct.pack("<I", len(members)) for _, members in buckets[full:])
+        if level == 0:
+            centers, sizes, count, stated, partials = b"", b"", 0, 0, 0
+        else:
+            count, stated, partials = len(buckets), full, len(buckets) - full
+        head = struct.pack(
+            "<4IfH2xI4xIIH", len(part), len(part), capacity, count, block, 12, 0, stated, partials, bands
+        )
+        heads += head.ljust(1024, b"\0")
+        bodies += sizes + centers + records
+    header = struct.pack("<BB2x4IH2x3fff", 0, 1, sections, sections, n, n, level, 0, 0, 0, *limits)
+    return header.ljust(4096, b"\0") + heads + bodies
+
+
 # -- SPZ
 
 
@@ -373,3 +431,110 @@ def gltf(accessors=None, spz_data=None, nodes=None, kind="glb", properties=None)
     data += b"\0" * (-len(data) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+# -- LCC
+
+LCC_LIMITS = (0.0, 0.5), (-2.0, 2.0)
+
+
+def share(x, limits, most):
+    return round(float(np.clip((x - limits[0]) / (limits[1] - limits[0]), 0, 1)) * most)
+
+
+def lcc(values, cells=3, harmonics=True):
+    """The files of a scene of two levels, of which the second has a splat of each cell."""
+    n = len(values["x"])
+    data, harmonics_data, index = b"", b"", b""
+    for cell, part in enumerate(np.array_split(np.arange(n), cells)):
+        levels = b""
+        for members in (part, part[:1]):
+            levels += struct.pack("<iqi", len(members), len(data), 32 * len(members))
+            for i in members:
+                data += struct.pack("<3f", *(float(values[k][i]) for k in "xyz"))
+                data += bytes(byte(255 * (0.5 + C0 * float(values[f"f_dc_{c}"][i]))) for c in range(3))
+                data += bytes([byte(255 * sigmoid(values["opacity"][i]))])
+                scales = (np.exp(float(values[f"scale_{k}"][i])) for k in range(3))
+                data += struct.pack("<3H", *(share(s, LCC_LIMITS[0], 65535) for s in scales))
+                w, x, y, z = unit_quaternion(values, i)
+                largest, others = smallest_three(np.array([x, y, z, w]))
+                word = largest << 30
+                for k, c in enumerate(others):
+                    word |= round((c / np.sqrt(2) + 0.5) * 1023) << 10 * k
+                data += struct.pack("<I3H", word, 0, 0, 0)
+                for r, g, b in rest(values, i):
+                    codes = (
+                        share(r, LCC_LIMITS[1], 2047),
+                        share(g, LCC_LIMITS[1], 1023),
+                        share(b, LCC_LIMITS[1], 2047),
+                    )
+                    harmonics_data += struct.pack("<I", codes[0] | codes[1] << 11 | codes[2] << 21)
+                harmonics_data += bytes(4)
+        index += struct.pack("<hh", cell, 0) + levels
+    meta = {
+        "version": "5.0",
+        "totalLevel": 2,
+        "splats": [n, cells],
+        "fileType": "Quality" if harmonics else "Portable",
+        "attributes": [
+            {"name": "scale", "min": [LCC_LIMITS[0][0]] * 3, "max": [LCC_LIMITS[0][1]] * 3},
+            {"name": "shcoef", "min": [LCC_LIMITS[1][0]] * 3, "max": [LCC_LIMITS[1][1]] * 3},
+        ],
+    }
+    files = {"meta.lcc": json.dumps(meta).encode(), "index.bin": index, "data.bin": data}
+    return files | ({"shcoef.bin": harmonics_data} if harmonics else {})
+
+
+# -- USD
+
+
+def usda(
+    values, up="Y", half=(), colors=None, xform="", degree=None, drop=(), prim="ParticleField3DGaussianSplat"
+):
+    """Text of a stage with one field, in the axes of ``values``. ``half``: attributes of half precision;
+    ``colors``: name of a colour space; ``xform``: lines of the prim above; ``drop``: attributes left out."""
+    n = len(values["x"])
+    sh = [[[float(values[f"f_dc_{c}"][i]) for c in range(3)], *rest(values, i).tolist()] for i in range(n)]
+    columns = {
+        "positions": ("point3f", "point3h", [tuple(float(values[k][i]) for k in "xyz") for i in range(n)]),
+        "orientations": ("quatf", "quath", [tuple(unit_quaternion(values, i)) for i in range(n)]),
+        "scales": (
+            *("float3", "half3"),
+            [tuple(np.exp(float(values[f"scale_{k}"][i])) for k in range(3)) for i in range(n)],
+        ),
+        "opacities": ("float", "half", [sigmoid(x) for x in values["opacity"]]),
+        "radiance:sphericalHarmonicsCoefficients": (
+            *("float3", "half3"),
+            [tuple(c) for splat in sh for c in splat],
+        ),
+    }
+    lines = []
+    for name, (kind, short, rows) in columns.items():
+        if name in drop:
+            continue
+        text = ", ".join(
+            repr(float(row)) if np.ndim(row) == 0 else "(" + ", ".join(repr(float(x)) for x in row) + ")"
+            for row in rows
+        )
+        lines.append(f"{short}[] {name}h = [{text}]" if name in half else f"{kind}[] {name} = [{text}]")
+    stated = int(len(sh[0]) ** 0.5) - 1 if degree is None else degree
+    lines.append(f"uniform int radiance:sphericalHarmonicsDegree = {stated}")
+    schemas = ""
+    if colors:
+        lines.append(f'uniform token colorSpace:name = "{colors}"')
+        schemas = '(prepend apiSchemas = ["ColorSpaceAPI"])'
+    body = "\n        ".join(lines)
+    return f"""#usda 1.0
+(
+    defaultPrim = "World"
+    upAxis = "{up}"
+)
+def Xform "World"
+{{
+    {xform}
+    def {prim} "Splats" {schemas}
+    {{
+        {body}
+    }}
+}}
+"""

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,6 +31,21 @@ def shared_data(path: str) -> Path:
     found = SHARED / path
     if not found.exists():
         pytest.skip(f"real data not here: {found} (set MESHSPLATS_SHARED_DATA to its folder)")
+    return found
+
+
+@pytest.fixture
+def node_package() -> Callable[[str], Path]:
+    """Gives the folder where a package of npm is installed, which no test installs itself."""
+
+    def found(name: str) -> Path:
+        folder = os.environ.get("MESHSPLATS_NODE_FOLDER")
+        if not folder or shutil.which("node") is None or not (Path(folder) / "node_modules" / name).exists():
+            pytest.skip(
+                f"{name} is not here: npm install {name} in a folder, and name it in MESHSPLATS_NODE_FOLDER"
+            )
+        return Path(folder)
+
     return found
 
 

@@ -12,7 +12,7 @@ ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 13
 LOWEST = (
     *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options", "_origin"),
-    *("_toml", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
+    *("_toml", "_words", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
 )
 """Rooms that import no other room."""
 FLOORS = (

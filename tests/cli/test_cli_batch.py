@@ -104,7 +104,7 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
         (["scans/empty", "-o", "out"], 1, "a folder without splats"),
         (["scans/none.ply", "scans/a.ply", "-o", "no/out"], 1, "no"),
         (["scans", "-o", "out", "--lit", "--formats", "npz"], 2, "--lit is for .glb"),
-        (["scans", "-o", "out", "--as-splats", "--formats", "glb"], 2, "--as-splats writes .ply"),
+        (["scans", "-o", "out", "--as-splats", "--formats", "obj"], 2, "splats are written as .ply"),
         (["scans", "-o", "out", "--set", "sides=2"], 1, "sides"),
         (["-", "-", "-o", "out"], 2, "can be read once"),
         (["scans/a.ply", "-o", "-"], 2, "-o must end in"),

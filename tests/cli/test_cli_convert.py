@@ -287,7 +287,7 @@ def test_splats_as_splats(splats, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("name", "options", "printed"),
     [
-        ("a.glb", [], "--as-splats writes .ply"),
+        ("a.obj", [], "splats are written as .ply"),
         ("a.ply", ["--lit"], "--lit: for a mesh"),
         ("a.ply", ["--data", "nowhere"], "--data: for a mesh"),
         ("a.ply", ["--data", "nowhere", "--max-splats", "3", "--set", "budget=drop"], "--data: for a mesh"),

@@ -381,7 +381,10 @@ def test_levels_and_tiles_without_an_origin(scenes):
 def test_splats_say_what_other_programs_see(scenes, capsys):
     _, far = scenes
     assert far.run("convert splats.ply -o note.ply --as-splats --no-sidecar") == 0
-    assert "in a comment of the file: other programs see the splats around 0 0 0" in capsys.readouterr().err
+    assert (
+        "in a note of the file: other programs see the splats of .ply and .sog around 0 0 0"
+        in capsys.readouterr().err
+    )
 
 
 def test_info_is_in_the_world(scenes, capsys):

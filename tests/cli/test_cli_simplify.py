@@ -79,8 +79,8 @@ def test_wrong_options(splats, tmp_path, capsys, options, printed):
 
 
 def test_outputs_and_inputs(splats, tmp_path, capsys):
-    assert run(splats, "-o", tmp_path / "small.glb", "--count", 3) == 2
-    assert "-o must end in .ply" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "small.obj", "--count", 3) == 2
+    assert "splats are written as .ply" in capsys.readouterr().err
     assert run(splats, "-o", splats, "--count", 3, "--force") == 2
     assert "is read by this command" in capsys.readouterr().err
     (tmp_path / "small.ply.config.toml").write_text("mine")

@@ -53,8 +53,8 @@ def test_the_file_is_the_same(splats, tmp_path, capsys, options):
     ("options", "message"),
     [
         (["-o", "a.glb"], "--stream writes .ply"),
-        (["-o", "a.ply", "--fidelity", "2"], "need the whole mesh in memory"),
-        (["-o", "a.ply", "--alpha", "opaque"], "need the whole mesh in memory"),
+        (["-o", "a.ply", "--fidelity", "2"], "need all in memory"),
+        (["-o", "a.ply", "--alpha", "opaque"], "need all in memory"),
         (["-o", "a.ply", "--max-triangles", "900"], "limits on splats or triangles"),
         (["-o", "a.ply", "--as-splats", "--max-splats", "9"], "limits on splats or triangles"),
     ],

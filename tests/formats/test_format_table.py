@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import types
+import warnings
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ import _splat_encoders as encode
 import numpy as np
 import pytest
 from _splat_files import random_splats
+from _splats import few_splats
 
 import meshsplats as ms
 from meshsplats.cli import main
@@ -138,6 +140,7 @@ def test_the_first_format_that_matches_is_the_only_one(tmp_path):
     """But for compressed .ply and what the order of the table decides: names in JSON."""
     values = random_splats(9, degree=1)
     files = {
+        "ksplat": encode.ksplat(values),
         "splat": encode.dot_splat(values),
         "spz": encode.spz(values),
         "sog": encode.bundle(encode.sog(values)),
@@ -166,11 +169,33 @@ def test_the_table_in_the_readme_is_that_of_the_formats():
     assert table("docs/files.md", "splats")["splats"] == read
 
 
+def test_the_table_in_the_documents_says_what_is_written():
+    rows = re.findall(r"(?m)^\| splats \| .* \| ([^|]+?) \|$", (ROOT / "docs/files.md").read_text("utf-8"))
+    assert rows == ["; ".join(kind.written_as for kind in FORMATS if kind.written)]
+
+
+def test_every_written_format_has_its_writer_and_is_read_back(tmp_path):
+    cloud = few_splats()
+    for kind in FORMATS:
+        assert bool(kind.writer_module) == bool(kind.written) == bool(kind.written_as), kind.name
+        for suffix in kind.written:
+            if kind.name == "usd":
+                pytest.importorskip("pxr")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of harmonics that .splat leaves out
+                ms.save_gaussians(cloud, tmp_path / f"a{suffix}")
+            assert format_of(tmp_path / f"a{suffix}") == kind.name
+            assert len(ms.load_gaussians(tmp_path / f"a{suffix}")) == len(cloud)
+
+
 def test_the_documents_say_what_is_in_memory():
-    rows = table("docs/tiles.md", "`.ply` (binary, ASCII, gzipped), compressed `.ply`, `.splat`")
+    rows = table(
+        "docs/tiles.md", "`.ply` (binary, ASCII, gzipped), compressed `.ply`, `.splat`, `.ksplat`, LCC"
+    )
     told = {name.strip(): text for names, text in rows.items() for name in names.split(", ")}
     shown = {"ply": "gzipped)", "compressed.ply": "compressed `.ply`", "splat": "`.splat`", "gltf": "glTF"}
-    shown |= {"spz": "SPZ", "sog": "SOG", "streamed sog": "streamed SOG"}
+    shown |= {"spz": "SPZ", "sog": "SOG", "streamed sog": "streamed SOG", "usd": "USD"}
+    shown |= {"ksplat": "`.ksplat`", "lcc": "LCC"}
     assert {kind.name: told[shown[kind.name]] for kind in FORMATS} == {k.name: k.in_memory for k in FORMATS}
 
 

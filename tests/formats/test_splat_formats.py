@@ -467,8 +467,7 @@ def test_gltf_joins_the_splats_of_all_nodes(tmp_path):
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
-        ("a.ksplat", b"\0\1" + bytes(5000), "splat-transform a.ksplat a.ply"),
-        ("a.lcc", b'{"version": "5.0", "splats": 10, "totalLevel": 3}', "splat-transform a.lcc a.ply"),
+        ("a.lcc2", b'{"version": "5.0", "splats": 10, "totalLevel": 3}', "splat-transform a.lcc2 a.ply"),
         ("a.splatv", b"\x4b\x67\0\0\x02\0\0\0{}" + bytes(64), "splats that move, are not read here"),
         ("cut.splat", bytes(33), "not records of 32 bytes"),
         ("a.ply.gz", b"\x1f\x8b\x08" + bytes(40), "a gzip file, but not SPZ; unpack it first"),

@@ -328,7 +328,7 @@ def test_2dgs_cloud_with_thick_splats_keeps_its_scales(tmp_path):
 def test_saving_refuses_what_cannot_be_read(tmp_path):
     cloud = make_cloud(3)
     with pytest.raises(ValueError, match=r"\.ply"):
-        save_gaussians(cloud, tmp_path / "a.spz")
+        save_gaussians(cloud, tmp_path / "a.xyz")
     with pytest.raises(ValueError, match="empty"):
         save_gaussians(cloud.take(np.zeros(3, bool)), tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
@@ -373,3 +373,20 @@ def test_zero_padded_harmonics_change_nothing():
     assert (padded.sh[:, 9:] == 0).all()
     np.testing.assert_array_equal(padded.means, short.means)
     np.testing.assert_allclose(padded.opacities, short.opacities, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (("sb_params_0", "sb_params_5"), r"Beta splats: colours .* \(sb_params_\*\) are left out"),
+        (("beta",), r"Beta splats: kernels other than Gaussians \(beta\) are left out"),
+    ],
+)
+def test_columns_of_beta_splats_are_named(tmp_path, columns, message):
+    values = random_splats(5, degree=0)
+    plain = write_ply(tmp_path / "a.ply", [splat_table(values)])
+    beta = write_ply(tmp_path / "b.ply", [splat_table(values | {name: values["x"] for name in columns})])
+    expected = load_gaussians(plain)
+    with pytest.warns(DataWarning, match=message):
+        cloud = load_gaussians(beta)
+    np.testing.assert_array_equal(cloud.sh, expected.sh)

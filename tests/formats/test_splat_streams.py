@@ -304,7 +304,7 @@ def test_blocks_are_written_as_the_whole(tmp_path):
         with pytest.raises(ValueError, match=f"500 splats came for a file of {count}"):
             save_gaussian_blocks(parts, tmp_path / "new.ply", count, degree=3)
     assert not (tmp_path / "new.ply").exists()
-    with pytest.raises(ValueError, match=r"written as \.ply"):
+    with pytest.raises(ValueError, match=r"written as float \.ply"):
         save_gaussian_blocks(parts, tmp_path / "new.spz", 500)
     with pytest.raises(ValueError, match="degree 0 to 3"):
         save_gaussian_blocks(parts, tmp_path / "new.ply", 500, degree=4)

@@ -14,7 +14,7 @@ from _meshes import assert_same, random_mesh
 from meshsplats import DataWarning, FileFormatError, MissingDependencyError, load_mesh, save_mesh
 from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.usd import reader as usd_reader
-from meshsplats.formats.usd.extraction import extract
+from meshsplats.formats.usd.extraction import checked, extract_meshes
 
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed")
 COLOR = ' color3f[] primvars:displayColor = [(0.5, 0, 1)] (interpolation = "constant")'
@@ -36,7 +36,7 @@ def shape(name: str = "M", more: str = "", points: str = "(0, 0, 0), (1, 0, 0), 
 def read(folder: Path, text: str) -> tuple[dict[str, np.ndarray], dict]:
     """The arrays and the report of ``extract`` for a stage typed by hand, in this process."""
     (folder / "m.usda").write_text(text)
-    report = extract(folder / "m.usda", folder / "m.npz")
+    report = checked(extract_meshes, folder / "m.usda", folder / "m.npz", None)
     with np.load(folder / "m.npz") as arrays:
         return dict(arrays), report
 

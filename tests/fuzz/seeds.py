@@ -15,7 +15,8 @@ import _splat_encoders as encode
 import numpy as np
 from _splat_files import Table, random_splats, splat_table, write_ply
 
-from meshsplats import FileFormatError, load_gaussians
+from meshsplats import FileFormatError, load_gaussians, save_gaussians
+from meshsplats.formats.sniff import identify
 
 Change = Callable[[bytes], bytes]
 
@@ -91,6 +92,25 @@ def _zstandard_seeds() -> list[Seed]:
     return [Seed("spz-4", {"a.spz": whole}, "a.spz", inside)]
 
 
+def _usd_seeds() -> list[Seed]:
+    """USD, where usd-core is installed; and what of it is read without that: the tokens of a binary file."""
+    if importlib.util.find_spec("pxr") is None:
+        return []
+    text = encode.usda(_VALUES)
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a.usda").write_text(text)
+        cloud = load_gaussians(Path(folder) / "a.usda")
+        save_gaussians(cloud, Path(folder) / "a.usdc")
+        save_gaussians(cloud, Path(folder) / "a.usdz")
+        binary, package = ((Path(folder) / name).read_bytes() for name in ("a.usdc", "a.usdz"))
+    return [
+        Seed("usd-tokens", {"a.usdc": binary}, "a.usdc", load=identify),
+        Seed("splat-usda", {"a.usda": text.encode()}, "a.usda", slow=True),
+        Seed("splat-usdc", {"a.usdc": binary}, "a.usdc", slow=True),
+        Seed("splat-usdz", {"a.usdz": package}, "a.usdz", slow=True),
+    ]
+
+
 _VALUES = random_splats(9, degree=1)
 _SPZ = {version: encode.spz(_VALUES, version, extensions=bytes(8), flags=2) for version in (1, 2, 3)}
 _GLB = encode.gltf(encode.splat_accessors(_VALUES), nodes=[{"mesh": 0, "scale": [1, 2, 3]}])
@@ -109,6 +129,7 @@ SEEDS = [
     _moving_ply("ply-4d", "t", "scale_t_0", *(f"rot_r_{i}" for i in range(4))),
     _ply("ply-far", "binary_little_endian", 0, False, away=5e6),
     Seed("compressed-ply", {"a.ply": encode.compressed_ply(_VALUES)}, "a.ply"),
+    Seed("ksplat", {"a.ksplat": encode.ksplat(_VALUES, 1, sections=2)}, "a.ksplat"),
     Seed("splat", {"a.splat": encode.dot_splat(_VALUES)}, "a.splat"),
     *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", in_gzip) for version, data in _SPZ.items()),
     *_zstandard_seeds(),
@@ -116,7 +137,9 @@ SEEDS = [
     Seed("sog-folder", encode.sog(_VALUES), "."),
     Seed("sog-folder-1", encode.sog(_VALUES, version=1), "meta.json"),
     Seed("sog-streamed", _STREAMED, "."),
+    Seed("lcc", encode.lcc(random_splats(9, degree=3)), "meta.lcc"),
     Seed("splat-glb", {"a.glb": _GLB}, "a.glb"),
     Seed("splat-gltf", {"a.gltf": encode.gltf(encode.splat_accessors(_VALUES), kind="gltf")}, "a.gltf"),
     Seed("spz-glb", {"a.glb": encode.gltf(spz_data=_SPZ[3])}, "a.glb"),
+    *_usd_seeds(),
 ]

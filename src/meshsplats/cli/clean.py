@@ -19,14 +19,16 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     check_mesh_suffix,
+    check_splat_endings,
     load_scene,
     size_of,
     written,
 )
-from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.messages import shown_path
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove, save_strip
 from meshsplats.errors import StraysWarning
 from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
+from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -64,7 +66,7 @@ class Clean(Command):
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
     output: Output
-    """The remaining splats: as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
+    """The remaining splats: .ply, .spz, .sog or others; a mesh: .glb, .npz, .ply, .usdc, .obj."""
     rules: RuleOptions = field(default_factory=RuleOptions)
     preview_only: bool = False
     """Print and draw what would be removed, but write no result."""
@@ -84,7 +86,6 @@ class Clean(Command):
 
         start = time.perf_counter()
         preview = beside(self.output, PREVIEW)
-        check_mesh_suffix(self.output)
         outputs = [preview] if self.preview_only else [self.output, preview]
         check_outputs(outputs, self.force, inputs=[self.input])
         explicit = any(value is not None for value in vars(self.rules).values())
@@ -92,8 +93,10 @@ class Clean(Command):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", StraysWarning)  # which names this command
             scene = load_scene(self.input, self.reading)
-        if isinstance(scene, GaussianCloud) and self.output.suffix.lower() != ".ply":
-            raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
+        if isinstance(scene, GaussianCloud):
+            check_splat_endings(written_ending(self.output.name))
+        else:
+            check_mesh_suffix(self.output)
         found = find(scene, rules)
         left = remove(scene, found)
         alpha = {}

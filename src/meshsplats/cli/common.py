@@ -15,6 +15,9 @@ import numpy as np
 import tyro
 
 from meshsplats._origin import in_words, lost_detail, sampled
+from meshsplats._words import direction_in_words
+from meshsplats._words import parse_color as parse_color
+from meshsplats._words import parse_up as parse_up
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up, warn_of_strays_in
@@ -25,7 +28,7 @@ from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.sniff import identify
-from meshsplats.formats.splat_formats import listed, y_up_suffixes
+from meshsplats.formats.splat_formats import listed, written_suffixes, y_up_suffixes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -61,14 +64,6 @@ Missing = Annotated[
     Literal["error", "skip"],
     tyro.conf.arg(help="With --data: images that are missing are an error, or their views are left out."),
 ]
-
-NAMED_COLORS: dict[str, tuple[float, float, float]] = {
-    "white": (1.0, 1.0, 1.0),
-    "black": (0.0, 0.0, 0.0),
-    "grey": (0.5, 0.5, 0.5),
-    "gray": (0.5, 0.5, 0.5),
-}
-
 
 _AXES = (
     "Direction of the y axis in the file; auto: as its format prescribes, up in"
@@ -400,7 +395,7 @@ def say_origin(found: np.ndarray, origin: Origin, *, splats: bool = False) -> No
     """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
     ``splats`` does not tell other programs."""
     if origin == "keep" and found.any():
-        splats_only = ", in a comment of the file: other programs see the splats around 0 0 0"
+        splats_only = ", in a note of the file: other programs see the splats of .ply and .sog around 0 0 0"
         say(f"origin: {in_words(found)}" + (splats_only if splats else "; --origin local leaves it out"))
     elif origin == "local" and found.any():
         say(f"origin: left out; coordinates are relative to {in_words(found)}")
@@ -443,53 +438,9 @@ def views_of_a_place(
     return list(found.cameras)
 
 
-def parse_up(text: str) -> np.ndarray:
-    """(3,) direction from ``-y``, ``+z``, ``x`` or ``x,y,z``. Raises ValueError for anything else."""
-    axis = text.lower().lstrip("+-")
-    if axis in ("x", "y", "z") and len(text) <= 2:
-        direction = np.zeros(3)
-        direction["xyz".index(axis)] = -1 if text.startswith("-") else 1
-        return direction
-    numbers = _numbers(text)
-    if numbers is None or not any(numbers):
-        raise ValueError(f"--up must be an axis such as -y or z, or three numbers x,y,z, got {text!r}")
-    return np.array(numbers)
-
-
-def direction_in_words(direction: np.ndarray) -> str:
-    """An axis, or three numbers, as ``parse_up`` takes them."""
-    axis = int(np.abs(direction).argmax())
-    if abs(direction[axis]) > 1 - 1e-6:
-        return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
-    return ",".join(f"{value:.4g}" for value in direction)
-
-
-def parse_color(text: str) -> tuple[float, float, float]:
-    """RGB in [0, 1] from a name, ``#rrggbb`` or ``r,g,b``. Raises ValueError for anything else."""
-    if text.lower() in NAMED_COLORS:
-        return NAMED_COLORS[text.lower()]
-    if text.startswith("#") and len(text) == 7 and all(c in "0123456789abcdefABCDEF" for c in text[1:]):
-        red, green, blue = (int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))
-        return red, green, blue
-    numbers = _numbers(text)
-    if numbers is None or not all(0 <= v <= 1 for v in numbers):
-        raise ValueError(
-            f"--background must be {', '.join(NAMED_COLORS)}, #rrggbb, or r,g,b from 0 to 1, got {text!r}"
-        )
-    return numbers
-
-
 def optional_color(text: str | None) -> tuple[float, float, float] | None:
     """``parse_color`` of an option that may not be given."""
     return None if text is None else parse_color(text)
-
-
-def _numbers(text: str) -> tuple[float, float, float] | None:
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        return None
-    return (x, y, z) if np.isfinite([x, y, z]).all() else None
 
 
 def check_mesh_suffix(path: Path) -> None:
@@ -498,6 +449,13 @@ def check_mesh_suffix(path: Path) -> None:
 
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
+
+
+def check_splat_endings(*kinds: str) -> None:
+    """Raises UsageError if no splats can be written to files that end in ``kinds``, without a dot."""
+    for kind in kinds:
+        if f".{kind}" not in written_suffixes():
+            raise UsageError(f"splats are written as {listed(written_suffixes())}, not as .{kind}")
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from meshsplats.cli.common import (
     File,
     Folder,
     Missing,
+    Number,
     Origin,
     Output,
     SplatOptions,
@@ -32,6 +33,7 @@ from meshsplats.cli.common import (
     alpha_in_words,
     alpha_record,
     check_mesh_suffix,
+    check_splat_endings,
     draw_preview,
     parse_up,
     plural,
@@ -62,8 +64,9 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
 from meshsplats.formats.meshes import MESH_SUFFIXES
-from meshsplats.formats.outputs import CONFIGURATION, beside
+from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats, scaled, splat_options
 from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.jobs import Job, is_batch, jobs, sources, without_results
 from meshsplats.mesh import SplatMesh, checked_cutoff
@@ -73,7 +76,8 @@ _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
 _FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
-    *("conversion", "reading", "origin", "json", "force", "skip_existing"),
+    *("conversion", "reading", "origin", "json", "force", "skip_existing", "spz_version", "linear"),
+    *("up", "scale"),
 )
 """Options of the command that have one."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
@@ -100,8 +104,7 @@ else:
 @dataclass(frozen=True)
 class Convert(Command):
     """Converts splats to a mesh of translucent, vertex-coloured triangles; several files or folders, into a
-    folder. Converts meshes to other formats. With --as-splats, writes splats: other formats as a plain .ply,
-    or a part.
+    folder. Converts meshes to other formats, and splats, too: with --as-splats, or a name such as scene.spz.
 
     Writes a preview and the configuration beside the result.
     """
@@ -119,12 +122,9 @@ class Convert(Command):
     """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
     input."""
     output: Output
-    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or a
-    folder, for files named like the inputs."""
-    formats: Annotated[
-        tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...],
-        tyro.conf.arg(help_behavior_hint=""),
-    ] = ()
+    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or
+    splats: .spz, .sog, .splat, .compressed.ply, .usdz. Or a folder, for files named like the inputs."""
+    formats: Annotated[tuple[Ending, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """With a folder: formats to write. Default: glb."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
@@ -137,6 +137,8 @@ class Convert(Command):
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
     file, else -y."""
+    scale: Number = None
+    """Factor for all lengths of the result, of meshes and splats: metres in an output unit, say."""
     lit: bool = False
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     smooth: bool = False
@@ -159,8 +161,12 @@ class Convert(Command):
     compression: Literal["none", "meshopt"] = "none"
     """.glb: meshopt: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
-    """Write splats, not a mesh: a float .ply in the layout of the 3DGS code, of all splats or of those that
-    --crop, --max-splats and min_opacity leave."""
+    """Write splats, not a mesh, as .ply, .glb or .usdc, too: all of them, or those that --crop, --max-splats
+    and min_opacity leave."""
+    spz_version: tyro.conf.Fixed[Literal[3, 4] | None] = None
+    """.spz: version. 4 is read by newer programs only. Default: 3."""
+    linear: tyro.conf.Fixed[bool | None] = None
+    """Splats as .usdc, .usda, .usdz: linear colours, for renderers that take all colours so."""
     fidelity: Count = None
     """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
     stream: bool = False
@@ -184,10 +190,13 @@ class Convert(Command):
     def execute(self) -> int:
         if not self.input:
             raise UsageError("give a splat file, a mesh or a folder to convert")
+        ending = written_ending(self.output.name)
+        if not self.as_splats and means_splats(self.formats or [ending]):
+            return replace(self, as_splats=True).execute()
         batch = is_batch(self.input)
         folder = batch or bool(self.formats) or self.output.is_dir()
         formats = self._formats(folder)
-        self._check(formats or [self.output.suffix.lower()[1:]])
+        self._check(formats or [ending])
         found = sources(self.input)
         preview = not (self.no_preview or self.stream)
         if formats:
@@ -214,15 +223,9 @@ class Convert(Command):
         if not folder:
             if not self.as_splats:
                 _check_file(self.output)
-            elif self.output.suffix.lower() != ".ply":
-                raise UsageError(f"--as-splats writes .ply, got {self.output.name!r}")
             return ()
         _check_folder(self.output)
-        if not self.as_splats:
-            return self.formats or ("glb",)
-        if self.formats and self.formats != ("ply",):
-            raise UsageError(f"--as-splats writes .ply, got --formats {' '.join(self.formats)}")
-        return ("ply",)
+        return self.formats or (("ply",) if self.as_splats else ("glb",))
 
     def _check(self, kinds: Sequence[str]) -> None:
         """UsageError or ValueError for options that contradict each other or have no effect."""
@@ -230,11 +233,17 @@ class Convert(Command):
             raise UsageError("give --force or --skip-existing, not both")
         if self.fidelity is not None and self.fidelity < 1:
             raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
+        if self.scale is not None and not 0 < self.scale < float("inf"):
+            raise ValueError(f"--scale must be a number above 0, got {self.scale}")
+        if self.up is not None:
+            parse_up(self.up)
         if self.stream:
             self._check_stream(kinds)
         if self.as_splats:
-            self._check_splat_options()
+            self._check_splat_options(kinds)
             return
+        if self.spz_version is not None or self.linear is not None:
+            raise UsageError("--set spz_version and linear are for splats: --as-splats")
         glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
         if self.lit and not (glb or usd):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
@@ -257,8 +266,6 @@ class Convert(Command):
             raise UsageError("give --cameras or --data, not both")
         if self.missing != "error" and self.data is None:
             raise UsageError("--missing has no effect without --data")
-        if self.up is not None:
-            parse_up(self.up)
         self._resolved(sources(self.input))  # checks the values before the work
 
     def resolved(self) -> dict[str, Any]:
@@ -271,7 +278,9 @@ class Convert(Command):
         has_cameras = bool(self.cameras or self.data) or beside
         return self.conversion.resolved(self.preset, has_cameras=has_cameras)
 
-    def _check_splat_options(self) -> None:
+    def _check_splat_options(self, kinds: Sequence[str]) -> None:
+        check_splat_endings(*kinds)
+        splat_options(kinds, spz_version=self.spz_version, linear=self.linear)
         standard = {f.name: f.default for f in fields(self) if f.name not in _FOR_SPLATS}
         idle = [name for name, value in standard.items() if getattr(self, name) != value]
         explicit = asdict(self.conversion)
@@ -397,8 +406,8 @@ class Convert(Command):
 
         if tuple(kinds) != ("ply",):
             raise UsageError("--stream writes .ply; for other programs, 'meshsplats tiles' makes .glb tiles")
-        if self.fidelity is not None or self.alpha not in ("auto", "blend"):
-            raise UsageError("--fidelity and --alpha need the whole mesh in memory: leave out --stream")
+        if self.fidelity is not None or self.alpha not in ("auto", "blend") or self.scale is not None:
+            raise UsageError("--fidelity, --alpha and --scale need all in memory: leave out --stream")
         refuse_whole(self._resolved(sources(self.input)))
 
     def _stream_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
@@ -440,10 +449,11 @@ class Convert(Command):
         if not count:
             raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
         kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
+        up = source.up if self.up is None else unit_up(parse_up(self.up))
         origin = source.origin if self.origin == "keep" else np.zeros(3)
         kept = (replace(block.take(worth_drawing(block, self.conversion)), origin=origin) for block in source)
         with self._recorded(job):
-            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=source.up)
+            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=up)
         seconds = round(time.perf_counter() - start, 4)
         return {"read": source.count, "written": count, "seconds": seconds}
 
@@ -510,7 +520,7 @@ class Convert(Command):
         choice = self._files.choice(mesh, job.outputs, cameras)
         order = self._files.order(mesh, job.outputs, cameras)
         chosen = time.perf_counter()
-        placed = written(mesh, self.origin)
+        placed = written(scaled(mesh, self.scale), self.origin)
         with self._recorded(job):
             self._files.save(placed, job.outputs, choice, order)
         comparing = "choose alpha" if order is None else "solve order"
@@ -546,11 +556,13 @@ class Convert(Command):
         return {**self._finish(mesh, job, seen, times), "fidelity": None}
 
     def _save_splats(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
-        """The splats themselves, as .ply."""
+        """The splats themselves."""
         from meshsplats.formats.gaussians import save_gaussians
 
         start = time.perf_counter()
-        cloud = self.reading.load(job.source)
+        cloud = self.reading.load(job.source, up=self.up)
+        if self.up is not None:
+            cloud = replace(cloud, up=unit_up(parse_up(self.up)))
         options = self.conversion
         merging, count = options.budget != "drop", options.max_splats
         kept = choose_splats(
@@ -562,10 +574,12 @@ class Convert(Command):
         if merging and count is not None:
             seen = _seen_from(cameras, job.source, kept.origin)
             kept = simplify(kept, count, cameras=seen or None)
-        result = written(kept, self.origin)
+        result = written(scaled(kept, self.scale), self.origin)
         with self._recorded(job):
-            for path in job.outputs:
-                save_gaussians(result, path)
+            kinds = [written_ending(path.name) for path in job.outputs]
+            taken = splat_options(kinds, spz_version=self.spz_version, linear=self.linear)
+            for path, own in zip(job.outputs, taken, strict=True):
+                save_gaussians(result, path, **own)
         seconds = time.perf_counter() - start
         if job.preview:
             draw_preview(kept, job.preview)
@@ -621,7 +635,7 @@ class Convert(Command):
         """The command that compares the mesh with the splats in its cameras, or one that renders it if only a
         part of them was converted."""
         folder, source = self.output.with_suffix(""), shown_path(self.input[0])
-        if self.conversion.crop is not None or source == "-":
+        if self.conversion.crop is not None or source == "-" or self.scale is not None:
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         words += ["--look", self._look] if self._look != "area" else []

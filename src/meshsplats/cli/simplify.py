@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     SplatOptions,
+    check_splat_endings,
     draw_preview,
     size_of,
     written,
@@ -33,13 +34,14 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
 from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_formats import written_ending
 
 
 @dataclass(frozen=True)
 class Simplify(Command):
     """Merges the splats that are most alike: fewer splats that look the same, and none are dropped.
 
-    Writes a float .ply in the layout of the 3DGS code, with a preview and the configuration beside it.
+    Writes a preview and the configuration beside them.
     """
 
     EXCLUSIVE = (("count", "share"), ("cameras", "data"))
@@ -48,7 +50,7 @@ class Simplify(Command):
     input: tyro.conf.Positional[Path]
     """Splat file, or the folder of a trained model."""
     output: Output
-    """The splats: .ply."""
+    """The splats: .ply, .spz, .sog or another format."""
     count: Count = None
     """Number of splats to keep."""
     share: Number = None
@@ -112,8 +114,7 @@ class Simplify(Command):
 
     def _check(self) -> None:
         """UsageError for options that contradict each other or are out of range."""
-        if self.output.suffix.lower() != ".ply":
-            raise UsageError(f"-o must end in .ply, got {self.output.name!r}")
+        check_splat_endings(written_ending(self.output.name))
         if (self.count is None) == (self.share is None):
             raise UsageError("give --count or --share, one of them")
         if self.count is not None and self.count < 1:

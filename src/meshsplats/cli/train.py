@@ -10,7 +10,7 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import File, Output, check_mesh_suffix, placed, say_origin
+from meshsplats.cli.common import File, Output, check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.training import (
     Plan,
@@ -27,6 +27,7 @@ from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Setup
 from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.outputs import check_outputs
+from meshsplats.formats.splat_formats import written_ending
 from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.run import SO_FAR, check_training_memory, train
 
@@ -87,7 +88,7 @@ class Train(TrainingCommand):
     output: Output
     """The mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
     as_splats: File = None
-    """Also write the fans as splats to this .ply file, for splat viewers."""
+    """Also write the fans as splats to this file, .ply, .spz or .sog, for splat viewers."""
     target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
     tuning: GrowingOptions = field(default_factory=GrowingOptions)
 
@@ -101,8 +102,7 @@ class Train(TrainingCommand):
     def check(self) -> None:
         check_mesh_suffix(self.output)
         if self.as_splats is not None:
-            if self.as_splats.suffix.lower() != ".ply":
-                raise UsageError(f"--as-splats must end in .ply, got {self.as_splats.name!r}")
+            check_splat_endings(written_ending(self.as_splats.name))
             if self.as_splats == self.output:
                 raise UsageError("--as-splats must not be the mesh itself: give another name")
             check_outputs([self.as_splats], self.force, inputs=self.inputs)

@@ -1,13 +1,14 @@
-"""Splats with linear colours, as display colours."""
+"""Splats with linear colours, as display colours, and back."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.colors import linear_to_srgb
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
@@ -23,10 +24,20 @@ def display_cloud(cloud: GaussianCloud) -> GaussianCloud:
     the sphere, and harmonics of the same degree are fitted to that. Images blend display colours, as those of
     all splats here, where the program that made them blends linear ones: they agree where splats are opaque.
     """
+    return _mapped(cloud, linear_to_srgb)
+
+
+def linear_cloud(cloud: GaussianCloud) -> GaussianCloud:
+    """``cloud`` with linear colours, for renderers that want them: the inverse of ``display_cloud``, but for
+    the fit."""
+    return _mapped(cloud, srgb_to_linear)
+
+
+def _mapped(cloud: GaussianCloud, curve: Callable[[np.ndarray], np.ndarray]) -> GaussianCloud:
     sh = cloud.sh
     if cloud.sh_degree == 0:
-        linear = np.maximum(np.float32(0.5) + np.float32(SH_C0) * sh, 0)
-        return replace(cloud, sh=(linear_to_srgb(linear) - np.float32(0.5)) / np.float32(SH_C0))
+        colors = np.maximum(np.float32(0.5) + np.float32(SH_C0) * sh, 0)
+        return replace(cloud, sh=(curve(colors) - np.float32(0.5)) / np.float32(SH_C0))
     i = np.arange(_DIRECTIONS) + 0.5  # directions on a Fibonacci spiral
     z, angle = 1 - 2 * i / _DIRECTIONS, i * np.pi * (1 + 5**0.5)
     r = np.sqrt(1 - z * z)
@@ -36,8 +47,8 @@ def display_cloud(cloud: GaussianCloud) -> GaussianCloud:
     fitted = np.empty_like(sh)
     for start in range(0, len(sh), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        linear = np.maximum(np.float32(0.5) + basis @ sh[part], 0)
-        fitted[part] = fit @ (linear_to_srgb(linear) - np.float32(0.5))
+        colors = np.maximum(np.float32(0.5) + basis @ sh[part], 0)
+        fitted[part] = fit @ (curve(colors) - np.float32(0.5))
     return replace(cloud, sh=fitted)
 
 

@@ -6,18 +6,22 @@ import os
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._files.atomic import atomic_path
 from meshsplats._kinds import each, need, need_path
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.opening import open_splats, to_y_down
 from meshsplats.formats.ply.activated import Activated
-from meshsplats.formats.ply.splats import write_float_blocks, write_float_ply
+from meshsplats.formats.ply.splats import write_float_blocks
 from meshsplats.formats.reading import Axes, Reading
 from meshsplats.formats.sniff import UnreadSplats, content_of, splat_format
+from meshsplats.formats.splat_formats import format_to_write, listed, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
+from meshsplats.formats.writing import SpzVersion, Writing
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 
@@ -118,30 +122,65 @@ def moving_splats(path: str | os.PathLike[str]) -> tuple[str, float, float] | No
         return splat_format(content).reader.motion(content)
 
 
-def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
-    """Writes ``cloud`` as a float .ply in the layout of the 3D Gaussian Splatting code, whole or not at all.
+def save_gaussians(
+    cloud: GaussianCloud,
+    path: str | os.PathLike[str],
+    *,
+    spz_version: SpzVersion | None = None,
+    linear: bool | None = None,
+) -> None:
+    """Writes ``cloud`` in the format that the suffix of ``path`` names, whole or not at all.
 
-    Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, are stored as
-    sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as in 2DGS
-    files, and an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both kernels are read
-    back. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three, with
-    a DataWarning, and is read back as '3dgs'. ``up`` becomes the comment ``meshsplats up X Y Z``, and
-    ``Vertical Axis: z``, too, if it is +z.
+    - `.ply`: floats, in the layout of the 3D Gaussian Splatting code.
+    - `.compressed.ply`: PlayCanvas, 16 bytes a splat and one for each harmonic.
+    - `.splat`: 32 bytes a splat, without view-dependent colour.
+    - `.spz`: about 15 bytes a splat, 30 with all harmonics. Positions have 24 bits in all, of which as many
+      are behind the point as the splats need.
+    - `.sog`: about 13 bytes a splat, 20 with all harmonics.
+    - `.glb`: floats, with KHR_gaussian_splatting.
+    - `.usdc`, `.usda`, `.usd`, `.usdz`: floats, as ParticleField3DGaussianSplat. They need the extra ``usd``.
 
-    Positions are written relative to the cloud's ``origin``, which a comment names: other programs see such
-    splats around (0, 0, 0), this one puts them back into the world.
+    All formats but `.ply`, `.glb` and USD quantise: docs/files.md says what is lost of images. They list
+    splats in another order, and name ellipsoids by other rotations and scales that mean the same.
+
+    `.ply`, `.compressed.ply`, `.sog`, `.glb` and USD keep the kernel, ``up`` and ``origin``; what another
+    format leaves out, a DataWarning says. Other programs see the splats of all formats but `.glb` and USD
+    around (0, 0, 0), and with y down where these have y up.
+    In `.ply` files, a '2dgs' cloud has two scales; one whose third scales are not 0 gives a DataWarning, and
+    is read back as '3dgs'. Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite,
+    are stored as sigmoid(-30), sigmoid(20) and 1.2e-38.
+
+    Args:
+        cloud: the splats.
+        path: the file; its suffix decides the format.
+        spz_version: (`.spz`; default 3) 4 is read by newer programs only and needs the extra ``formats``.
+        linear: (USD; default False) write linear colours, not the display values that splats are trained on.
+            The file says which it has; some renderers take all colours as linear all the same. Where splats
+            are translucent, images differ.
 
     Raises:
-        ValueError: the suffix is not .ply, or the cloud has no splats.
+        ValueError: the suffix is unknown, an option is for another format, or the cloud has no splats.
+        MissingDependencyError: a package is missing.
+        OSError: the file cannot be written.
     """
     need(GaussianCloud, cloud=cloud, instead={"SplatMesh": "save_mesh writes meshes"})
     need_path(path=path)
     target = Path(path)
-    if target.suffix.lower() != ".ply":
-        raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
+    kind = format_to_write(target.name)
+    if kind is None:
+        known = listed(written_suffixes())
+        raise ValueError(f"{target.name!r} does not name a splat format; choose a name that ends in {known}")
+    if spz_version not in (None, *get_args(SpzVersion)):
+        raise ValueError(f"spz_version must be 3 or 4, got {spz_version!r}")
+    writing = Writing(target, spz_version, linear)
+    for name in writing.options():
+        if name not in kind.writer.takes:
+            raise ValueError(f"the option {name} is for {taken_by(name)}, not for {target.name!r}")
     if not len(cloud):
         raise ValueError("no splats to write: the cloud is empty, and no reader takes such a file")
-    write_float_ply(cloud, target)
+    size = int(kind.writer.bytes_a_splat(cloud.sh.shape[1]) * len(cloud))
+    with atomic_path(target, needs=size) as temporary:
+        kind.writer.write(cloud, temporary, writing)
 
 
 def save_gaussian_blocks(
@@ -172,8 +211,9 @@ def save_gaussian_blocks(
     blocks = each(GaussianCloud, "blocks", blocks)
     need_path(path=path)
     target = Path(path)
-    if target.suffix.lower() != ".ply":
-        raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
+    kind = format_to_write(target.name)
+    if kind is None or kind.name != "ply":
+        raise ValueError(f"blocks are written as float .ply, got {target.name!r}: choose a name that ends so")
     if count < 1 or degree not in (0, 1, 2, 3):
         raise ValueError(f"count must be at least 1 and degree 0 to 3, got {count} and {degree}")
     write_float_blocks(blocks, target, count, (degree + 1) ** 2, kernel, flat=kernel == "2dgs", up=up)

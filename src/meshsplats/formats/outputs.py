@@ -5,22 +5,65 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
+
+import numpy as np
 
 from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
 from meshsplats.errors import FileFormatError, OverwritingError
+from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.splat_formats import format_to_write, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+Scene = TypeVar("Scene", GaussianCloud, SplatMesh)
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
+
+Ending = Literal[
+    "glb", "npz", "ply", "usdc", "usda", "usd", "obj", "compressed.ply", "splat", "spz", "sog", "usdz"
+]
+"""Of files that are written, meshes and splats, without the first dot."""
 
 
 def beside(output: Path, record: str) -> Path:
     """Name of a record of the file ``output``: with the whole name of that, so that records of ``mesh.glb``
     and ``mesh.png`` are different files."""
     return output.with_name(f"{output.name}.{record}")
+
+
+def means_splats(kinds: Sequence[str]) -> bool:
+    """Whether files with these endings, without a dot, can only be splats, not meshes."""
+    return bool(kinds) and all(f".{k}" in written_suffixes() and f".{k}" not in MESH_SUFFIXES for k in kinds)
+
+
+def splat_options(kinds: Sequence[str], **given: Any) -> list[dict[str, Any]]:
+    """Of the options of ``save_gaussians`` that are ``given``, not None, those that files with these endings
+    take. ValueError for one that none of them takes."""
+    given = {name: value for name, value in given.items() if value is not None}
+    formats = [format_to_write(f".{kind}") for kind in kinds]
+    taken = [{n: v for n, v in given.items() if f and n in f.writer.takes} for f in formats]
+    for name in given:
+        if not any(name in options for options in taken):
+            raise ValueError(f"{name} is for splats as {taken_by(name)}")
+    return taken
+
+
+def scaled(scene: Scene, factor: float | None) -> Scene:
+    """``scene`` with all lengths, from the origin of the world on, times ``factor``; None: as it is.
+    ValueError for a mesh that is bound to a base mesh, whose lengths are those of the base."""
+    if factor is None:
+        return scene
+    if isinstance(scene, GaussianCloud):
+        return scene.transformed(np.eye(3) * factor)
+    if scene.binding is not None:
+        raise ValueError("a mesh prior has the lengths of its base mesh: scale the base and bind to that")
+    return replace(scene, vertices=scene.vertices * np.float32(factor), origin=scene.origin * factor)
 
 
 def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:

@@ -114,12 +114,8 @@ def _unread(content: Content) -> str:
             ".splatv files, of splats that move, are not read here; the .ply that they are made of is"
             " (Spacetime Gaussians)"
         )
-    if content.name.endswith(".ksplat"):
-        return f".ksplat files are not read here; {convert}"
-    if text and (
-        content.name.endswith((".lcc", ".lcc2")) or (b'"splats"' in text and b'"totalLevel"' in text)
-    ):
-        return f".lcc scenes are not read here; {convert}"
+    if text and content.name.endswith((".lcc", ".lcc2")):
+        return f"LCC2 scenes are not read here; {convert}"
     return ""
 
 
@@ -194,8 +190,8 @@ def _without_splats(content: Content) -> Literal["mesh", "cameras"]:
 
 def _holds_arrays(content: Content) -> bool:
     """Whether a zip archive is an .npz."""
-    if content.path.suffix.lower() == ".usdz":  # its reader says what to do
-        return True
+    if content.path.suffix.lower() == ".usdz":
+        return not any(kind.reader.matches(content) for kind in splat_formats.FORMATS if kind.name == "usd")
     try:
         return any(name.endswith(".npy") for name in content.archive.names)
     except FileFormatError:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from meshsplats.formats.reading import FormatReader
+    from meshsplats.formats.writing import FormatWriter
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,23 @@ class SplatFormat:
     """Which of the options 'time' and 'activated' of ``load_gaussians`` have a meaning for it."""
     has_signature: bool = True
     """False: files without a mark, which are tried last."""
+    writer_module: str = ""
+    """The module below ``meshsplats.formats`` that holds its ``WRITER``; empty: it is not written."""
+    written: tuple[str, ...] = ()
+    """Suffixes of the files that are written."""
+    written_as: str = ""
+    """For the table in docs/files.md."""
 
     @cached_property
     def reader(self) -> FormatReader:
         """What reads its files."""
         found: FormatReader = import_module(f"meshsplats.formats.{self.module}").READER
+        return found
+
+    @cached_property
+    def writer(self) -> FormatWriter:
+        """What writes its files, if it is written."""
+        found: FormatWriter = import_module(f"meshsplats.formats.{self.writer_module}").WRITER
         return found
 
 
@@ -60,6 +73,9 @@ FORMATS: tuple[SplatFormat, ...] = (
         "a block",
         zipped=(".ply",),
         takes=("activated", "time"),
+        writer_module="ply.splats",
+        written=(".ply",),
+        written_as="`.ply` as the 3DGS code lays it out",
     ),
     SplatFormat(
         "compressed.ply",
@@ -68,6 +84,17 @@ FORMATS: tuple[SplatFormat, ...] = (
         "PlayCanvas compressed `.ply`",
         "a block",
         zipped=(".ply",),
+        writer_module="ply.compressed_writer",
+        written=(".compressed.ply",),
+        written_as="`.compressed.ply`",
+    ),
+    SplatFormat(
+        "ksplat",
+        (".ksplat",),
+        "splats.ksplat",
+        "`.ksplat`",
+        "a block",
+        has_signature=False,
     ),
     SplatFormat(
         "splat",
@@ -77,6 +104,9 @@ FORMATS: tuple[SplatFormat, ...] = (
         "a block",
         zipped=(".splat",),
         has_signature=False,
+        writer_module="splats.dot_splat",
+        written=(".splat",),
+        written_as="`.splat`",
     ),
     SplatFormat(
         "spz",
@@ -86,6 +116,9 @@ FORMATS: tuple[SplatFormat, ...] = (
         "a block; attributes lie one after the other and are unpacked side by side, in versions 1 to 3 twice",
         zipped=(".spz",),
         y_up=True,
+        writer_module="splats.spz_writer",
+        written=(".spz",),
+        written_as="`.spz` (versions 3 and 4)",
     ),
     SplatFormat(
         "sog",
@@ -94,6 +127,9 @@ FORMATS: tuple[SplatFormat, ...] = (
         "SOG",
         "24 bytes a splat: an image can only be unpacked as a whole",
         folder_file="meta.json",
+        writer_module="splats.sog_writer",
+        written=(".sog",),
+        written_as="`.sog`",
     ),
     SplatFormat(
         "streamed sog",
@@ -104,6 +140,14 @@ FORMATS: tuple[SplatFormat, ...] = (
         folder_file="lod-meta.json",
     ),
     SplatFormat(
+        "lcc",
+        (".lcc",),
+        "splats.lcc",
+        "LCC of XGRIDS (the finest level)",
+        "a block",
+        folder_file="meta.lcc",
+    ),
+    SplatFormat(
         "gltf",
         (".glb", ".gltf"),
         "gltf.splats",
@@ -111,6 +155,20 @@ FORMATS: tuple[SplatFormat, ...] = (
         "the whole file",
         y_up=True,
         half_turn="z",
+        writer_module="gltf.splats_writer",
+        written=(".glb",),
+        written_as="`.glb` with KHR_gaussian_splatting",
+    ),
+    SplatFormat(
+        "usd",
+        (".usdc", ".usda", ".usd", ".usdz"),
+        "usd.splats",
+        "USD with ParticleField3DGaussianSplat",
+        "the whole file",
+        y_up=True,
+        writer_module="usd.splats_writer",
+        written=(".usdc", ".usda", ".usd", ".usdz"),
+        written_as="`.usdc`, `.usda`, `.usdz` with ParticleField3DGaussianSplat",
     ),
 )
 """The formats, in the order of the documents. The first one that matches a file counts."""
@@ -119,6 +177,29 @@ FORMATS: tuple[SplatFormat, ...] = (
 def splat_suffixes() -> tuple[str, ...]:
     """How the names of splat files end, wherever names decide: which files of a folder are read."""
     return _shortest([suffix for format_ in FORMATS for suffix in format_.suffixes])
+
+
+def written_suffixes() -> tuple[str, ...]:
+    """How the names of splat files that can be written end."""
+    return tuple(suffix for format_ in FORMATS for suffix in format_.written)
+
+
+def format_to_write(name: str) -> SplatFormat | None:
+    """The format that the ``name`` of a file asks for, by the longest suffix; None if none is written so."""
+    found = [(suffix, f) for f in FORMATS for suffix in f.written if name.lower().endswith(suffix)]
+    return max(found, key=lambda pair: len(pair[0]))[1] if found else None
+
+
+def written_ending(name: str) -> str:
+    """The ending of the ``name`` of a file without its first dot, of two parts where a format has two:
+    'compressed.ply'."""
+    suffixes = [s for s in written_suffixes() if name.lower().endswith(s)]
+    return max(suffixes, key=len, default="." + name.lower().rpartition(".")[2])[1:]
+
+
+def taken_by(option: str) -> str:
+    """The suffixes of the formats that take an ``option`` of ``save_gaussians``, in words."""
+    return listed(tuple(s for f in FORMATS if f.written and option in f.writer.takes for s in f.written))
 
 
 def zipped_suffixes() -> tuple[str, ...]:

@@ -9,25 +9,28 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from meshsplats._geometry import rotation_rows
 from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.document import GltfDocument
-from meshsplats.formats.gltf.reader import objects_in
+from meshsplats.formats.gltf.reader import dict_or_empty, objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
+from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within
 from meshsplats.formats.splats.spz import spz_in_memory
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import GaussianCloud, Kernel
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPRESSED = (
@@ -52,6 +55,8 @@ def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = Non
         raise document.error(
             f"a glTF file without splats (no primitive has {EXTENSION}); load_mesh reads meshes"
         )
+    if len(placed) == 1 and (own := _own(document, *placed[0])) is not None:
+        return own if origin is None else own.relative_to(origin)
     if origin is None:
         few = [sampled(cloud.means) @ matrix[:3, :3].T + matrix[:3, 3] for cloud, matrix in placed]
         origin = choose_origin(np.concatenate(few))
@@ -62,6 +67,34 @@ def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = Non
         except ValueError as error:
             raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
     return joined_within(clouds, document.budget)
+
+
+def turn_of(up: np.ndarray | None) -> list[float]:
+    """Unit quaternion x, y, z, w of the node of our own files, for a cloud with this ``up``."""
+    return up_quaternion(HALF_TURN_Z @ (np.array([0.0, -1.0, 0.0]) if up is None else up))
+
+
+def _own(document: GltfDocument, cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud | None:
+    """``cloud`` with the up, origin and kernel of our own note, if its node still places it accordingly."""
+    note = dict_or_empty(dict_or_empty(document.items("meshes")[0].get("extras")).get("meshsplats"))
+    up, origin, kernel = note.get("up"), note.get("origin", [0, 0, 0]), note.get("kernel", cloud.kernel)
+    vectors = [np.zeros(3) if v is None else np.array(v, object) for v in (up, origin)]
+    if not note or any(v.shape != (3,) or not all(map(_is_number, v)) for v in vectors):
+        return None
+    direction, place = (HALF_TURN_Z @ v.astype(np.float64) for v in vectors)
+    if kernel not in get_args(Kernel) or (up is not None and not direction.any()):
+        return None
+    x, y, z, w = turn_of(None if up is None else HALF_TURN_Z @ direction)
+    turn = np.array(list(rotation_rows(w, x, y, z)))
+    reach = max(1e-6, 1e-12 * float(np.abs(place).max()))
+    moved = np.abs(matrix[:3, :3] - turn).max() > 1e-6 or np.abs(matrix[:3, 3] - turn @ place).max() > reach
+    if moved:
+        return None
+    return replace(cloud, up=None if up is None else direction, origin=place, kernel=kernel)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and abs(value) < 1e300
 
 
 class _SplatGltf(Splats):

@@ -30,6 +30,17 @@ _AXIS = re.compile(r"([+-]?)([xyz])(?![a-z])", re.IGNORECASE)
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
+def note_comments(kernel: Kernel, up: np.ndarray | None) -> list[str]:
+    """Header lines that name a kernel other than '3dgs' that no property tells, and ``up``."""
+    lines = ["comment SplatRenderMode: mip"] if kernel == "antialiased" else []
+    if up is None:
+        return lines
+    lines.append("comment meshsplats up " + " ".join(repr(float(u)) for u in up))
+    if (np.asarray(up) == (0, 0, 1)).all():
+        lines.append("comment Vertical Axis: z")  # as nerfstudio, which others read
+    return lines
+
+
 def kernel_of_comments(comments: tuple[str, ...]) -> Kernel:
     """The kernel that a .ply names in its comments; the last one counts, '3dgs' if there is none."""
     spelt: dict[str, Kernel] = {

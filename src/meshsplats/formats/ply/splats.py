@@ -30,10 +30,11 @@ from meshsplats.formats.ply.activated import SAMPLE, Activated, harmonics_of, sp
 from meshsplats.formats.ply.compressed_splats import is_compressed_splat
 from meshsplats.formats.ply.header import Element, PlyHeader, origin_comments, origin_of_comments
 from meshsplats.formats.ply.motion import Motion, motion_of
-from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_in, up_of
+from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, note_comments, up_in, up_of
 from meshsplats.formats.ply.table import CHUNK_BYTES, POSITION, FloatTable
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
+from meshsplats.formats.writing import FormatWriter, Writing
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -115,6 +116,7 @@ def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
             f" {_listed([e.name for e in header.elements])})"
         )
     columns = _Columns(element, header, where)
+    _warn_of_beta(element.names, where)
     table = FloatTable(file, header, element, columns.needed, where)
     kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
     if len(columns.scale) == 2:
@@ -138,6 +140,22 @@ def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
         linear=is_linear(file, header, where),
         instant=instant,
     )
+
+
+def _warn_of_beta(names: Sequence[str], where: object) -> None:
+    """A DataWarning for columns of Deformable Beta Splatting that change the image and are not read."""
+    told = {
+        "colours that depend on the view (sb_params_*)": any(name.startswith("sb_params_") for name in names),
+        "kernels other than Gaussians (beta)": "beta" in names,
+    }
+    lost = [what for what, there in told.items() if there]
+    if lost:
+        warnings.warn(
+            f"{where}: Beta splats: {' and '.join(lost)} are left out; images are those of Gaussians with the"
+            " colours of f_dc, which were not trained as such",
+            DataWarning,
+            stacklevel=4,
+        )
 
 
 def _motion(content: Content) -> tuple[str, float, float] | None:
@@ -294,15 +312,15 @@ def _listed(names: tuple[str, ...] | list[str]) -> str:
     return (shown + ", ..." if len(names) > 8 else shown) or "nothing"
 
 
-def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
+def write_float_ply(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud`` in the layout of the 3D Gaussian Splatting code; see ``save_gaussians``."""
     flat = cloud.kernel == "2dgs" and not cloud.scales[:, 2].any()
     if cloud.kernel == "2dgs" and not flat:
         warnings.warn(
-            f"{path}: this '2dgs' cloud has third scales that are not 0; written with three scales,"
+            f"{writing.where}: this '2dgs' cloud has third scales that are not 0; written with three scales,"
             " it will be read back as '3dgs'",
             DataWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     write_float_blocks([cloud], path, len(cloud), cloud.sh.shape[1], cloud.kernel, flat=flat, up=cloud.up)
 
@@ -341,12 +359,7 @@ def write_float_blocks(
     first = next(rest_of_blocks, None)
     origin = zero_origin() if first is None else first.origin
     lines = ["ply", "format binary_little_endian 1.0", *origin_comments(origin)]
-    if kernel == "antialiased":
-        lines.append("comment SplatRenderMode: mip")
-    if up is not None:
-        lines.append("comment meshsplats up " + " ".join(repr(float(u)) for u in up))
-        if (np.asarray(up) == (0, 0, 1)).all():
-            lines.append("comment Vertical Axis: z")  # as nerfstudio, which others read
+    lines += note_comments(kernel, up)
     lines.append(f"element vertex {count}")
     lines += [f"property float {name}" for name in names] + ["end_header", ""]
     per_chunk = max(1, CHUNK_BYTES // (4 * len(names)))
@@ -379,3 +392,4 @@ def _matches(content: Content) -> bool:
 
 
 READER = FormatReader(_matches, _open, lambda content: is_float_splat(content.ply_header), up_in, _motion)
+WRITER = FormatWriter(write_float_ply, lambda coefficients: 56 + 12 * coefficients)

@@ -18,6 +18,8 @@ from meshsplats.formats._validation import Budget
 MAGIC = b"NGSP"
 REST = (0, 3, 8, 15, 24)
 """Coefficients per channel beyond the first, by degree."""
+COLOR_SCALE = 0.15
+"""Colours are stored as 0.5 + 0.15 f_dc, which leaves room beyond [0, 1]."""
 ANTIALIASED, EXTENDED, _TREE = 1, 2, 128
 _COORDINATE_SYSTEM = 0xADBE0003
 _SYSTEMS = ["RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]

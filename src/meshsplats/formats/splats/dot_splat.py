@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -19,7 +20,9 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
-from meshsplats.gaussians import SH_C0
+from meshsplats.formats.splats._quantising import as_bytes
+from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
+from meshsplats.gaussians import SH_C0, GaussianCloud
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _AT_ONCE = 1 << 16
@@ -89,4 +92,21 @@ def _rotations(records: np.ndarray) -> np.ndarray:
     return (records["rotation"] - np.float32(127.5)) / np.float32(127.5)
 
 
+def write_dot_splat(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
+    """Writes ``cloud``, the largest and most opaque splats first, as viewers that load a part want them; see
+    ``save_gaussians``."""
+    warn_of_losses(cloud, writing.where, degree=0)
+    order = np.argsort(-cloud.scales.prod(axis=1) * cloud.opacities, kind="stable")
+    records = np.empty(len(cloud), _RECORD)
+    records["position"], records["scale"] = cloud.means[order], cloud.scales[order]
+    colors = np.float32(0.5) + np.float32(SH_C0) * cloud.sh[order, 0]
+    records["color"][:, :3] = as_bytes(colors * np.float32(255))
+    records["color"][:, 3] = as_bytes(cloud.opacities[order] * np.float32(255))
+    # Truncated, as by other writers; see ``_rotations``.
+    records["rotation"] = np.clip(128 + 128 * cloud.quaternions[order], 0, 255).astype(np.uint8)
+    with open(path, "wb") as file:
+        file.write(records.data)
+
+
 READER = FormatReader(_matches, _open)
+WRITER = FormatWriter(write_dot_splat, lambda _: _RECORD.itemsize)

@@ -163,7 +163,18 @@ class _Reader:
         step = max(1, count // SAMPLE)
         few = [image[::step] for image in pixels["means"]]
         positions = partial(_positions, few, maps.positions)
-        return SplatReader(count, coefficients, self._kernel(), self._where, chunks, positions, float32=False)
+        note = self._note()
+        return SplatReader(
+            count,
+            coefficients,
+            self._kernel(),
+            self._where,
+            chunks,
+            positions,
+            float32=False,
+            up=note.get("up"),
+            origin=note.get("origin"),
+        )
 
     def corners(self) -> np.ndarray:
         """(2, 3) float64: the least and the greatest coordinates, by meta.json alone."""
@@ -271,6 +282,20 @@ class _Reader:
         if self._meta.get("antialias") is True:
             return "antialiased"
         return known.get(str(self._meta.get("model")), "3dgs")
+
+    def _note(self) -> dict[str, np.ndarray]:
+        """The 'up' and 'origin' of our own files, each (3,)."""
+        note = self._meta.get("meshsplats", {})
+        if not isinstance(note, dict):
+            raise self._error(f"'meshsplats' in meta.json must be an object, got {str(note)[:40]}")
+        found = {
+            name: self._checked(note[name], "meshsplats", name, (3,))
+            for name in ("up", "origin")
+            if name in note
+        }
+        if "up" in found and not found["up"].any():
+            raise self._error("meshsplats.up in meta.json must be a direction, got 0 0 0")
+        return found
 
     # -- images
 

@@ -29,6 +29,7 @@ from meshsplats.formats.splats._cloud_builder import (
 )
 from meshsplats.formats.splats._spz_layout import (
     ANTIALIASED,
+    COLOR_SCALE,
     MAGIC,
     MAX_EXTENSION_BYTES,
     MAX_HEAD,
@@ -45,8 +46,6 @@ from meshsplats.formats.splats._spz_layout import (
 from meshsplats.formats.splats._spz_streams import open_streams
 from meshsplats.gaussians import Kernel
 
-_COLOR_SCALE = 0.15
-"""Colours are stored as 0.5 + 0.15 f_dc, which leaves room beyond [0, 1]."""
 _AT_ONCE = 1 << 16
 
 
@@ -126,7 +125,7 @@ def _fill(header: Header, part: dict[str, np.ndarray], origin: np.ndarray, rows:
     """Writes m splats of ``part``, (m, bytes) of each attribute."""
     rows.means[:] = _positions(part["positions"], header) - origin
     rows.opacities[:] = part["alphas"][:, 0] / np.float32(255)
-    rows.sh[:, 0] = (part["colors"] / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE)
+    rows.sh[:, 0] = (part["colors"] / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
     rows.scales[:] = np.exp(part["scales"] / np.float32(16) - np.float32(10))
     _fill_rotations(rows.quaternions, part["rotations"])
     degree = min(header.degree, 3)

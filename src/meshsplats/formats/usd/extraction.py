@@ -12,7 +12,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -34,13 +34,19 @@ _LIBRARY_BYTES = 2 << 30
 _FACTOR = 256
 """Limit of address space: that at the start, ``_LIBRARY_BYTES``, and ``_FACTOR`` times the file's size."""
 
+Extract = Callable[[Path, Path, "np.ndarray | None"], dict[str, Any]]
+"""Writes arrays of the first file to the second, relative to an origin, and returns a report."""
 
-def main(file: Path, result: Path, origin: np.ndarray | None) -> None:
+
+def main(arguments: Sequence[str], extract: Extract) -> None:
+    """Runs ``extract`` for the ``arguments`` of a command, FILE RESULT [X Y Z], and prints its report."""
     import pxr.UsdGeom  # noqa: F401  (loaded before memory is limited)
 
+    file, result = Path(arguments[0]), Path(arguments[1])
+    origin = np.array([float(x) for x in arguments[2:]]) if len(arguments) > 2 else None
     _limit_memory(file.stat().st_size)
     try:
-        report = extract(file, result, origin)
+        report = checked(extract, file, result, origin)
     except FileFormatError as error:
         report = {"error": str(error).removeprefix(f"{file}: ")}
     except MemoryError:
@@ -66,11 +72,10 @@ def _limit_memory(file_bytes: int) -> None:
         return
 
 
-def extract(file: Path, result: Path, origin: np.ndarray | None = None) -> dict[str, Any]:
-    """Writes the arrays; returns warnings, up direction, origin, blending and names of attributes. Raises
-    FileFormatError."""
+def checked(extract: Extract, file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
+    """``extract``, with FileFormatError for the library's own errors."""
     try:
-        return _extract(file, result, origin)
+        return extract(file, result, origin)
     except RuntimeError as error:  # including the library's own errors
         try:
             lines = str(error).split("\n")
@@ -82,14 +87,23 @@ def extract(file: Path, result: Path, origin: np.ndarray | None = None) -> dict[
         raise FileFormatError("not readable as USD: it holds text that is not UTF-8") from None
 
 
-def _extract(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
-    from pxr import Sdf, Usd, UsdGeom
+def opened(file: Path) -> Any:
+    """The stage of ``file``. FileFormatError if it refers to others."""
+    from pxr import Sdf, Usd
 
     layer = Sdf.Layer.OpenAsAnonymous(str(file))  # this file alone, without its references
     if layer is None:
         raise FileFormatError("not readable as USD")
     _refuse_references(layer)
-    stage = Usd.Stage.Open(layer)
+    return Usd.Stage.Open(layer)
+
+
+def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
+    """Writes the arrays; returns warnings, up direction, origin, blending and names of attributes. Raises
+    FileFormatError."""
+    from pxr import Usd, UsdGeom
+
+    stage = opened(file)
     shapes, others = _visible(stage)
     if not shapes:
         raise FileFormatError(
@@ -151,12 +165,8 @@ def _visible(stage: Any) -> tuple[list[Any], int]:
     from pxr import Usd, UsdGeom
 
     meshes, others = [], 0
-    time = Usd.TimeCode.EarliestTime()
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
-        imageable = UsdGeom.Imageable(prim)
-        if not imageable or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
-            continue
-        if imageable.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+        if not is_visible(prim):
             continue
         if prim.GetParent().HasAttribute(_BLENDER + "stand_in"):
             continue  # only takes light in Blender
@@ -165,6 +175,17 @@ def _visible(stage: Any) -> tuple[list[Any], int]:
         elif prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer):
             others += 1
     return meshes, others
+
+
+def is_visible(prim: Any) -> bool:
+    """Whether renderers draw it, and what is below it."""
+    from pxr import Usd, UsdGeom
+
+    imageable = UsdGeom.Imageable(prim)
+    if not imageable or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+        return False
+    visibility = imageable.ComputeVisibility(Usd.TimeCode.EarliestTime())
+    return bool(visibility != UsdGeom.Tokens.invisible)
 
 
 def _chosen_origin(
@@ -427,5 +448,4 @@ def _attributes_of(note: dict[str, Any]) -> Iterator[tuple[str, str, int]]:
 
 
 if __name__ == "__main__":
-    given = np.array([float(x) for x in sys.argv[3:6]])
-    main(Path(sys.argv[1]), Path(sys.argv[2]), given if len(given) else None)
+    main(sys.argv[1:], extract_meshes)

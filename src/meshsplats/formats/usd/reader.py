@@ -11,12 +11,13 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -44,15 +45,7 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         MissingDependencyError: usd-core is missing.
         FileFormatError: the file is broken, or refers to other files, which are not opened.
     """
-    if importlib.util.find_spec("pxr") is None:
-        raise MissingDependencyError(f"{path}: reading USD needs the extra 'usd': pip install usd-core")
-    budget = Budget(path)
-    with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
-        result = Path(folder) / "mesh.npz"
-        report = _extract(path.resolve(), path, result, origin)
-        budget.spend(result.stat().st_size, "its meshes")
-        with np.load(result, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+    report, arrays = extracted(path, "meshsplats.formats.usd.extraction", origin)
     for message in report["warnings"]:
         warnings.warn(f"{path}: {message}", DataWarning, stacklevel=3)
     colors = straight_colors(arrays.pop("linear"), path)
@@ -80,10 +73,30 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     )
 
 
-def _extract(file: Path, path: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
-    """Runs ``extraction``, which writes arrays to ``result``; returns the rest of its report."""
+def extracted(
+    path: Path, module: str, origin: np.ndarray | None = None, *, packed: BinaryIO | None = None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The report and the arrays of ``module``, run as a process of its own; ``packed``: the USD file, where
+    ``path`` is a package around it. Errors as ``read_usd``."""
+    if importlib.util.find_spec("pxr") is None:
+        raise MissingDependencyError(f"{path}: reading USD needs the extra 'usd': pip install usd-core")
+    budget = Budget(path)
+    with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
+        result, file = Path(folder) / "arrays.npz", path.resolve()
+        if packed is not None:
+            file = Path(folder) / "packed.usd"
+            with open(file, "wb") as copy:
+                shutil.copyfileobj(packed, copy)
+        report = _extract(module, file, path, result, origin)
+        budget.spend(result.stat().st_size, "its arrays")
+        with np.load(result, allow_pickle=False) as archive:
+            return report, {name: archive[name] for name in archive.files}
+
+
+def _extract(module: str, file: Path, path: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
+    """Runs ``module``, which writes arrays to ``result``; returns the rest of its report."""
     size = file.stat().st_size
-    command = [sys.executable, "-m", "meshsplats.formats.usd.extraction", str(file), str(result)]
+    command = [sys.executable, "-m", module, str(file), str(result)]
     command += [] if origin is None else [repr(float(x)) for x in origin]
     places = os.pathsep.join(os.path.abspath(place) for place in sys.path if place)
     try:

@@ -1,0 +1,56 @@
+"""Directions and colours as users write them: options of commands, and what is printed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+NAMED_COLORS: dict[str, tuple[float, float, float]] = {
+    "white": (1.0, 1.0, 1.0),
+    "black": (0.0, 0.0, 0.0),
+    "grey": (0.5, 0.5, 0.5),
+    "gray": (0.5, 0.5, 0.5),
+}
+
+
+def parse_up(text: str) -> np.ndarray:
+    """(3,) direction from ``-y``, ``+z``, ``x`` or ``x,y,z``. Raises ValueError for anything else."""
+    axis = text.lower().lstrip("+-")
+    if axis in ("x", "y", "z") and len(text) <= 2:
+        direction = np.zeros(3)
+        direction["xyz".index(axis)] = -1 if text.startswith("-") else 1
+        return direction
+    numbers = _numbers(text)
+    if numbers is None or not any(numbers):
+        raise ValueError(f"--up must be an axis such as -y or z, or three numbers x,y,z, got {text!r}")
+    return np.array(numbers)
+
+
+def direction_in_words(direction: np.ndarray) -> str:
+    """An axis, or three numbers, as ``parse_up`` takes them."""
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) > 1 - 1e-6:
+        return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+    return ",".join(f"{value:.4g}" for value in direction)
+
+
+def parse_color(text: str) -> tuple[float, float, float]:
+    """RGB in [0, 1] from a name, ``#rrggbb`` or ``r,g,b``. Raises ValueError for anything else."""
+    if text.lower() in NAMED_COLORS:
+        return NAMED_COLORS[text.lower()]
+    if text.startswith("#") and len(text) == 7 and all(c in "0123456789abcdefABCDEF" for c in text[1:]):
+        red, green, blue = (int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))
+        return red, green, blue
+    numbers = _numbers(text)
+    if numbers is None or not all(0 <= v <= 1 for v in numbers):
+        raise ValueError(
+            f"--background must be {', '.join(NAMED_COLORS)}, #rrggbb, or r,g,b from 0 to 1, got {text!r}"
+        )
+    return numbers
+
+
+def _numbers(text: str) -> tuple[float, float, float] | None:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return (x, y, z) if np.isfinite([x, y, z]).all() else None

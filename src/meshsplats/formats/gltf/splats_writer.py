@@ -1,0 +1,125 @@
+"""Writes splats as binary glTF 2.0 with KHR_gaussian_splatting, ratified in 2026: a primitive of points.
+
+Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. Attributes are float and
+activated, in the axes that other writers of splats use: x left, y up, z forward. A node turns the cloud's
+``up`` to +y and puts it at its ``origin``; the mesh's ``extras.meshsplats`` name both, too. COLOR_0 is for
+viewers that know points only. What compresses splats in glTF (SPZ) is a draft, so it is read, not written.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats._geometry import rotation_rows
+from meshsplats.colors import srgb_to_linear
+from meshsplats.formats._orientation import HALF_TURN_Z
+from meshsplats.formats.gltf.splats import EXTENSION, turn_of
+from meshsplats.formats.splats._quantising import as_bytes
+from meshsplats.formats.writing import FormatWriter, Writing
+from meshsplats.gaussians import GaussianCloud
+
+_FLOAT, _UINT8 = 5126, 5121
+_ARRAY_BUFFER = 34962
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_MAX_BYTES = (1 << 32) - 1
+
+
+def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
+    """Writes ``cloud``; see ``save_gaussians``. ValueError for more than the 4 GiB that a file can hold."""
+    from meshsplats import __version__
+
+    turned = cloud.transformed(HALF_TURN_Z)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    attributes, parts, length = {}, [], 0
+    for name, array in _attributes(turned).items():
+        component = _UINT8 if array.dtype == np.uint8 else _FLOAT
+        accessor: dict[str, Any] = {"bufferView": len(views), "componentType": component, "count": len(cloud)}
+        accessor["type"] = _TYPES[1 if array.ndim == 1 else array.shape[1]]
+        if component == _UINT8:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor["min"], accessor["max"] = array.min(axis=0).tolist(), array.max(axis=0).tolist()
+        attributes[name] = len(accessors)
+        accessors.append(accessor)
+        size = {"buffer": 0, "byteOffset": length, "byteLength": array.nbytes}
+        views.append(size | {"target": _ARRAY_BUFFER})
+        parts.append(array)
+        length += array.nbytes  # all are multiples of 4 bytes
+    kind = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    kind |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
+    document = {
+        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "splats", "mesh": 0, **_place(cloud)}],
+        "meshes": [{"name": "splats", "primitives": [primitive], **_note(cloud)}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": length}],
+    }
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + length
+    if total > _MAX_BYTES:
+        raise ValueError(
+            f"{writing.where}: the splats would take {total:,} bytes, a .glb file can hold {_MAX_BYTES:,}:"
+            " write .ply, or .sog, which is a twentieth of it"
+        )
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A) + text)
+        file.write(struct.pack("<II", length, 0x004E4942))
+        for part in parts:
+            file.write(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).data)
+
+
+def _attributes(cloud: GaussianCloud) -> dict[str, np.ndarray]:
+    """By their names in the file, of ``cloud`` in its axes."""
+    colors = np.concatenate([srgb_to_linear(cloud.colors), cloud.opacities[:, None]], axis=1)
+    found = {
+        "POSITION": cloud.means,
+        "COLOR_0": as_bytes(colors * 255),
+        f"{EXTENSION}:ROTATION": cloud.quaternions[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": cloud.scales,
+        f"{EXTENSION}:OPACITY": cloud.opacities,
+    }
+    for degree in range(cloud.sh_degree + 1):
+        for i in range(2 * degree + 1):
+            found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = cloud.sh[:, degree * degree + i]
+    return found
+
+
+def _place(cloud: GaussianCloud) -> dict[str, Any]:
+    """Of the node."""
+    x, y, z, w = turn_of(cloud.up)
+    place = {} if w == 1 else {"rotation": [x, y, z, w]}
+    if cloud.origin.any():
+        turn = np.array(list(rotation_rows(w, x, y, z))) @ HALF_TURN_Z
+        place["translation"] = (turn @ cloud.origin + 0.0).tolist()
+    return place
+
+
+def _note(cloud: GaussianCloud) -> dict[str, Any]:
+    """What only this project reads of a mesh."""
+    note: dict[str, Any] = {"version": 1}
+    if cloud.up is not None:
+        note["up"] = cloud.up.astype(np.float64).tolist()
+    if cloud.origin.any():
+        note["origin"] = cloud.origin.tolist()
+    if cloud.kernel != "3dgs":
+        note["kernel"] = cloud.kernel
+    return {"extras": {"meshsplats": note}} if len(note) > 1 else {}
+
+
+def _bytes_a_splat(coefficients: int) -> float:
+    return 48 + 12 * coefficients
+
+
+WRITER = FormatWriter(write_splat_glb, _bytes_a_splat)
