@@ -10,8 +10,9 @@ struct MsWitnesses {
     const float *inverse;   // (pixels) inverse depths to be judged; 0: none
     const float *others;    // (pixels) those that judge them; 0: unknown
     const int32_t *judges;  // (views.count, judge_count) views that judge each; negative: none
-    uint8_t *agree, *past,
-        *seen;  // results, (pixels): judges that see the same place, past it, and it or past it
+    // Results, (pixels): judges that see the same place, that see past it, and that have it in the image with
+    // nothing known in front of it.
+    uint8_t *agree, *past, *seen;
     float tolerance, past_tolerance;  // relative to the depth
     int32_t judge_count;
 };
@@ -38,6 +39,9 @@ struct MsCarving {
 }  // extern "C"
 
 namespace ms {
+
+// What is known in front of a place hides it where it is nearer by this much more than what sees past it.
+constexpr float IN_FRONT = 0.02f;
 
 inline void count_witnesses(const MsWitnesses &input) {
     const MsViews &views = input.views;
@@ -72,7 +76,7 @@ inline void count_witnesses(const MsWitnesses &input) {
                             continue;
                         const float known = judge.inverse[(int64_t)row * warp.width + (int)column];
                         const float ratio = z / q * known;  // depth there by the depth that is known there
-                        seen += !(ratio > 1 + input.past_tolerance + 0.02f);
+                        seen += !(ratio > 1 + input.past_tolerance + IN_FRONT);
                         if (!(known > 0)) continue;
                         // What a pixel there is in depth: nearer matches cannot be expected.
                         const float du = (warp.shift[0] - column * warp.shift[2]) / z;
