@@ -109,7 +109,7 @@ def test_points_and_normals_lie_on_the_plane():
 
 def test_outlines_are_not_widened():
     """A square in front of a wall: what is confirmed lies on one of them, and the wall right beside the
-    square does not take its depth."""
+    square hardly takes its depth."""
 
     def view(camera):
         back = view_of(camera, (0, 0, 1), 4.0).image
@@ -126,6 +126,46 @@ def test_outlines_are_not_widened():
     assert (near | far)[found > 0].mean() > 0.97
     assert near[inside].mean() > 0.6
     assert (near & ~inside).sum() < 0.02 * inside.sum()
+
+
+def given_depths(maps: list[np.ndarray]) -> tuple[Layout, Planes, np.ndarray, np.ndarray]:
+    """What ``confirmed`` takes, for nine views of which each judges all others."""
+    layout = layout_of([view_of(camera, *FLAT) for camera in cameras_on_a_grid(step=0.1)])
+    inverse = np.concatenate([values.astype(np.float32).ravel() for values in maps])
+    judges = np.array([[j for j in range(9) if j != i] for i in range(9)], np.int32)
+    return layout, Planes(inverse, inverse, inverse, inverse), np.ones(layout.pixels, bool), judges
+
+
+def test_depths_that_other_views_do_not_have_are_dropped():
+    """A third of those of one view are too near, a third too far."""
+    maps = [inverse_of_plane(camera, *FLAT) for camera in cameras_on_a_grid(step=0.1)]
+    factor = np.random.default_rng(0).choice([1.0, 1.3, 0.75], maps[4].shape)
+    maps[4] = maps[4] * factor
+    layout, planes, fits, judges = given_depths(maps)
+    kept = layout.image(confirmed(layout, planes, fits, judges), 4) > 0
+    assert not kept[factor != 1].any()
+    lone = np.where(factor == 1, maps[4], 0)  # beside nothing else, as those are dropped for outlines
+    layout, planes, fits, judges = given_depths([*maps[:4], lone, *maps[5:]])
+    kept = layout.image(confirmed(layout, planes, fits, judges), 4) > 0
+    assert kept[factor == 1].all()
+    fits[:] = False
+    assert not confirmed(layout, planes, fits, judges).any()
+
+
+def test_rims_of_what_is_in_front_are_dropped():
+    """Windows widen a square in front of a wall by a pixel in every view, so that they confirm each other."""
+    maps, insides = [], []
+    for camera in cameras_on_a_grid(step=0.1):
+        reach = np.abs((camera.center + 2 * rays(camera))[..., :2]).max(axis=-1)
+        insides.append(reach < 0.4)
+        widened = reach < 0.4 + 2 / camera.fx
+        maps.append(np.where(widened, 1 / 2, 1 / 4))
+    layout, planes, fits, judges = given_depths(maps)
+    sure = confirmed(layout, planes, fits, judges)
+    for i, inside in enumerate(insides):
+        near = layout.image(sure, i) > 0.4
+        assert not near[~inside].any()
+        assert near.sum() > 0.5 * inside.sum()
 
 
 def test_a_plain_wall_is_filled_from_its_frame():

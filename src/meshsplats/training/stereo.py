@@ -54,7 +54,7 @@ WITNESSES = 2
 FEW = 3
 """... but one is enough where only so many views have the place in their image."""
 OUTLINE = 2
-"""Pixels around something nearer that are dropped where another depth begins: windows widen outlines."""
+"""Pixels of what is in front that are dropped beside what is farther: windows widen outlines."""
 BEHIND = 0.1
 """Relative difference of depth of an outline."""
 MATCHED_BYTES, PHOTO_BYTES = 150, 20
