@@ -3,12 +3,15 @@
     python benchmarks/training.py --data ../shared/data --scenes lego snowmiku --steps 2800
     python benchmarks/training.py --data ../shared/data --scenes lego --steps 600 --downscale 2 --vary
     python benchmarks/training.py --own --steps 200
+    python benchmarks/training.py --data ../shared/data --scenes bonsai saharov --start
+    python benchmarks/training.py --data ../shared/data --scenes bonsai saharov --minutes 10
 
 The seconds are processor time of all threads divided by --processors, so that other work on the machine
-does not count; reading and matching photographs does. --vary trains with one choice changed at a time: no
-growth, all images at full size, other numbers of fans at the start and sides. --own trains on 35 images of
-128 x 96 pixels of our own scenes: the still life inside a room, and a house outdoors below a sky, as they
-are, with photographs that are not what they should be, and with gains from 0.6 to 1.
+does not count; reading and matching photographs does. --start: no step, the fans that a training starts
+from. --vary trains with one choice changed at a time: no growth, all images at full size, other numbers of
+fans at the start and sides. --own trains on 35 images of 128 x 96 pixels of our own scenes: the still life
+inside a room, and a house outdoors below a sky, as they are, with photographs that are not what they should
+be, and with gains from 0.6 to 1.
 """
 
 from __future__ import annotations
@@ -20,20 +23,22 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from _common import PHOTOGRAPHED, Report, Stopwatch, arguments
+from _common import PHOTOGRAPHED, Report, Scene, Stopwatch, arguments
 
 import meshsplats as ms
 from meshsplats.datasets.views import ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.city import city_blocks
+from meshsplats.training.run import starting_fans
 
-SCENES = {name: PHOTOGRAPHED[name] for name in ("lego", "snowmiku")}
+SCENES = {name: PHOTOGRAPHED[name] for name in ("lego", "snowmiku")} | {
+    name: Scene(name, "", f"photos/{name}") for name in ("bonsai", "saharov")
+}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "no growth": {"growth_events": 0},
-    "start with all fans, no growth": {"growth_events": 0, "start_splats": 100_000},
     "all images at full size": {"quarter_share": 0.0, "half_share": 0.0},
-    "20,000 fans at the start": {"start_splats": 20_000},
+    "40,000 fans at the start": {"start_splats": 40_000},
     "4 sides": {"sides": 4},
     "8 sides": {"sides": 8},
     "position rates of short runs": {"rate_steps": 250},
@@ -50,14 +55,19 @@ def main() -> None:
     parser = arguments(__doc__, data=True)
     parser.add_argument("--own", action="store_true", help="our own scenes, in place of those of --data")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--steps", type=int, required=True)
+    length = parser.add_mutually_exclusive_group(required=True)
+    length.add_argument("--steps", type=int)
+    length.add_argument("--minutes", type=float)
+    length.add_argument("--start", action="store_true", help="no step: the fans at the start")
     parser.add_argument("--downscale", type=int, default=1, help="further factor of the images' sides")
     parser.add_argument("--max-splats", type=int, default=100_000)
-    parser.add_argument("--start-splats", type=int, default=40_000)
+    parser.add_argument("--start-splats", type=int, help="by default all of --max-splats")
     parser.add_argument("--vary", action="store_true", help="all variants, not the default alone")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--processors", type=int, default=2, help="that processor time is divided by")
     options = parser.parse_args()
+    if options.own and not options.steps:
+        parser.error("--own needs --steps")
     with Report(options) as report:
         if options.own:
             own_scenes(report, options)
@@ -76,9 +86,13 @@ def row(name: str, variant: str, options: argparse.Namespace) -> tuple[str, ...]
         data = data.over((0, 0, 0))
     fans_allowed = {"max_splats": options.max_splats, "start_splats": options.start_splats}
     changes = {**fans_allowed, **VARIANTS[variant]}
-    config = ms.train_config(steps=options.steps, **changes)
-    run = ms.RunOptions(threads=options.threads)
-    mesh = ms.train(ms.Dataset(data.train), config, points=ms.load_points(folder), run=run)
+    length = {"minutes": options.minutes} if options.minutes else {"steps": options.steps or 1}
+    config = ms.train_config(**length, **changes)
+    train, points = ms.Dataset(data.train), ms.load_points(folder)
+    if options.start:
+        mesh = starting_fans(train, config, points, options.threads)
+    else:
+        mesh = ms.train(train, config, points=points, run=ms.RunOptions(threads=options.threads))
     seconds = watch.idle(options.processors)
     method = ms.evaluate(mesh, data, fit_exposure=True, threads=options.threads).method("mesh")
     fans = len(mesh.vertices) // (1 + config.sides)

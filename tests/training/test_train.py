@@ -132,6 +132,15 @@ def test_the_budget_holds(ball, trained):
 # ---- Photographs that are not what they should be
 
 
+def test_the_start_fills_the_budget():
+    """But for masked photographs, whose fans growth puts where they are needed."""
+    config = train_config(max_splats=1000)
+    assert [config.first_splats(masked) for masked in (False, True)] == [1000, 400]
+    assert train_config(max_splats=1000, start_splats=300).first_splats(False) == 300
+    assert train_config(max_splats=1000, start_splats=3000).first_splats(True) == 1000
+    assert train_config(max_splats=1).first_splats(True) == 1
+
+
 @pytest.mark.parametrize("scene", ["ball", "room"])
 def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
     """The others still give a mesh, and none of them is named, not even blurred ones."""

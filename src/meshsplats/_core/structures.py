@@ -278,6 +278,90 @@ class MergingStruct(CoreStruct):
     ]
 
 
+class ViewsStruct(CoreStruct):
+    _fields_ = [
+        ("cameras", c_void_p),
+        ("start", c_void_p),
+        ("count", c_int32),
+        ("threads", c_int32),
+    ]
+
+
+class MatchingStruct(CoreStruct):
+    _fields_ = [
+        ("photos", ViewsStruct),
+        ("color", c_void_p),
+        ("matched", ViewsStruct),
+        ("photo", c_void_p),
+        ("sources", c_void_p),
+        ("range", c_void_p),
+        ("inverse", c_void_p),
+        ("along_x", c_void_p),
+        ("along_y", c_void_p),
+        ("score", c_void_p),
+        ("source_count", c_int32),
+        ("planes", c_int32),
+        ("rounds", c_int32),
+    ]
+
+
+class WitnessesStruct(CoreStruct):
+    _fields_ = [
+        ("views", ViewsStruct),
+        ("inverse", c_void_p),
+        ("others", c_void_p),
+        ("judges", c_void_p),
+        ("agree", c_void_p),
+        ("past", c_void_p),
+        ("seen", c_void_p),
+        ("tolerance", c_float),
+        ("past_tolerance", c_float),
+        ("judge_count", c_int32),
+    ]
+
+
+class FillingStruct(CoreStruct):
+    _fields_ = [
+        ("views", ViewsStruct),
+        ("color", c_void_p),
+        ("inverse", c_void_p),
+        ("along_x", c_void_p),
+        ("along_y", c_void_p),
+        ("known", c_void_p),
+        ("result", c_void_p),
+        ("per_pixel", c_float),
+    ]
+
+
+class CarvingStruct(CoreStruct):
+    _fields_ = [
+        ("views", ViewsStruct),
+        ("inverse", c_void_p),
+        ("points", c_void_p),
+        ("agree", c_void_p),
+        ("past", c_void_p),
+        ("count", c_int64),
+        ("tolerance", c_float),
+        ("past_tolerance", c_float),
+    ]
+
+
+class FusionStruct(CoreStruct):
+    _fields_ = [
+        ("points", c_void_p),
+        ("normals", c_void_p),
+        ("pixels", c_void_p),
+        ("colors", c_void_p),
+        ("sure", c_void_p),
+        ("patches", c_void_p),
+        ("count", c_int64),
+        ("wanted", c_int32),
+        ("threads", c_int32),
+        ("largest", c_float),
+        ("found", c_int32),
+    ]
+
+
 class _Field(ctypes.Structure):
     """MsField of csrc/layout.h."""
 

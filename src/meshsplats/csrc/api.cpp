@@ -14,15 +14,18 @@
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
 #include "listing.h"
+#include "fusion.h"
 #include "merging.h"
 #include "ordering.h"
 #include "viewer.h"
+#include "witnesses.h"
 #endif
 #include "mesh_tile.h"
 #include "shading.h"
 #include "splat_order_tile.h"
 #include "splats.h"
 #include "ssim.h"
+#include "stereo.h"
 
 #if defined(_WIN32)
 #define MS_EXPORT __declspec(dllexport)
@@ -246,7 +249,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 11; }
+MS_EXPORT int ms_interface_version() { return 13; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -339,6 +342,10 @@ MS_EXPORT int ms_shade_backward(const MsShading *shading, char *message, int mes
     return guarded(message, message_size, [&] { ms::Shading(*shading).backward(); });
 }
 
+MS_EXPORT int ms_match_photos(const MsMatching *matching, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::Matching(*matching).run(); });
+}
+
 #ifndef MS_WIDE_ONLY
 MS_EXPORT int ms_nearest(const MsNearest *points, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::find_nearest(*points); });
@@ -358,6 +365,22 @@ MS_EXPORT int ms_order_triangles(MsOrdering *ordering, char *message, int messag
 
 MS_EXPORT int ms_list_triangles(const MsListing *listing, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::Listing(*listing).run(); });
+}
+
+MS_EXPORT int ms_count_witnesses(const MsWitnesses *witnesses, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::count_witnesses(*witnesses); });
+}
+
+MS_EXPORT int ms_fill_depths(const MsFilling *filling, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::fill_depths(*filling); });
+}
+
+MS_EXPORT int ms_count_views(const MsCarving *carving, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::count_views(*carving); });
+}
+
+MS_EXPORT int ms_fuse_points(MsFusion *fusion, char *message, int message_size) {
+    return guarded(message, message_size, [&] { fusion->found = ms::Fusion(*fusion).run(); });
 }
 #endif
 

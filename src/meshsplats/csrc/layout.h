@@ -10,12 +10,15 @@
 #include "fans.h"
 #ifndef MS_WIDE_ONLY
 #include "listing.h"
+#include "fusion.h"
 #include "merging.h"
 #include "ordering.h"
 #include "viewer.h"
+#include "witnesses.h"
 #endif
 #include "shading.h"
 #include "ssim.h"
+#include "stereo.h"
 #include "types.h"
 
 extern "C" {
@@ -178,6 +181,25 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsShading, gradient),
     MS_FIELD(MsShading, color_gradient),
     MS_FIELD(MsShading, harmonic_gradient),
+    MS_WHOLE(MsViews),
+    MS_FIELD(MsViews, cameras),
+    MS_FIELD(MsViews, start),
+    MS_FIELD(MsViews, count),
+    MS_FIELD(MsViews, threads),
+    MS_WHOLE(MsMatching),
+    MS_FIELD(MsMatching, photos),
+    MS_FIELD(MsMatching, color),
+    MS_FIELD(MsMatching, matched),
+    MS_FIELD(MsMatching, photo),
+    MS_FIELD(MsMatching, sources),
+    MS_FIELD(MsMatching, range),
+    MS_FIELD(MsMatching, inverse),
+    MS_FIELD(MsMatching, along_x),
+    MS_FIELD(MsMatching, along_y),
+    MS_FIELD(MsMatching, score),
+    MS_FIELD(MsMatching, source_count),
+    MS_FIELD(MsMatching, planes),
+    MS_FIELD(MsMatching, rounds),
 #ifndef MS_WIDE_ONLY
     MS_WHOLE(MsNearest),
     MS_FIELD(MsNearest, count),
@@ -248,6 +270,47 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsListing, listed_splat),
     MS_FIELD(MsListing, node_count),
     MS_FIELD(MsListing, threads),
+    MS_WHOLE(MsWitnesses),
+    MS_FIELD(MsWitnesses, views),
+    MS_FIELD(MsWitnesses, inverse),
+    MS_FIELD(MsWitnesses, others),
+    MS_FIELD(MsWitnesses, judges),
+    MS_FIELD(MsWitnesses, agree),
+    MS_FIELD(MsWitnesses, past),
+    MS_FIELD(MsWitnesses, seen),
+    MS_FIELD(MsWitnesses, tolerance),
+    MS_FIELD(MsWitnesses, past_tolerance),
+    MS_FIELD(MsWitnesses, judge_count),
+    MS_WHOLE(MsFilling),
+    MS_FIELD(MsFilling, views),
+    MS_FIELD(MsFilling, color),
+    MS_FIELD(MsFilling, inverse),
+    MS_FIELD(MsFilling, along_x),
+    MS_FIELD(MsFilling, along_y),
+    MS_FIELD(MsFilling, known),
+    MS_FIELD(MsFilling, result),
+    MS_FIELD(MsFilling, per_pixel),
+    MS_WHOLE(MsCarving),
+    MS_FIELD(MsCarving, views),
+    MS_FIELD(MsCarving, inverse),
+    MS_FIELD(MsCarving, points),
+    MS_FIELD(MsCarving, agree),
+    MS_FIELD(MsCarving, past),
+    MS_FIELD(MsCarving, count),
+    MS_FIELD(MsCarving, tolerance),
+    MS_FIELD(MsCarving, past_tolerance),
+    MS_WHOLE(MsFusion),
+    MS_FIELD(MsFusion, points),
+    MS_FIELD(MsFusion, normals),
+    MS_FIELD(MsFusion, pixels),
+    MS_FIELD(MsFusion, colors),
+    MS_FIELD(MsFusion, sure),
+    MS_FIELD(MsFusion, patches),
+    MS_FIELD(MsFusion, count),
+    MS_FIELD(MsFusion, wanted),
+    MS_FIELD(MsFusion, threads),
+    MS_FIELD(MsFusion, largest),
+    MS_FIELD(MsFusion, found),
 #endif
 };
 

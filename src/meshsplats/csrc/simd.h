@@ -3,6 +3,8 @@
 // mul_add and reciprocal are the exceptions.
 #pragma once
 
+#include <cstdint>
+
 #if defined(__SSE2__)
 #include <immintrin.h>
 #endif
@@ -71,6 +73,40 @@ inline vf reciprocal(vf a) {
 }
 #else
 inline vf reciprocal(vf a) { return 1 / a; }
+#endif
+
+// Square roots, rounded as IEEE demands.
+#if defined(__AVX512F__)
+inline vf vsqrt(vf a) { return _mm512_sqrt_ps(a); }
+#elif defined(__AVX2__)
+inline vf vsqrt(vf a) { return _mm256_sqrt_ps(a); }
+#elif defined(__SSE2__)
+inline vf vsqrt(vf a) { return _mm_sqrt_ps(a); }
+#else
+inline vf vsqrt(vf a) {
+    for (int i = 0; i < W; ++i) a[i] = __builtin_sqrtf(a[i]);
+    return a;
+}
+#endif
+
+// Integers beside the floats, for indices: truncated floats, and the words at these indices.
+typedef int vi __attribute__((vector_size(4 * W)));
+inline vi truncated(vf a) { return __builtin_convertvector(a, vi); }
+inline vf as_floats(vi a) { return __builtin_convertvector(a, vf); }
+#if defined(__AVX512F__)
+inline vi gather(const uint32_t *words, vi index) {
+    return (vi)_mm512_i32gather_epi32((__m512i)index, words, 4);
+}
+#elif defined(__AVX2__)
+inline vi gather(const uint32_t *words, vi index) {
+    return (vi)_mm256_i32gather_epi32((const int *)words, (__m256i)index, 4);
+}
+#else
+inline vi gather(const uint32_t *words, vi index) {
+    vi result{};
+    for (int i = 0; i < W; ++i) result[i] = (int)words[index[i]];
+    return result;
+}
 #endif
 
 // Masks: one flag per lane. Comparisons with NaN are false.

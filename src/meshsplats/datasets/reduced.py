@@ -79,12 +79,9 @@ def reduced_views(views: Sequence[View], factor: float, store: ImageCache) -> tu
 def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
     """``image`` at a smaller size. Pixels that do not count are left out of the means; a new pixel counts if
     all pixels that it covers do."""
-    rows = _mixing(image.color.shape[0], height)
-    columns = _mixing(image.color.shape[1], width)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        mixed = np.einsum("yh,hw...,xw->yx...", rows, values.astype(np.float32), columns, optimize=True)
-        return np.ascontiguousarray(mixed)
+        return _means(_means(values.astype(np.float32), height, 0), width, 1)
 
     unit = np.float32(255 if image.color.dtype == np.uint8 else 1)
     known = image.color if image.mask is None else np.where(image.mask[..., None], image.color, 0)
@@ -94,10 +91,19 @@ def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
     return ViewImage(color, alpha, mask)
 
 
-def _mixing(before: int, after: int) -> np.ndarray:
-    """(after, before) float32 shares of the old pixels in each new one along an axis; rows add up to 1."""
-    edges = np.linspace(0, before, after + 1)
-    starts = np.arange(before)
-    overlap = np.minimum(edges[1:, None], starts + 1) - np.maximum(edges[:-1, None], starts)
-    shares = np.maximum(overlap, 0)
-    return (shares / shares.sum(axis=1, keepdims=True)).astype(np.float32)
+def _means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
+    """The means of float32 ``values`` over ``size`` equal spans along an axis."""
+    before = values.shape[axis]
+    edges = np.linspace(0, before, size + 1)
+    first = np.minimum(edges[:-1].astype(int), before - 1)
+    shape = [1] * values.ndim
+    shape[axis] = size
+    result = np.zeros((*values.shape[:axis], size, *values.shape[axis + 1 :]), np.float32)
+    for k in range(int((np.ceil(edges[1:] - 1e-9) - first).max())):
+        # Each span holds the k-th entry from its first one by this share.
+        share = np.minimum(edges[1:], first + k + 1) - np.maximum(edges[:-1], first + k)
+        share = np.maximum(share, 0) * (size / before)
+        entries = np.take(values, np.minimum(first + k, before - 1), axis=axis)
+        entries *= share.astype(np.float32).reshape(shape)
+        result += entries
+    return result

@@ -8,6 +8,9 @@ from typing import Annotated, Any, Literal
 from meshsplats._options import Advanced, Fixed, Range, check_names
 from meshsplats.finetuning.config import LENGTHS, BackgroundMode, FinetuneConfig
 
+MASKED_SHARE = 0.4
+"""Fans at the start from masked photographs, as a share of ``max_splats``. Lego, 300 steps at half the size:
+30.8 dB, with all of them 30.3."""
 _GROWS = "while the set of fans grows; finetune has it"
 
 
@@ -40,8 +43,9 @@ class TrainConfig(FinetuneConfig):
     exposure_rate: float = 0.01
     max_splats: Annotated[int, Range(1, 10**7)] = 100_000
     """Largest number of fans."""
-    start_splats: Annotated[int, Range(1, 10**7)] = 40_000
-    """About the number of fans at the start, at most max_splats."""
+    start_splats: Annotated[int | None, Range(1, 10**7)] = None
+    """About the number of fans at the start, at most max_splats, which is the default. For masked
+    photographs it is 40 % of it: growth puts the others where they are needed."""
     sh_degree: Annotated[int, Range(0, 3)] = 2
     """Degree of the spherical harmonics by which the colour of a fan depends on the view. 0: it does not."""
     sides: Annotated[int, Range(3, 16)] = 6
@@ -62,6 +66,11 @@ class TrainConfig(FinetuneConfig):
     """Background of the images. random: a new colour in every step, which masked photographs show around the
     subject, and others where nothing covers it. mixed: random in every fourth step, otherwise that of the
     data set."""
+
+    def first_splats(self, masked: bool) -> int:
+        """About the number of fans at the start, from ``masked`` photographs or others."""
+        default = round(MASKED_SHARE * self.max_splats) if masked else self.max_splats
+        return min(self.start_splats or max(default, 1), self.max_splats)
 
 
 def train_config(**changes: Any) -> TrainConfig:

@@ -8,42 +8,46 @@ from dataclasses import replace
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats._geometry import quaternions_of
+from meshsplats._core.stereo import SurfaceArrays
 from meshsplats.camera import Camera
 from meshsplats.conversion import convert
 from meshsplats.datasets.points import ScenePoints
-from meshsplats.datasets.views import View
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.datasets.reduced import reduced_views
+from meshsplats.datasets.views import ImageCache, View
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import scatter_to_vertices
 from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
-from meshsplats.training.patches import Patches, SurfacePoints, merged, sums_around
-from meshsplats.training.stereo import SIDE, WITNESSES, dense_points
+from meshsplats.training.patches import Patches, flat_splats, fused
+from meshsplats.training.stereo import REFERENCES, SIDE, find_depths
 
 COLOR_VIEWS = 40
-"""Maximum number of training views, evenly spread, that give the first colours."""
+"""Maximum number of training views, evenly spread, that give the first colours..."""
+COLOR_SIDES = (200, 400)
+"""... and the longer sides of their images in pixels, at most, for these colours and for their errors."""
+ERROR_PIXELS = 0.5
+"""Added to the pixels that a vertex has errors in: those of few pixels may be those of its neighbours."""
 NEAREST_POINTS = 2000
 """Points, at most, among which the nearest is looked for."""
 OPACITY = 0.8
-"""Opacity of fans at the start."""
-FILL_OPACITY = 0.2
-"""That of fans between matched depths, which may hang in front of a sky: the views decide."""
-SIGMA = 0.6
-"""Standard deviation of a fan on a surface, in sides of its patch."""
+"""Opacity of fans at the start that no matched photographs show: on hulls and the shell."""
 ROUGH_CELLS = 5000
 """Cells of the hull that bounds the depths in which photographs are matched."""
 MIN_TRACK = 3
 """Views that must show a known point."""
 FEWEST_POINTS = 30
 """Points that bound the depths in a view, at least."""
-NEARER, FARTHER = 0.6, 3.0
-"""Depths are tried from this multiple of the least depth of the points to that of the greatest."""
-SHELL_SHARE = 0.25
+RANGE_POINTS = 20_000
+"""Points, at most, that ranges of depth are taken from."""
+NEARER, FARTHER = 0.6, 60.0
+"""Depths are tried from this multiple of the least depth of the points to that of the greatest: outdoors,
+all known points may lie on what stands in front."""
+SHELL_SHARE = 0.06
 """Share of the fans at the start that the shell around everything has."""
-SHELL_DISTANCE = 1.3
-"""Radius of the shell, as a multiple of the distance of the farthest points but one in fifty."""
+SHELL_DISTANCE = 1.2
+"""Radius of the shell, as a multiple of the distance of the farthest points but one in two hundred."""
 SHELL_VIEWS, SHELL_SIDE = 48, 100
 """Maximum number of views, evenly spread, and of pixels along a side of their images, in which it is found
 where the shell is needed."""
@@ -57,44 +61,56 @@ BACKDROP_DISTANCE = 1.25
 """Radius of the backdrop, as a multiple of that of the shell."""
 COVERED = 0.98
 """Alpha of the other fans from which the shell is not needed behind them."""
-FILL_WEIGHT = 2
-"""Weight of a point that was not matched itself against one that was: it stands for more pixels."""
 FREE_VIEWS = 3
 """Views that must see past a cell of the hull to make it empty."""
 
 
 def starting_patches(
-    views: Sequence[View], count: int, points: ScenePoints | None = None
+    views: Sequence[View], count: int, points: ScenePoints | None = None, threads: int | None = None
 ) -> tuple[Patches | None, Patches | None]:
-    """About ``count`` pieces of the surfaces that ``views`` show, if any is found; and those of the shell
+    """At most ``count`` pieces of the surfaces that ``views`` show, if any is found; and those of the shell
     around the scene, where nothing masks the background.
 
     ``points``: known points of the scene.
     """
     if has_silhouettes(views):
-        return _masked_patches(views, count), None
+        return _masked_patches(views, count, threads), None
     known = None if points is None else points.positions[points.views >= MIN_TRACK]
     if known is not None and len(known) < FEWEST_POINTS:
         known = None
     near, far, targets = ranges_of_points(views, known) if known is not None else ranges_of_cameras(views)
-    depths = dense_points(views, near, far, targets)
-    parts = [
-        SurfacePoints.alike(depths.points, depths.colors, 1, OPACITY),
-        SurfacePoints.alike(*depths.between(), FILL_WEIGHT, FILL_OPACITY),
-    ]
+    depths = find_depths(views, near, far, targets if known is None else known, threads)
+    origin = np.median([view.camera.center for view in views], axis=0)
+    surface = depths.surface(origin)
     if known is not None and points is not None:
-        tints = points.colors[points.views >= MIN_TRACK].astype(np.float32) / np.float32(255)
-        parts.append(SurfacePoints.alike(known, tints, WITNESSES, OPACITY))
-    surfaces = SurfacePoints.joined(*parts)
-    places = surfaces.positions
+        tints = points.colors[points.views >= MIN_TRACK]
+        surface = _with_points(surface, known - origin, tints, pixel_sizes(views, known))
     shell = int(SHELL_SHARE * count)
     dense = None
-    if len(places):
-        dense = merged(surfaces, pixel_sizes(views, places), count - shell)
-    return dense, shell_patches(views, dense, shell_radius(views, places, far), shell)
+    if len(surface.points):
+        dense = fused(surface, origin, depths, count - shell, threads)
+    if dense is not None and not len(dense.points):
+        dense = None
+    radius = shell_radius(views, surface.points.astype(np.float64) + origin, far)
+    return dense, shell_patches(views, dense, radius, shell)
 
 
-def _masked_patches(views: Sequence[View], count: int) -> Patches:
+def _with_points(
+    surface: SurfaceArrays, places: np.ndarray, colors: np.ndarray, pixels: np.ndarray
+) -> SurfaceArrays:
+    """``surface`` and known points (n, 3)."""
+    n = len(places)
+    known = SurfaceArrays(
+        places.astype(np.float32),
+        np.zeros((n, 3), np.float32),
+        pixels.astype(np.float32),
+        colors.astype(np.uint8),
+        np.ones(n, np.uint8),
+    )
+    return SurfaceArrays(*(np.concatenate(pair) for pair in zip(surface, known, strict=True)))
+
+
+def _masked_patches(views: Sequence[View], count: int, threads: int | None) -> Patches:
     """The surface of the subject inside the silhouettes."""
     rough = carve(views, ROUGH_CELLS)
     if rough is None:
@@ -103,24 +119,26 @@ def _masked_patches(views: Sequence[View], count: int) -> Patches:
             " masks do not fit each other"
         )
     near, far = depth_ranges(views, rough.points)
-    target = np.tile(rough.points.mean(axis=0), (len(views), 1))
-    depths = dense_points(views, near, far, target)
-    inside = in_silhouettes(views, depths.points, 0.5 * depths.pixels)
-    points, colors = depths.points[inside], depths.colors[inside]
-    hull = carve(views, count // 2, lambda points: depths.free(points) < FREE_VIEWS)
+    depths = find_depths(views, near, far, rough.points, threads)
+    origin = rough.points.mean(axis=0)
+    surface = depths.surface(origin)
+    places = surface.points.astype(np.float64) + origin
+    inside = in_silhouettes(views, places, 0.5 * surface.pixels)
+    surface, places = SurfaceArrays(*(column[inside] for column in surface)), places[inside]
+    hull = carve(views, count // 2, lambda points: depths.counts(points, threads)[1] < FREE_VIEWS)
     hull = rough if hull is None else hull
-    rest = _uncolored(hull.points, hull.normals, hull.side)
-    if not len(points):
+    rest = Patches.squares(hull.points, hull.normals, hull.side, OPACITY)
+    if not len(places):
         return rest
-    surfaces = SurfacePoints.alike(points, colors, 1, OPACITY)
-    dense = merged(surfaces, pixel_sizes(views, points), count)
-    return Patches.joined(dense, rest.select(apart(hull.points, dense.points, 1.5 * hull.side)))
+    rest = rest.select(apart(hull.points, places, 1.5 * hull.side))
+    dense = fused(surface, origin, depths, max(count - len(rest.points), count // 2), threads)
+    return Patches.joined(dense, rest)
 
 
 def ranges_of_points(views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(views,) least and greatest depth for each view, (views, 3) a point it looks at: from the ``points``
     (n, 3) in its image, or from all views where it has few."""
-    found = []
+    found, points = [], subsample(points, RANGE_POINTS)
     for view in views:
         positions, depth = view.camera.project(points)
         depth = depth[view.camera.in_image(positions)]
@@ -158,7 +176,7 @@ def pixel_sizes(views: Sequence[View], points: np.ndarray) -> np.ndarray:
     """(n,) least size of a pixel at ``points`` (n, 3) in the images of ``views`` for matching, scene
     units; the median where no view sees a point."""
     least = np.full(len(points), np.inf)
-    for view in views:
+    for view in subsample(views, REFERENCES):
         camera = view.camera.within(SIDE)
         positions, depth = camera.project(points)
         size = np.where(camera.in_image(positions), depth / camera.fx, np.inf)
@@ -176,7 +194,7 @@ def shell_radius(views: Sequence[View], points: np.ndarray, far: np.ndarray) -> 
     outermost = float(np.linalg.norm(centers - middle, axis=1).max())
     if len(points) < FEWEST_POINTS:
         return float(np.median(far)) + outermost
-    distance = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
+    distance = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.995))
     return max(SHELL_DISTANCE * distance, 1.5 * outermost)
 
 
@@ -234,15 +252,7 @@ def _pieces(middle: np.ndarray, radius: float, directions: np.ndarray, total: in
     """Those in the given ``directions`` (n, 3) of ``total`` pieces of a sphere around ``middle``."""
     side = radius * np.sqrt(4 * np.pi / total)
     # Pieces overlap, as nothing is behind them.
-    return _uncolored(middle + radius * directions, -directions, 1.6 * side)
-
-
-def _uncolored(points: np.ndarray, normals: np.ndarray, side: float) -> Patches:
-    """Grey patches of equal ``side`` at ``points`` (n, 3)."""
-    n = len(points)
-    return Patches(
-        points, normals, np.full((n, 3), 0.5, np.float32), np.full(n, float(side)), np.full(n, OPACITY)
-    )
+    return Patches.squares(middle + radius * directions, -directions, 1.6 * side, OPACITY)
 
 
 def _sphere(count: int) -> np.ndarray:
@@ -257,8 +267,20 @@ def _sphere(count: int) -> np.ndarray:
 def apart(points: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
     """(n,) bool: ``points`` (n, 3) with none of ``others`` (m, 3) in their cell of side ``distance`` and the
     26 beside it."""
-    low = np.concatenate([points, others]).min(axis=0)
-    return sums_around(others, points, low, distance)[0] == 0
+    low = np.concatenate([points, others]).min(axis=0) - distance
+
+    def cell_of(positions: np.ndarray) -> np.ndarray:
+        cells = np.clip((positions - low) / distance, 0, 2**20 - 1).astype(np.int64)
+        return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+
+    held, wanted = np.unique(cell_of(others)), cell_of(points)
+    near = np.zeros(len(points), bool)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            for k in (-1, 0, 1):
+                beside = wanted + ((i << 42) + (j << 21) + k)
+                near |= held[np.minimum(np.searchsorted(held, beside), len(held) - 1)] == beside
+    return ~near
 
 
 def depth_ranges(views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -272,23 +294,6 @@ def depth_ranges(views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray,
     return near, far
 
 
-def flat_splats(patches: Patches) -> GaussianCloud:
-    """A flat splat on each of ``patches``."""
-    normals = patches.normals
-    least = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    first = np.cross(normals, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    frames = np.stack([first, np.cross(normals, first), normals], axis=2)
-    return GaussianCloud(
-        patches.points,
-        quaternions_of(frames),
-        SIGMA * patches.sides[:, None] * [1, 1, 0],
-        patches.opacities,
-        (patches.colors[:, None] - 0.5) / SH_C0,
-        kernel="2dgs",
-    )
-
-
 def fans_of(cloud: GaussianCloud, sides: int) -> SplatMesh:
     """One fan of ``sides`` triangles for each splat, in order; none is left out."""
     return convert(
@@ -300,25 +305,19 @@ def colored(
     mesh: SplatMesh, views: Sequence[View], threads: int | None, unseen_from: int | None = None
 ) -> SplatMesh:
     """``mesh`` with colours from the images of ``views``: for each vertex the mean over the pixels that it is
-    blended into, with the weights of the blending.
+    blended into, with the weights of the blending; then once more by what is left of their errors, in larger
+    images.
 
     Vertices from index ``unseen_from`` on that no view shows take the colour of the nearest one among them
     that is seen.
     """
-    sums = np.zeros((len(mesh.vertices), 4))
-    for view in subsample(views, COLOR_VIEWS):
-        image = view.load()
-        values = np.zeros((len(mesh.vertices), 4), np.float32)
-        rendering = CpuEngine(threads).tape(mesh.triangles._replace(values=values), view.camera)
-        # Colour times alpha, and alpha: mixed pixels on the outline show other things, too.
-        alpha = np.ones(image.color.shape[:2], np.float32) if view.alpha is None else view.alpha.copy()
-        if image.mask is not None:
-            alpha[~image.mask] = 0
-        values = np.concatenate([image.over((0, 0, 0)), np.ones_like(alpha)[..., None]], axis=2)
-        values[..., 3] = alpha
-        values[alpha == 0] = 0
-        sums += scatter_to_vertices(rendering, values)
+    longest = max(max(view.camera.width, view.camera.height) for view in views)
+    small, large = (
+        reduced_views(subsample(views, COLOR_VIEWS), min(1.0, side / longest), ImageCache(0))
+        for side in COLOR_SIDES
+    )
     colors = mesh.colors.copy()
+    sums = _color_sums(mesh, small, threads, errors=False)
     seen = sums[:, 3] > 1e-6
     colors[seen, :3] = np.clip(sums[seen, :3] / sums[seen, 3:], 0, 1)
     if unseen_from is not None:
@@ -326,7 +325,31 @@ def colored(
         known = np.flatnonzero(seen[unseen_from:]) + unseen_from
         if len(rows) and len(known):
             colors[rows, :3] = colors[_nearest(mesh.vertices[known], mesh.vertices[rows], known), :3]
+    mesh = replace(mesh, colors=colors)
+    sums = _color_sums(mesh, large, threads, errors=True)
+    colors = colors.copy()
+    colors[:, :3] = np.clip(colors[:, :3] + sums[:, :3] / (sums[:, 3:] + ERROR_PIXELS), 0, 1)
     return replace(mesh, colors=colors)
+
+
+def _color_sums(mesh: SplatMesh, views: Sequence[View], threads: int | None, errors: bool) -> np.ndarray:
+    """(v, 4) sums over the pixels that each vertex of ``mesh`` is blended into, by its weight in them: RGB of
+    ``views``, or what the mesh lacks of it (``errors``), and the weights."""
+    sums = np.zeros((len(mesh.vertices), 4))
+    triangles = mesh.triangles._replace(values=np.zeros((len(mesh.vertices), 4), np.float32))
+    for view in views:
+        image = view.load()
+        rendering = CpuEngine(threads).tape(triangles, view.camera)
+        # Colour times alpha, and alpha: mixed pixels on the outline show other things, too.
+        alpha = np.ones(image.color.shape[:2], np.float32) if view.alpha is None else view.alpha.copy()
+        if image.mask is not None:
+            alpha[~image.mask] = 0
+        values = np.concatenate([image.over((0, 0, 0)), alpha[..., None]], axis=2)
+        if errors:
+            values[..., :3] -= rendering.color
+        values[alpha == 0] = 0
+        sums += scatter_to_vertices(rendering, values)
+    return sums
 
 
 def _nearest(points: np.ndarray, places: np.ndarray, indices: np.ndarray) -> np.ndarray:

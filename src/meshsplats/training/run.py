@@ -26,10 +26,10 @@ from meshsplats.rendering.devices import engine
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.growing import REDUCED_PART, Growing
 from meshsplats.training.growth import SHELL
-from meshsplats.training.hull import carving_bytes
-from meshsplats.training.initial import colored, fans_of, flat_splats, starting_patches
-from meshsplats.training.patches import Patches
-from meshsplats.training.stereo import MATCHING_BYTES
+from meshsplats.training.hull import carving_bytes, has_silhouettes
+from meshsplats.training.initial import colored, fans_of, starting_patches
+from meshsplats.training.patches import Patches, flat_splats
+from meshsplats.training.stereo import matching_bytes
 
 SHOWN_NAMES = 10
 """Maximum number of such photographs that are named."""
@@ -119,7 +119,7 @@ def train(
 
 def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
     """Estimated peak memory in bytes of a process that trains. MemoryError if there is less."""
-    fans = max(config.max_splats, config.start_splats)
+    fans = config.max_splats
     vertices = fans * (1 + config.sides)
     needed = estimate_bytes(vertices, fans * config.sides, dataset, cache_bytes)
     if config.sh_degree:
@@ -128,7 +128,7 @@ def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes:
     views, store = dataset.train, ImageCache(0)
     reduced = [*reduced_views(views, 0.25, store), *reduced_views(views, 0.5, store)]
     needed += min(sum(view.source.nbytes for view in reduced), cache_bytes // REDUCED_PART)
-    needed += max(MATCHING_BYTES, carving_bytes(views, min(config.start_splats, config.max_splats)))
+    needed += max(matching_bytes(views), carving_bytes(views, config.first_splats(masked=True)))
     what = f"training {config.max_splats:,} fans on {len(dataset.views):,} images"
     check_bytes(needed, what, "allow fewer fans (--max-splats)")
     return needed
@@ -139,14 +139,14 @@ def starting_fans(
 ) -> SplatMesh:
     """The fans that a training starts from, coloured from the training views; see ``train``."""
     views = dataset.train
-    count = min(config.start_splats, config.max_splats)
-    patches, shell = starting_patches(views, count, points)
+    count = config.first_splats(has_silhouettes(views))
+    patches, shell = starting_patches(views, count, points, threads)
     parts = [part for part in (patches, shell) if part is not None]
     if not parts:
         raise ValueError("the photographs have nothing in common that a mesh could start from")
     joined = Patches.joined(*parts)
-    count = len(joined.points)
-    chosen = np.linspace(0, count - 1, min(count, config.max_splats)).astype(int)
+    found = len(joined.points)
+    chosen = np.linspace(0, found - 1, min(found, config.max_splats)).astype(int)
     mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
     up = guess_up(cameras=[view.camera for view in views])
     harmonics = None
@@ -155,7 +155,7 @@ def starting_fans(
     mesh = replace(mesh, up=up, origin=dataset.origin, harmonics=harmonics)
     if shell is None:
         return colored(mesh, views, threads)
-    in_shell = np.repeat(chosen >= count - len(shell.points), 1 + config.sides)
+    in_shell = np.repeat(chosen >= found - len(shell.points), 1 + config.sides)
     mesh = colored(mesh, views, threads, int(np.count_nonzero(~in_shell)))
     return replace(mesh, attributes={SHELL: in_shell.astype(np.float32)})
 

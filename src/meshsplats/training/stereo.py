@@ -1,298 +1,305 @@
-"""Depth from pairs of photographs: plane sweep with normalised cross-correlation, checked between views.
+"""Depths of photographs: each is matched with a few others, and what these do not confirm is dropped.
 
-Collins 1996 (plane sweep); the depth of a pixel is the plane on which its window and those of neighbouring
-views correlate best. Depths that other views do not confirm are dropped.
+The core sweeps planes at half the size and improves slanted windows at the whole (csrc/stereo.h). Here: which
+photographs are matched, which depths stay, and what is filled in between.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import subsample
+from meshsplats._core.stereo import (
+    Layout,
+    Pairs,
+    Planes,
+    SurfaceArrays,
+    count_views,
+    count_witnesses,
+    fill_depths,
+    match_photos,
+)
 from meshsplats.camera import Camera
 from meshsplats.datasets.reduced import reduced_image
 from meshsplats.datasets.views import View
+from meshsplats.rendering.core_arguments import camera_struct
 
-SIDE = 200
+SIDE = 400
 """Longer side of the images that are matched, in pixels."""
-PLANES = 64
-"""Depths that are tried, evenly spaced in inverse depth."""
-SOURCES = 4
-"""Neighbouring views that each view is matched with."""
-BEST = 2
-"""Of their correlations the mean of this many counts: in the others the pixel may be hidden."""
-RADIUS = 3
-"""Pixels to each side of a window."""
-MIN_CORRELATION = 0.6
-MIN_DEVIATION = 0.02
-"""Standard deviation of the grey values in a window below which nothing can be matched."""
-ANGLES = (4.0, 12.0, 45.0)
-"""Least, best and greatest angle in degrees between two views of a pair, seen from what they look at."""
 REFERENCES = 64
-"""Maximum number of views, evenly spread, whose depths are found."""
-AGREEMENT = 1.5
-"""Planes by which depths of two views of a point may differ."""
-MATCHING_BYTES = (SOURCES + 4) * PLANES * SIDE * SIDE * 4
-"""Memory for matching one view."""
+"""Maximum number of views, evenly spread, whose depths are found. They are matched with any others."""
+PLANES = 128
+"""Depths that are tried at half the size, evenly spaced in inverse depth."""
+ROUNDS = 1
+"""Times that slanted windows are improved."""
+SOURCES = 5
+"""Views that each view is matched with."""
+JUDGES = 12
+"""Views with depths that confirm or refute those of a view, at most."""
+ANGLES = (2.5, 8.0, 30.0)
+"""Least, best and greatest angle in degrees between two views of a pair, seen from points in both."""
+POINTS, POINTS_IN_VIEW = 1500, 80
+"""Known points that angles are taken at, at most: of the scene, and of a view."""
+LEAST_SUITED = 0.005
+"""Views that suit another less are not matched with it."""
+MIN_CORRELATION = 0.5
+AGREEMENT, PAST = 0.01, 0.03
+"""Relative differences of depth up to which two views agree, and from which one sees past the other."""
 WITNESSES = 2
-"""Views that must confirm a depth."""
-
-
-FILL_STRIDE = 2
-"""Of the rows and columns without a depth one in this many is filled."""
-FILL_AGREEMENT = 4.0
-"""Planes by which filled depths of two views of a point may differ."""
-FILL_WITNESSES = 4
-"""Other views that must agree with a filled depth."""
-FILL_FREE = 1
-"""Views that must see past a filled point to refute it."""
-FARNESS = 4
-"""Power of the depth in the weights of the depths that others are filled from."""
-
-
-class DepthView(NamedTuple):
-    """Depths of a view."""
-
-    camera: Camera
-    """At the size of the depths."""
-    inverse: np.ndarray
-    """(h, w) float32 inverse depths; 0 where none was found."""
-    color: np.ndarray
-    """(h, w, 3) float32 display RGB over black."""
-    step: float
-    """Distance of two planes, in inverse depth."""
+"""Views that must confirm a depth..."""
+FEW = 3
+"""... but one is enough where only so many views have the place in their image."""
+OUTLINE = 2
+"""Pixels of what is in front that are dropped beside what is farther: windows widen outlines."""
+BEHIND = 0.1
+"""Relative difference of depth of an outline."""
+MATCHED_BYTES, PHOTO_BYTES = 150, 20
+"""Memory of a pixel of a view whose depths are found, and of a photograph that takes part."""
+FILL_AGREEMENT, FILL_PAST = 0.03, 0.05
+"""The same as ``AGREEMENT`` and ``PAST`` for filled depths."""
+FILL_WITNESSES = 3
+"""Views whose filled depths must agree."""
+FILL_PER_PIXEL = 0.3
+"""Cost of filling across a pixel, in differences of colour from 0 to 255."""
+SEED_STEP = 0.05
+"""Relative difference to a depth two pixels away from which a pixel does not fill others."""
+SEED_NEIGHBOURS = 6
+"""Known ones of the 3 x 3 pixels around a pixel that fills others, at least."""
 
 
 class Depths(NamedTuple):
-    """Points on surfaces, and the views that they were found in."""
+    """Depths of several views, one image after the other."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
-    colors: np.ndarray
-    """(n, 3) float32 display RGB."""
-    pixels: np.ndarray
-    """(n,) float64 size of a pixel of its view at each point, scene units."""
-    views: tuple[DepthView, ...]
-    """The depths that other views confirm."""
+    layout: Layout
+    cameras: tuple[Camera, ...]
+    color: np.ndarray
+    """(pixels, 3) uint8 display RGB over black."""
+    planes: Planes
+    sure: np.ndarray
+    """(pixels,) float32 inverse depths that other views confirm, 0: none."""
+    filled: np.ndarray
+    """(pixels,) float32 those between them, where the filled ones of several views agree; 0: none."""
 
-    def free(self, points: np.ndarray, margin: float = 2.0) -> np.ndarray:
-        """(m,) int: how many views see past ``points`` (m, 3): they have a surface behind them, by more than
-        ``margin`` planes."""
-        count = np.zeros(len(points), int)
-        for view in self.views:
-            positions, z = view.camera.project(points)
-            rows = np.flatnonzero(view.camera.in_image(positions))
-            u, v = positions[rows].astype(int).T
-            known = view.inverse[v, u]
-            count[rows] += (known > 0) & (1 / z[rows] > known + margin * view.step)
-        return count
+    def counts(self, points: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: views that have a surface at ``points`` (n, 3), and that see past them."""
+        places = np.ascontiguousarray(points, np.float64)
+        return count_views(self.layout, self.sure, places, (2 * AGREEMENT, 2 * PAST), threads)
 
-    def between(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (m, 3) and colours (m, 3) where nothing could be matched: on walls without texture, say.
+    def surface(self, origin: np.ndarray) -> SurfaceArrays:
+        """The points of all pixels with a depth, relative to ``origin`` (3,)."""
+        parts = [self._points(i, sure, origin) for i in range(len(self.cameras)) for sure in (True, False)]
+        return SurfaceArrays(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
-        Each view fills its unknown pixels from the depths around them, the farther ones above all. A point
-        stays if the filled depths of ``FILL_WITNESSES`` other views agree, and no view sees past it.
-        """
-        full = [view._replace(inverse=_filled(view.inverse)) for view in self.views]
-        points, colors = [], []
-        for view, whole in zip(self.views, full, strict=True):
-            rows, columns = np.nonzero((view.inverse == 0) & (whole.inverse > 0))
-            chosen = (rows % FILL_STRIDE == 0) & (columns % FILL_STRIDE == 0)
-            rows, columns = rows[chosen], columns[chosen]
-            there = _places(whole, rows, columns)
-            agree = _witnesses(there, [other for other in full if other is not whole], FILL_AGREEMENT)
-            keep = (agree >= FILL_WITNESSES) & (self.free(there) < FILL_FREE)
-            points.append(there[keep])
-            colors.append(view.color[rows[keep], columns[keep]])
-        return np.concatenate(points), np.concatenate(colors)
-
-
-class _Photo:
-    """An image in grey values at the size for matching."""
-
-    def __init__(self, view: View) -> None:
-        self.camera = view.camera.within(SIDE)
-        image = reduced_image(view.load(), self.camera.width, self.camera.height)
-        self.color = image.over((0, 0, 0))
-        counts = np.ones(self.color.shape[:2], np.float32)
-        if image.alpha is not None:
-            counts = image.alpha.astype(np.float32)
-        if image.mask is not None:
-            counts = counts * image.mask
-            self.color[~image.mask] = 0
-        self.opaque = counts > 0.5
-        self.grey = self.color @ np.array([0.3, 0.6, 0.1], np.float32)
+    def _points(self, index: int, sure: bool, origin: np.ndarray) -> SurfaceArrays:
+        """Those of one view."""
+        camera = self.cameras[index]
+        inverse = self.layout.image(self.sure if sure else self.filled, index)
+        rows, columns = np.nonzero(inverse)
+        q = inverse[rows, columns].astype(np.float64)
+        x, y = columns + 0.5 - camera.cx, rows + 0.5 - camera.cy
+        turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        local = np.stack([x / camera.fx, y / camera.fy, np.ones_like(q)], axis=1) / q[:, None]
+        # The normal of a plane of inverse depths q + a x + b y. Filled pixels have the planes of others, and
+        # face the camera.
+        a, b = (
+            self.layout.image(slopes, index)[rows, columns] * np.float64(sure)
+            for slopes in (self.planes.along_x, self.planes.along_y)
+        )
+        normals = np.stack([a * camera.fx, b * camera.fy, q - a * x - b * y], axis=1) @ turn
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return SurfaceArrays(
+            ((local - shift) @ turn - origin).astype(np.float32),
+            normals.astype(np.float32),
+            (1 / (q * camera.fx)).astype(np.float32),
+            self.layout.image(self.color, index)[rows, columns],
+            np.full(len(q), sure, np.uint8),
+        )
 
 
-def dense_points(views: Sequence[View], near: np.ndarray, far: np.ndarray, targets: np.ndarray) -> Depths:
-    """Points that several of ``views`` agree on.
+def matching_bytes(views: Sequence[View]) -> int:
+    """Estimated memory of ``find_depths`` and of its points in bytes."""
+    some = [view.camera.within(SIDE) for view in subsample(views, REFERENCES)]
+    matched = sum(camera.width * camera.height for camera in some)
+    return int(matched * (MATCHED_BYTES + PHOTO_BYTES * min(len(views) / len(some), 1 + SOURCES)))
+
+
+def find_depths(
+    views: Sequence[View], near: np.ndarray, far: np.ndarray, points: np.ndarray, threads: int | None = None
+) -> Depths:
+    """Depths of up to ``REFERENCES`` of ``views``.
 
     Args:
         near, far: (views,) least and greatest depth that is tried in each view.
-        targets: (views, 3) a point that each view looks at, for the angles between views.
+        points: (n, 3) where the scene is, roughly, for the angles between views.
     """
-    photos = [_Photo(view) for view in views]
-    step = max(1, -(-len(views) // REFERENCES))
-    chosen = range(0, len(views), step)
-    depths = []
-    for i in chosen:
-        sources = _neighbours(photos, i, targets[i])
-        depths.append(_depths(photos[i], [photos[j] for j in sources], near[i], far[i]))
-    return _confirmed(depths)
-
-
-def _neighbours(photos: Sequence[_Photo], i: int, target: np.ndarray) -> list[int]:
-    """Indices of the views that suit view ``i`` best, by the angle between them."""
-    centers = np.array([photo.camera.center for photo in photos])
-    away = target - centers
-    distance = np.linalg.norm(away, axis=1)
-    away /= np.maximum(distance, 1e-12)[:, None]
-    axes = np.array([photo.camera.world_to_camera[2, :3] for photo in photos])
-    angle = np.degrees(np.arccos(np.clip(away @ away[i], -1, 1)))
-    least, best, most = ANGLES
-    ratio = distance / max(distance[i], 1e-12)
-    fits = (angle >= least) & (angle <= most) & (ratio > 0.5) & (ratio < 2) & (axes @ axes[i] > 0.5)
-    order = np.argsort(np.abs(np.log(np.maximum(angle, 1e-9) / best)), kind="stable")
-    return [int(j) for j in order if fits[j] and j != i][:SOURCES]
-
-
-def _depths(reference: _Photo, sources: Sequence[_Photo], near: float, far: float) -> DepthView:
-    camera = reference.camera
-    inverse = np.linspace(1 / far, 1 / near, PLANES)
-    step = float(inverse[1] - inverse[0])
-    found = np.zeros((camera.height, camera.width), np.float32)
-    if not sources:
-        return DepthView(camera, found, reference.color, step)
-    mean = _box(reference.grey)
-    spread = _box(np.square(reference.grey)) - np.square(mean)
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    correlations = np.stack(
-        [_correlations(reference, source, rays, inverse, mean, spread) for source in sources]
+    cameras = [view.camera.within(SIDE) for view in views]
+    chosen = subsample(range(len(views)), REFERENCES)
+    suited = suited_views(cameras, points, chosen)
+    sources = [_spread(cameras, i, *found) for i, found in zip(chosen, suited, strict=True)]
+    place = {view: i for i, view in enumerate(chosen)}
+    judges = _table([[place[j] for j in order if j in place] for order, _ in suited], JUDGES)
+    # Thousands of photographs would not fit: only those that take part are read.
+    read = sorted({*chosen, *(j for row in sources for j in row)})
+    photos = _layout([cameras[i] for i in read])
+    color = np.empty((photos.pixels, 3), np.uint8)
+    counted = np.ones(photos.pixels, bool)
+    for i, view in enumerate(read):
+        _read(views[view], photos.image(color, i), photos.image(counted, i))
+    number = {view: i for i, view in enumerate(read)}
+    own = np.array([number[i] for i in chosen], np.int32)
+    matched = _layout([cameras[i] for i in chosen])
+    rows = list(chosen)
+    pairs = Pairs(
+        own,
+        _table([[number[j] for j in row] for row in sources], SOURCES),
+        np.stack([1 / far[rows], 1 / near[rows]], axis=1).astype(np.float32),
     )
-    correlations = np.sort(correlations, axis=0)[-BEST:].mean(axis=0)
-    best = correlations.argmax(axis=0)
-    height = np.take_along_axis(correlations, best[None], axis=0)[0]
-    inner = np.clip(best, 1, PLANES - 2)
-    before, at, after = (np.take_along_axis(correlations, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    bend = before - 2 * at + after
-    shift = np.where(bend < -1e-6, 0.5 * (before - after) / np.minimum(bend, -1e-6), 0)
-    good = (height >= MIN_CORRELATION) & (spread >= MIN_DEVIATION**2) & reference.opaque
-    good &= (best > 0) & (best < PLANES - 1)
-    found[good] = (inverse[0] + (inner + np.clip(shift, -0.5, 0.5)) * step)[good]
-    return DepthView(camera, found, reference.color, step)
+    planes = match_photos(photos, color, matched, pairs, planes=PLANES, rounds=ROUNDS, threads=threads)
+    pixels = np.concatenate([np.arange(photos.start[i], photos.start[i + 1]) for i in own])
+    color, counted = color[pixels], counted[pixels]
+    fits = counted & (planes.score > MIN_CORRELATION)
+    sure = confirmed(matched, planes, fits, judges, threads)
+    filled = between(matched, color, planes._replace(inverse=sure), counted, judges, threads)
+    return Depths(matched, tuple(cameras[i] for i in chosen), color, planes, sure, filled)
 
 
-def _correlations(
-    reference: _Photo,
-    source: _Photo,
-    rays: np.ndarray,
-    inverse: np.ndarray,
-    mean: np.ndarray,
-    spread: np.ndarray,
-) -> np.ndarray:
-    """(planes, h, w) float32 correlation of each window with the source on each plane; -1 outside of it."""
-    other = source.camera
-    relative = other.world_to_camera @ np.linalg.inv(reference.camera.world_to_camera)
-    turned = (rays @ relative[:3, :3].T).astype(np.float32)
-    result = np.empty((len(inverse), *rays.shape[:2]), np.float32)
-    grey = source.grey
-    flat = np.ascontiguousarray(grey).ravel()
-    for i, value in enumerate(inverse):
-        x, y, z = (turned[..., k] + np.float32(value * relative[k, 3]) for k in range(3))
-        valid = z > 1e-6
-        z = np.where(valid, z, 1)
-        u = np.float32(other.fx) * x / z + np.float32(other.cx - 0.5)
-        v = np.float32(other.fy) * y / z + np.float32(other.cy - 0.5)
-        valid &= (u >= 0) & (u <= other.width - 1) & (v >= 0) & (v <= other.height - 1)
-        u, v = np.where(valid, u, 0), np.where(valid, v, 0)
-        left = np.minimum(u.astype(np.int32), other.width - 2)
-        top = np.minimum(v.astype(np.int32), other.height - 2)
-        a, b = u - left, v - top
-        at = top * np.int32(other.width) + left
-        upper = flat[at] * (1 - a) + flat[at + 1] * a
-        lower = flat[at + other.width] * (1 - a) + flat[at + other.width + 1] * a
-        warped = upper * (1 - b) + lower * b
-        own = _box(warped)
-        deviation = _box(np.square(warped)) - np.square(own)
-        together = _box(warped * reference.grey) - own * mean
-        scale = np.sqrt(np.maximum(deviation * spread, 1e-8))
-        result[i] = np.where(valid & (deviation > 1e-5), together / scale, -1)
+def _layout(cameras: Sequence[Camera]) -> Layout:
+    # Stereo has no use for near planes, which belong to scenes that are drawn.
+    return Layout([camera_struct(replace(camera, near=camera.near or 1.0)) for camera in cameras])
+
+
+def _read(view: View, color: np.ndarray, counted: np.ndarray) -> None:
+    """Writes the image of ``view`` and which of its pixels count, at the size of ``color`` (h, w, 3)."""
+    image = reduced_image(view.load(), color.shape[1], color.shape[0])
+    values = image.over((0, 0, 0))
+    if image.mask is not None:
+        counted &= image.mask
+        values[~image.mask] = 0
+    if image.alpha is not None:
+        counted &= image.alpha > 0.5
+    color[:] = np.round(255 * np.clip(values, 0, 1))
+
+
+def suited_views(
+    cameras: Sequence[Camera], points: np.ndarray, chosen: Sequence[int]
+) -> list[tuple[list[int], np.ndarray]]:
+    """For each ``chosen`` camera the others that suit it, best first, and (cameras,) how well each does: by
+    the angles and the distances at ``points`` (n, 3) that both have in the image."""
+    rng = np.random.default_rng(0)
+    points = points[np.sort(rng.permutation(len(points))[:POINTS])]
+    projected = [camera.project(points) for camera in cameras]
+    seen = np.array([camera.in_image(at) for camera, (at, _) in zip(cameras, projected, strict=True)])
+    depth = np.array([z for _, z in projected])
+    centers = np.array([camera.center for camera in cameras])
+    least, best, most = ANGLES
+    result: list[tuple[list[int], np.ndarray]] = []
+    for i in chosen:
+        mine = subsample(np.flatnonzero(seen[i]), POINTS_IN_VIEW)
+        if not len(mine):
+            result.append(([], np.zeros(len(cameras))))
+            continue
+        away = centers[:, None] - points[mine]
+        away /= np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-12)
+        angle = np.degrees(np.arccos(np.clip((away * away[i]).sum(axis=2), -1, 1)))
+        ratio = np.abs(np.log(np.clip(depth[:, mine] / depth[i, mine], 0.01, 100)))
+        weight = np.exp(-np.square(np.log(np.maximum(angle, 0.1) / best)) - np.square(ratio))
+        weight[ratio > np.log(2)] = 0
+        weight[(angle < least) | (angle > most)] *= 0.2
+        suited = (weight * seen[:, mine]).mean(axis=1)
+        suited[i] = 0
+        order = np.argsort(-suited, kind="stable")
+        result.append(([int(j) for j in order if suited[j] > LEAST_SUITED], suited))
     return result
 
 
-def _box(values: np.ndarray) -> np.ndarray:
-    """Mean over windows of ``RADIUS`` pixels to each side; edges are repeated."""
-    size = 2 * RADIUS + 1
+def _spread(cameras: Sequence[Camera], i: int, order: Sequence[int], suited: np.ndarray) -> list[int]:
+    """Up to ``SOURCES`` of the views ``order`` that suit camera ``i``, in several directions from it: what
+    one does not see past an edge, the one on the other side does."""
+    left = suited.copy()
+    turn = cameras[i].world_to_camera[:2, :3]
+    across = np.array([turn @ (camera.center - cameras[i].center) for camera in cameras])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    chosen: list[int] = []
+    for _ in range(min(SOURCES, len(order))):
+        j = max((j for j in order if j not in chosen), key=lambda j: left[j])
+        chosen.append(j)
+        left *= 1 - 0.5 * np.maximum(across @ across[j], 0) ** 4
+    return chosen
+
+
+def _table(rows: Sequence[Sequence[int]], width: int) -> np.ndarray:
+    """(rows, width) int32 of the first entries of each row; -1 where it has fewer."""
+    table = np.full((len(rows), width), -1, np.int32)
+    for line, row in zip(table, rows, strict=True):
+        line[: len(row)] = row[:width]
+    return table
+
+
+def confirmed(
+    views: Layout, planes: Planes, fits: np.ndarray, judges: np.ndarray, threads: int | None = None
+) -> np.ndarray:
+    """(pixels,) float32 inverse depths that the depths of other views confirm, of those that ``fits``."""
+    inverse = np.where(fits, planes.inverse, 0).astype(np.float32)
+    found = count_witnesses(views, inverse, inverse, judges, (AGREEMENT, PAST), threads)
+    enough = (found.agree >= WITNESSES) | ((found.agree >= 1) & (found.seen <= FEW))
+    good = (inverse > 0) & enough & (found.past <= found.agree)
+    sure = np.where(good, inverse, 0).astype(np.float32)
+    for i in range(len(views)):
+        image, near = views.image(sure, i), views.image(inverse, i)
+        image[_least(np.where(near > 0, near, np.inf), OUTLINE) < (1 - BEHIND) * image] = 0
+    return sure
+
+
+def between(
+    views: Layout,
+    color: np.ndarray,
+    planes: Planes,
+    counted: np.ndarray,
+    judges: np.ndarray,
+    threads: int | None = None,
+) -> np.ndarray:
+    """(pixels,) float32 inverse depths where ``planes`` has none, on walls without texture, say: continued
+    from the pixels around, where those of other views agree and none sees past them."""
+    sure = planes.inverse
+    seeds = np.zeros(views.pixels, bool)
+    for i in range(len(views)):
+        views.image(seeds, i)[:] = _inner(views.image(sure, i))
+    whole = fill_depths(views, color, planes, seeds, per_pixel=FILL_PER_PIXEL, threads=threads)
+    whole = np.where(sure > 0, sure, np.where(counted, whole, 0)).astype(np.float32)
+    limits = (FILL_AGREEMENT, FILL_PAST)
+    found = count_witnesses(views, whole, whole, judges, limits, threads)
+    against = count_witnesses(views, whole, sure, judges, limits, threads).past
+    enough = (found.agree >= FILL_WITNESSES) | ((found.agree >= 1) & (found.seen <= FEW))
+    return np.where((sure == 0) & enough & (against == 0), whole, 0).astype(np.float32)
+
+
+def _inner(inverse: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the known pixels of ``inverse`` (h, w) amid others, not beside a step of depth."""
+    known = inverse > 0
+    height, width = known.shape
+    around = np.pad(known, 1).astype(np.int8)
+    count = sum(around[i : i + height, j : j + width] for i in range(3) for j in range(3))
+    inner = known & (count >= SEED_NEIGHBOURS)
+    for depths, kept in ((inverse, inner), (inverse.T, inner.T)):
+        ahead, behind = depths[2:], depths[:-2]
+        step = (ahead > 0) & (behind > 0)
+        step &= np.abs(ahead - behind) > SEED_STEP * np.maximum(ahead, behind)
+        kept[2:] &= ~step
+        kept[:-2] &= ~step
+    return np.asarray(inner)
+
+
+def _least(values: np.ndarray, reach: int) -> np.ndarray:
+    """The least of ``values`` (h, w) within ``reach`` pixels to each side."""
     for axis in (0, 1):
-        width = [(0, 0), (0, 0)]
-        width[axis] = (RADIUS + 1, RADIUS)
-        sums = np.cumsum(np.pad(values, width, mode="edge"), axis=axis, dtype=np.float64)
-        upper, lower = [slice(None)] * 2, [slice(None)] * 2
-        upper[axis], lower[axis] = slice(size, None), slice(None, -size)
-        values = ((sums[tuple(upper)] - sums[tuple(lower)]) / size).astype(np.float32)
+        result = values.copy()
+        for k in range(1, reach + 1):
+            for to, of in ((slice(k, None), slice(None, -k)), (slice(None, -k), slice(k, None))):
+                part = np.moveaxis(result, axis, 0)[to]
+                np.minimum(part, np.moveaxis(values, axis, 0)[of], out=part)
+        values = result
     return values
-
-
-def _confirmed(depths: Sequence[DepthView]) -> Depths:
-    """The depths that at least ``WITNESSES`` other views have, too."""
-    points, colors, pixels, views = [], [], [], []
-    for view in depths:
-        rows, columns = np.nonzero(view.inverse)
-        there = _places(view, rows, columns)
-        witnesses = _witnesses(there, [other for other in depths if other is not view], AGREEMENT)
-        keep = witnesses >= WITNESSES
-        rows, columns = rows[keep], columns[keep]
-        inverse = np.zeros_like(view.inverse)
-        inverse[rows, columns] = view.inverse[rows, columns]
-        views.append(view._replace(inverse=inverse))
-        points.append(there[keep])
-        colors.append(view.color[rows, columns])
-        pixels.append(1 / (inverse[rows, columns].astype(np.float64) * view.camera.fx))
-    return Depths(np.concatenate(points), np.concatenate(colors), np.concatenate(pixels), tuple(views))
-
-
-def _witnesses(points: np.ndarray, views: Sequence[DepthView], planes: float) -> np.ndarray:
-    """(n,) int: how many of ``views`` have ``points`` (n, 3) at their depth, give or take ``planes``."""
-    count = np.zeros(len(points), int)
-    for view in views:
-        positions, z = view.camera.project(points)
-        rows = np.flatnonzero(view.camera.in_image(positions))
-        u, v = positions[rows].astype(int).T
-        known = view.inverse[v, u]
-        count[rows[(known > 0) & (np.abs(1 / z[rows] - known) < planes * view.step)]] += 1
-    return count
-
-
-def _filled(inverse: np.ndarray) -> np.ndarray:
-    """``inverse`` depths (h, w) with values for all pixels, from a pyramid of means of the known ones; all 0
-    if none is known."""
-    if min(inverse.shape) < 2 or (inverse > 0).all():
-        return inverse
-    height, width = inverse.shape
-    even = np.pad(inverse, ((0, height % 2), (0, width % 2)))
-    # Relative to the nearest, and bounded: powers of far ones overflow.
-    relative = np.maximum(even / max(float(even.max()), 1e-30), 1e-4)
-    weights = np.where(even > 0, relative.astype(np.float64) ** -FARNESS, 0)
-
-    def halved(values: np.ndarray) -> np.ndarray:
-        return values.reshape(len(values) // 2, 2, -1, 2).sum(axis=(1, 3))
-
-    total = halved(weights)
-    coarse = np.divide(halved(weights * even), total, out=np.zeros_like(total), where=total > 0)
-    coarse = _filled(coarse.astype(np.float32))
-    fine = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)[:height, :width]
-    edge = np.pad(fine, 1, mode="edge")
-    smooth = sum(edge[i : i + height, j : j + width] for i in range(3) for j in range(3)) / np.float32(9)
-    return np.where(inverse > 0, inverse, smooth)
-
-
-def _places(view: DepthView, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """(n, 3) positions in the world of the pixels at ``rows`` and ``columns`` (n,)."""
-    camera = view.camera
-    depth = 1 / view.inverse[rows, columns].astype(np.float64)
-    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
-    local = np.stack([x * depth, y * depth, depth], axis=1)
-    return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
