@@ -18,14 +18,14 @@ struct MsShading {
     int64_t vertex_count, face_count, splat_count;
     int32_t terms;  // of a splat: 3, 8 or 15
     int32_t threads;
-    const float *vertices;       // (v, 3)
-    const float *colors;         // (v, 4) straight RGBA
-    const int32_t *faces;        // (f, 3)
-    const int32_t *face_splat;   // (f,) ascending
-    const float *harmonics;      // (s, terms, 3)
-    double eye[3];               // the camera's centre
-    float *shaded;               // (v, 4); out of ms_shade, in of ms_shade_backward
-    const float *gradient;       // (v, 4) of shaded, for ms_shade_backward; its results are added to:
+    const float *vertices;      // (v, 3)
+    const float *colors;        // (v, 4) straight RGBA
+    const int32_t *faces;       // (f, 3)
+    const int32_t *face_splat;  // (f,) ascending
+    const float *harmonics;     // (s, terms, 3)
+    double eye[3];              // the camera's centre
+    float *shaded;              // (v, 4); out of ms_shade, in of ms_shade_backward
+    const float *gradient;      // (v, 4) of shaded, for ms_shade_backward; its results are added to:
     float *color_gradient, *harmonic_gradient;  // (v, 4), (s, terms, 3); the latter may be null
 };
 
@@ -159,7 +159,7 @@ class Shading {
                            C33 = 0.59004358992664352f;
 
     const MsShading &s_;
-    std::vector<int64_t> start_;         // first triangle of each splat, then their count
+    std::vector<int64_t> start_;        // first triangle of each splat, then their count
     PooledVector<unsigned char> seen_;  // vertices that a batch has held
 };
 
