@@ -1,7 +1,7 @@
-// Shading: colours of vertices in a view, where splats have spherical harmonics. On the bindings of lists.wgsl.
+// Shading: colours of vertices in a view, where splats have spherical harmonics. Bindings of lists.wgsl, and:
 //
-// A vertex of splat s has the colour max(0, RGB + sum_k b_k(d) h_sk), with the unit vector d from the camera to
-// the vertex, real spherical harmonics b_k of degree 1 and more, and frame.terms coefficients h_sk.
+// A vertex of splat s has the colour max(0, RGB + sum_k b_k(d) h_sk), with the unit vector d from the camera
+// to the vertex, real spherical harmonics b_k of degree 1 and more, and frame.terms coefficients h_sk.
 
 @group(0) @binding(25) var<storage, read_write> values_out: array<vec4f>;
 @group(0) @binding(26) var<storage, read> base: array<vec4f>;      // by vertex: RGB and opacity
