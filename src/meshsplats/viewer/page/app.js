@@ -78,7 +78,7 @@ class App {
       this.changed();
     } else {
       this.#fall(`The image is not exact here: ${problems.join("; ")}.` +
-        ` WebGL draws ${this.mesh.order === "splat" ? "whole splats" : "triangles"} sorted by their centres.` +
+        ` WebGL draws ${this.mesh.order === "splat" ? "splats" : "triangles"} sorted by their centres.` +
         " Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
     }
     if (!this.sorted) {
