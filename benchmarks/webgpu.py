@@ -1,12 +1,14 @@
 """Work and time of the GPU on random fans, beside the core.
 
     python benchmarks/webgpu.py [--scenes 160k 1M 4M] [--mesh FILE --side 400] [--repeat 3] [--gradients]
-                                [--order fragment splat]
+                                [--order fragment splat] [--degree 0 1 2]
 
 Difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at a sample per blended
 fragment, walks through a tile list per tile, samples whose first queue was too short, dispatches of a frame,
 megabytes of buffers, and medians of wall time and processor time in milliseconds. Times on a software adapter
 (named in the first line) say nothing about a GPU.
+
+With --degree, each mesh of a file with its spherical harmonics up to these degrees.
 
 With --gradients, the backward pass of a random gradient: ||g - g_core|| / ||g_core|| of positions, RGB and
 opacities, windows of the image, fragments on the tape and triangles in tiles, dispatches of a window,
@@ -112,6 +114,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--gradients", action="store_true")
     parser.add_argument("--order", nargs="+", default=["fragment"], choices=get_args(Order))
+    parser.add_argument("--degree", type=int, nargs="+", choices=range(4))
     asked = parser.parse_args()
     columns: tuple[str, ...] = (
         *("scene", "triangles", "image", "dB", "> 1e-3", "tests a fragment", "walks a tile", "overflowed"),
@@ -139,7 +142,10 @@ def main() -> None:
             show(name, *random_fans(*FANS[name]))
         for path in asked.mesh:
             mesh = load_mesh(path)
-            show(path.stem, mesh, orbit(mesh, 4, width=asked.side, height=asked.side)[1])
+            view = orbit(mesh, 4, width=asked.side, height=asked.side)[1]
+            for degree in asked.degree or [mesh.sh_degree]:
+                title = path.stem if asked.degree is None else f"{path.stem}, degree {degree}"
+                show(title, mesh.of_degree(degree), view)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,15 @@ def test_only_the_colours_that_a_page_shows_are_kept():
     np.testing.assert_array_equal(found.splats.sh, cloud.sh[:, :1])
 
 
+def test_both_levels_keep_colours_that_depend_on_the_view_and_splats_beside_them_do_not(monkeypatch):
+    monkeypatch.setattr("meshsplats.viewer.content.COARSE_TRIANGLES", 400)
+    cloud = make_scene(200).of_degree(2)
+    for found in (content_of_splats(cloud), content_of_mesh(convert(cloud), cloud)):
+        assert (found.mesh.sh_degree, found.coarse.sh_degree, found.splats.sh_degree) == (2, 2, 0)
+    plain = content_of_mesh(convert(cloud.of_degree(0)), cloud)
+    assert (plain.mesh.sh_degree, plain.coarse.sh_degree) == (0, 0)
+
+
 def test_a_page_has_a_limit_for_meshes_and_splats(monkeypatch):
     monkeypatch.setattr(content, "MOST_TRIANGLES", 1000)
     cloud = make_scene(200)

@@ -568,18 +568,22 @@ def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):
     source = re.sub(r"^export ", "", _read("scene.js"), flags=re.MULTILINE)
     page.run(
         source + "; window.decode = async text => { const m = decodeMesh(await unpack(text));"
-        " return [m.vertices, m.colors, m.faces, m.splat, m.group].map(a => a && [...a]); }; 0"
+        " const harmonics = m.harmonics && Float32Array.from(m.harmonics.values, v => v * m.harmonics.step);"
+        " return [m.vertices, m.colors, m.faces, m.splat, m.group, harmonics].map(a => a && [...a]); }; 0"
     )
     groups = np.arange(len(mesh.faces), dtype=np.int32) % 7 - 1
-    for each in (mesh, replace(mesh, face_splat=None, depth_group=groups)):
+    assert mesh.harmonics is not None
+    for each in (mesh, replace(mesh, face_splat=None, harmonics=None, depth_group=groups)):
         data = make_page(each).mesh.data
-        vertices, colors, faces, splat, group = page.run(f"decode('{base64.b64encode(data).decode()}')")
+        found = page.run(f"decode('{base64.b64encode(data).decode()}')")
+        vertices, colors, faces, splat, group, harmonics = found
         back = unpack_mesh(data)
         assert np.array_equal(np.array(vertices, np.float32), back.vertices.ravel())
         assert np.array_equal(np.array(colors, np.float32), back.colors.ravel())
         assert faces == back.faces.ravel().tolist()
         assert splat == (None if back.face_splat is None else back.face_splat.tolist())
         assert group == (None if back.depth_group is None else back.depth_group.tolist())
+        assert harmonics == (None if back.harmonics is None else back.harmonics.ravel().tolist())
 
     page.run(
         "window.splats = async text => { const s = decodeSplats(await unpack(text));"

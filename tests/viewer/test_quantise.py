@@ -41,6 +41,7 @@ def assert_same_but_rounded(back: SplatMesh, mesh: SplatMesh, precision: Precisi
         assert ours is None or np.array_equal(ours, theirs)
     assert (back.blending, back.filter_px2) == (mesh.blending, mesh.filter_px2)
     assert back.order == mesh.order
+    assert back.sh_degree == mesh.sh_degree
     assert np.allclose(back.up, mesh.up, atol=1e-6)
     step = max(radius * 2.0**-precision.position, np.ptp(mesh.vertices, axis=0).max() * FINER * 2.0**-31)
     size = float(np.abs(mesh.vertices).max())
@@ -119,7 +120,7 @@ def test_fans_of_convert_follow_from_a_few_of_their_vertices():
 
 
 def test_noisy_fans_take_the_finest_precision_within_the_limit(monkeypatch):
-    mesh = ms.convert(make_scene(3000))
+    mesh = ms.convert(make_scene(3000)).of_degree(0)
     random = np.random.default_rng(0)
     vertices = mesh.vertices + random.normal(0, 0.01, mesh.vertices.shape).astype(np.float32)
     colors = np.clip(mesh.colors + random.normal(0, 0.05, mesh.colors.shape), 0, 1).astype(np.float32)
@@ -221,3 +222,49 @@ def test_the_size_is_estimated_from_a_part():
     alone = replace(mesh, face_splat=None, harmonics=None)
     assert estimated_bytes(alone) == pytest.approx(len(quantise_mesh(alone).data), rel=0.1)
     assert quantise._in_runs(np.arange(len(cloud))).mean() < 0.4
+
+
+# Spherical harmonics
+
+
+def shiny(degree: int) -> SplatMesh:
+    """Splats with harmonics of very different sizes, and colours above 1."""
+    cloud = make_scene(400)
+    random = np.random.default_rng(degree)
+    sh = random.normal(0, 0.1, (len(cloud), (degree + 1) ** 2, 3))
+    sh[:, 0] = random.normal(0, 1, (len(cloud), 3)) + 1
+    sh[0, 1, 0] = 8
+    mesh = ms.convert(replace(cloud, sh=sh))
+    assert mesh.sh_degree == degree
+    assert mesh.colors.max() > 1.5
+    return mesh
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_have_eight_bits_and_large_ones_stay(degree):
+    mesh = shiny(degree)
+    precision, radius = PRECISIONS[2], scene_bounds(mesh).radius
+    back = unpack_mesh(pack_mesh(mesh, precision, radius))
+    assert_same_but_rounded(back, mesh, precision, radius)
+    usual = np.quantile(np.abs(mesh.harmonics), 0.999)
+    assert np.abs(back.harmonics - mesh.harmonics).max() <= 0.5001 * usual / 127
+    assert usual < 3 < np.abs(back.harmonics).max()
+
+
+def test_harmonics_neither_change_what_else_is_stored_nor_cost_more_than_a_byte():
+    mesh = shiny(2)
+    with_them, without = quantise_mesh(mesh), quantise_mesh(replace(mesh, harmonics=None))
+    assert with_them.precision == without.precision
+    for name in ("vertices", "colors", "faces", "face_splat"):
+        assert np.array_equal(getattr(with_them.decoded, name), getattr(without.decoded, name))
+    assert b"harmonics" not in gzip.decompress(without.data)
+    added = len(with_them.data) - len(without.data)
+    assert 0.5 * mesh.harmonics.size < added < 1.05 * mesh.harmonics.size
+    assert estimated_bytes(mesh) > estimated_bytes(replace(mesh, harmonics=None)) + 0.5 * mesh.harmonics.size
+
+
+def test_harmonics_of_zero_and_of_a_single_splat():
+    mesh = shiny(1).take(slice(8))
+    for harmonics in (np.zeros((1, 3, 3)), np.full((1, 3, 3), -2.5)):
+        back = quantise_mesh(replace(mesh, harmonics=harmonics)).decoded
+        assert np.abs(back.harmonics - harmonics).max() <= 0.5001 * 2.5 / 127

@@ -15,7 +15,7 @@ from meshsplats.mesh import SplatMesh, Triangles, checked_filter
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, checked_options
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
-from meshsplats.rendering.shading import Shading, seen_from
+from meshsplats.rendering.shading import Shading
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
 from meshsplats.webgpu.gradients import GradientRenderer, WindowLimit, changing_mesh, check_limits
@@ -74,7 +74,7 @@ class GpuEngine:
             order=options.order,
         )
         with self.errors():
-            drawn = self.renderer_of(seen_from(mesh, camera)).draw(
+            drawn = self.renderer_of(mesh).draw(
                 camera, settings, depth=options.depth, normals=options.normals, values=options.values
             )
         backdrop = np.asarray(options.background, np.float32)

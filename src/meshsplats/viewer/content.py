@@ -68,10 +68,9 @@ def content_of_splats(
     each = usual_triangles_each()
     count = len(cloud) if max_triangles is None else max(1, max_triangles // each)
     _check_size(each * min(count, len(cloud)))
-    cloud = _degree_0(cloud)
     kept = simplify_in_blocks(cloud, count)
     mesh = convert(kept)
-    content = Content(mesh, kept if shown else None, _coarse(mesh, kept), len(kept))
+    content = Content(mesh, _degree_0(kept) if shown else None, _coarse(mesh, kept), len(kept))
     if kept is cloud:
         return content
     images = (render_splats(each, _camera(cloud, cameras)).color for each in (kept, cloud))
@@ -82,8 +81,9 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     """The content of a page of a mesh, with ``splats`` to compare it with. Raises TooManyTrianglesError above
     ``MOST_TRIANGLES``."""
     _check_size(len(mesh.faces))
-    splats = None if splats is None else _degree_0(splats)
-    return Content(mesh, splats, None if splats is None else _coarse(mesh, splats))
+    if splats is None:
+        return Content(mesh, None)
+    return Content(mesh, _degree_0(splats), _coarse(mesh, splats))
 
 
 def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[st
 
 
 def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
-    """``cloud`` without the colours that a page does not show: up to three quarters of its memory."""
+    """``cloud`` without what a page does not show of splats: up to three quarters of its memory."""
     return cloud.of_degree(0)
 
 
@@ -120,6 +120,7 @@ def _coarse(mesh: SplatMesh, splats: GaussianCloud) -> SplatMesh | None:
     """The coarse level of a mesh with many triangles, made of its splats."""
     if len(mesh.faces) <= COARSE_TRIANGLES:
         return None
+    splats = splats.of_degree(min(mesh.sh_degree, splats.sh_degree))
     return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each()), up=mesh.up)
 
 

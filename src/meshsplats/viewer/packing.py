@@ -45,6 +45,15 @@ LARGEST_SPLAT = 64
 ROTATION_STEPS = 511
 """Steps of a component of a quaternion in one."""
 
+HARMONIC_STEPS = 127
+"""Steps of spherical harmonics in the magnitude that HARMONIC_SHARE of them do not exceed: 8 bits with the
+sign."""
+
+HARMONIC_SHARE = 0.999
+
+MOST_HARMONIC_STEPS = (1 << 15) - 1
+"""Largest magnitude of a harmonic in steps."""
+
 SAMPLE = 6000
 """Fans, or triangles of a mesh without fans, from which the size of the data is estimated."""
 
@@ -105,6 +114,8 @@ def pack_in_order(mesh: SplatMesh, order: np.ndarray, precision: Precision, radi
         header |= _pack_fans(packer, fans, places, rgb, alpha, step)
     header |= _pack_far(packer, far, vertices)
     header["group"] = -1 if mesh.depth_group is None else packer.add(mesh.depth_group)
+    if mesh.harmonics is not None:
+        header["harmonics"] = _pack_harmonics(packer, mesh.harmonics)
     return packer.finish(header)
 
 
@@ -115,6 +126,17 @@ def vertex_order(mesh: SplatMesh) -> np.ndarray:
     np.minimum.at(first, corners, np.arange(len(corners)))
     order = np.argsort(first, kind="stable")
     return order[: np.count_nonzero(first < len(corners))]
+
+
+def _pack_harmonics(packer: Packer, harmonics: np.ndarray) -> dict[str, Any]:
+    """Spherical harmonics (s, k, 3) of the splats in the order of their triangles, with one step for all.
+    Numbers above 8 bits are few, so that their second bytes compress to nearly nothing."""
+    size = np.abs(harmonics)
+    usual, largest = float(np.quantile(size, HARMONIC_SHARE)), float(size.max())
+    step = rounded([max(usual / HARMONIC_STEPS, 1.001 * largest / MOST_HARMONIC_STEPS) or 1.0])[0]
+    whole = np.rint(harmonics.astype(np.float64) / step).astype(np.int64)
+    terms = harmonics.shape[1]
+    return {"terms": terms, "step": step, "row": packer.add_rows(whole.reshape(-1, 3 * terms))}
 
 
 # ---- Strays

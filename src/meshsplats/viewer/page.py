@@ -31,8 +31,8 @@ from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_
 from meshsplats.webgpu import device, frames, kernels
 
 MODULES = (
-    *("scene.js", "camera.js", "controls.js", "crop.js", "order.js", "sorted.js", "arrays.js"),
-    *("exact.js", "status.js", "app.js"),
+    *("scene.js", "camera.js", "controls.js", "crop.js", "order.js", "shaders.js", "sorted.js"),
+    *("arrays.js", "exact.js", "status.js", "app.js"),
 )
 """The scripts of the page, in the order in which they are joined."""
 
@@ -42,7 +42,7 @@ MOST_CAMERAS = 2000
 LONGEST_NAME = 120
 """Characters of a title or the name of a camera."""
 
-_IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
+_IMPORT = re.compile(r"^import \{[^}]*\}\s+from \"\./\w+\.js\";\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) )", re.MULTILINE)
 
 
@@ -94,7 +94,6 @@ def make_page(
     need_all(Camera, cameras=cameras)
     need(PageOptions, options=options, optional=True)
     options = options or PageOptions()
-    mesh, coarse = mesh.plain, None if coarse is None else coarse.plain
     packed = quantise_mesh(mesh)
     views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)

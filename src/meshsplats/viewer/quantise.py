@@ -5,7 +5,7 @@ How fine the steps are, and how large that makes the page. ``packing`` says how 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from meshsplats.viewer.packing import SAMPLE, Precision, pack_in_order, pack_mes
 from meshsplats.viewer.unpacking import unpack_mesh
 
 BYTES_A_TRIANGLE = 8.5
-"""The finest of ``PRECISIONS`` is used whose data stays below this; the coarsest, where none does..."""
+"""The finest of ``PRECISIONS`` is used whose data, without spherical harmonics, stays below this; the
+coarsest, where none does..."""
 
 SMALL = 1_000_000
 """... and the finest for meshes of fewer bytes in all."""
@@ -64,8 +65,8 @@ class QuantisedMesh:
 
 
 def quantise_mesh(mesh: SplatMesh, limit: float = BYTES_A_TRIANGLE) -> QuantisedMesh:
-    """``mesh`` in at most about ``limit`` bytes a triangle. Normals, attributes and the binding of a mesh
-    prior are left out: images do not need them.
+    """``mesh`` in at most about ``limit`` bytes a triangle, and its spherical harmonics in 8 bits each.
+    Normals, attributes and the binding of a mesh prior are left out: images do not need them.
 
     Raises ValueError for a mesh without triangles.
     """
@@ -113,8 +114,8 @@ def _in_runs(parts: np.ndarray) -> np.ndarray:
 
 
 def _finest(mesh: SplatMesh, radius: float, limit: float) -> Precision:
-    """The finest precision with at most about ``limit`` bytes a triangle."""
-    sample = _sample(mesh)
+    """The finest precision with at most about ``limit`` bytes a triangle, besides spherical harmonics."""
+    sample = replace(_sample(mesh), harmonics=None)
     share = len(sample.faces) / len(mesh.faces)
     for precision in PRECISIONS[:-1]:
         if len(pack_mesh(sample, precision, radius)) <= max(limit * len(sample.faces), SMALL * share):

@@ -51,7 +51,16 @@ def _unpacked(source: Unpacker) -> SplatMesh:
         blending=header["blending"],
         filter_px2=header["filter"],
         order=header.get("order", "fragment"),
+        harmonics=_unpack_harmonics(source),
     )
+
+
+def _unpack_harmonics(source: Unpacker) -> np.ndarray | None:
+    if "harmonics" not in source.header:
+        return None
+    known = source.header["harmonics"]
+    values = source.columns(known["row"], 3 * known["terms"]) * known["step"]
+    return values.astype(np.float32).reshape(-1, known["terms"], 3)
 
 
 def _unpack_far(source: Unpacker, points: np.ndarray) -> None:

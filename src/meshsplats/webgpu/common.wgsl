@@ -18,6 +18,7 @@ struct Frame {
   runs_at: u32, face_groups_at: u32, group_faces_at: u32,  // offsets in `mesh`
   samples: u32,                               // side of the grid of samples in a pixel
   right_rest: vec4f, down_rest: vec4f, forward_rest: vec4f, lens_rest: vec4f,  // what rounding left
+  terms: u32,                                 // spherical harmonics of each splat; 0: none
 };
 
 const TILE = 8u;           // samples along each side of a tile

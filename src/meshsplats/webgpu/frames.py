@@ -15,7 +15,15 @@ from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh
 from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET, Device
-from meshsplats.webgpu.layout import check_fans, check_size, find_fans, find_groups, find_runs, tiles_of
+from meshsplats.webgpu.layout import (
+    check_fans,
+    check_size,
+    find_fans,
+    find_groups,
+    find_owners,
+    find_runs,
+    tiles_of,
+)
 
 WINDOW_SAMPLES = 1 << 22
 """Largest number of samples of a frame; larger images are drawn in windows."""
@@ -124,7 +132,7 @@ class MeshFrames:
         """Whether the runs on the GPU are in the order of the splats of a frame."""
         parts = [mesh.faces.view(np.uint32).ravel(), runs]
         self.counts = {"one": 1, "vertices": len(mesh.vertices), "faces": len(mesh.faces), "runs": len(runs)}
-        self.counts |= {"splats": 0, "groups": 0}
+        self.counts |= {"splats": 0, "groups": 0, "harmonics": 0}
         self.offsets = (3 * len(mesh.faces), 0, 0)
         if mesh.depth_group is not None and (mesh.depth_group >= 0).any():
             of_face, largest = find_groups(mesh)
@@ -141,7 +149,7 @@ class MeshFrames:
         check_size(device, "vertices", 16 * (len(mesh.vertices) + 2 * self.counts["groups"]))
         check_size(device, "triangles", 4 * sum(map(len, parts)))
         self.upload("vertices", mesh.vertices)
-        self.upload("values", mesh.colors)
+        self._upload_colors(mesh)
         self.upload("mesh", np.concatenate(parts))
         self.allocate("projected", 16 * (len(mesh.vertices) + 2 * self.counts["groups"]))
         self.allocate("group_bounds", 8 * self.counts["groups"])
@@ -154,6 +162,18 @@ class MeshFrames:
         digits[:-1, :2] = kernels.DIGITS
         digits[:-1, 2] = 1
         self.upload("digits", digits)
+
+    def _upload_colors(self, mesh: SplatMesh) -> None:
+        """What is blended or, for colours that depend on the view, what ``shade`` makes it of."""
+        if mesh.harmonics is None:
+            self.upload("values", mesh.colors)
+            return
+        check_size(self.device, "splats with harmonics", mesh.harmonics.nbytes)
+        self.counts["harmonics"] = mesh.harmonics.shape[1]
+        self.upload("base", mesh.colors)
+        self.upload("harmonics", mesh.harmonics)
+        self.upload("owners", find_owners(mesh))
+        self.allocate("values", mesh.colors.nbytes)
 
     # ---- Buffers
 
@@ -400,4 +420,5 @@ def frame_uniform(
     for i in range(3):
         data[44 + 4 * i : 47 + 4 * i] = matrix[i, :3] - data[4 * i : 4 * i + 3]
     data[56:60] = lens - data[20:24]
+    words[60] = counts["harmonics"]
     return data

@@ -39,8 +39,9 @@ OUTPUTS: tuple[Output, ...] = ("color", "depth", "vertex_normals", "face_normals
 
 
 def lists_source() -> str:
-    """WGSL of the kernels that make the tile lists, and of ``resolve``."""
-    return _text("common.wgsl") + _text("lists.wgsl") + _text("sorting.wgsl") + _text("splat_order.wgsl")
+    """WGSL of the kernels that shade and make the tile lists, and of ``resolve``."""
+    names = ("common", "lists", "shading", "sorting", "splat_order")
+    return "".join(_text(f"{name}.wgsl") for name in names)
 
 
 def raster_source(
@@ -101,7 +102,7 @@ RUN_DIGITS = (0, 1, 2, 3)
 
 
 def list_steps(order: Order = "fragment") -> list[dict[str, Any]]:
-    """The steps from vertices to sorted tile lists, in their order, as JSON values.
+    """The steps from vertices to their colours and sorted tile lists, in their order, as JSON values.
 
     In the order 'splat', runs are sorted first, and pairs by their tiles alone.
 
@@ -134,6 +135,8 @@ def list_steps(order: Order = "fragment") -> list[dict[str, Any]]:
             source, target = target, source
 
     by_splat = order == "splat"
+    shaded = {0: "frame", 1: "vertices", 25: "values", 26: "base", 27: "harmonics", 28: "owners"}
+    add("shade", shaded, count=["vertices", 256], only_if="harmonics")
     add("project", {0: "frame", 1: "vertices", 6: "projected"}, count=["vertices", 256])
     filtered = {0: "frame", 1: "vertices", 2: "values", 3: "mesh", 4: "fans", 6: "projected"}
     add("widen", filtered, count=["fans", 64], only_if="fans")

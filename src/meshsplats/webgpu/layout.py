@@ -69,6 +69,13 @@ def find_fans(mesh: SplatMesh) -> np.ndarray:
     return np.concatenate(parts).astype(np.uint32)
 
 
+def find_owners(mesh: SplatMesh) -> np.ndarray:
+    """(v,) uint32 splat of each vertex, from 0 on without gaps; 2^32 - 1 for a vertex of no triangle."""
+    owners = np.full(len(mesh.vertices), 0xFFFFFFFF, np.uint32)
+    owners[mesh.faces] = mesh.splats.of_face[:, None]
+    return owners
+
+
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:
     """(f,) uint32 depth group of each face, without gaps, 2^32 - 1 for none; and (g,) uint32 the face of each
     group with the largest area in world space."""

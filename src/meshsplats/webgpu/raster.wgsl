@@ -8,8 +8,8 @@
 // farthest is dropped, and the list is walked again, behind the last fragment that was blended: the result is
 // exact for any K.
 //
-// In the order of the splats nothing waits: fragments are blended in the order of the list, those of a run from
-// its last triangle to the first.
+// In the order of the splats nothing waits: fragments are blended in the order of the list, those of a run
+// from its last triangle to the first.
 
 const BY_SPLAT = $BY_SPLAT;    // the order of the splats
 const K = $Ku;                 // fragments of the queue of each sample

@@ -1,8 +1,9 @@
 // The order of the splats: on the bindings of lists.wgsl.
 //
 // Runs are sorted by the depths of their splats' centres, nearest first, before pairs are made of them. Pairs
-// are emitted in the order of the runs, and the sort by tiles is stable: so it needs no depth. Of equal depths,
-// the later splat is in front, and of one splat the later run, as where triangles are painted one by one.
+// are emitted in the order of the runs, and the sort by tiles is stable: so it needs no depth. Of equal
+// depths, the later splat is in front, and of one splat the later run, as where triangles are painted one by
+// one.
 
 @group(0) @binding(24) var<storage, read_write> mesh_out: array<u32>;
 

@@ -78,8 +78,8 @@ class App {
       this.changed();
     } else {
       this.#fall(`The image is not exact here: ${problems.join("; ")}.` +
-        ` WebGL draws ${this.mesh.order === "splat" ? "whole splats" : "triangles"} sorted by their centres.` +
-        " Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
+        ` WebGL draws ${this.mesh.order === "splat" ? "whole splats" : "triangles"} sorted by` +
+        " their centres. Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
     }
     if (!this.sorted) {
       for (const input of document.querySelectorAll("[name=content], [name=style]")) input.disabled = true;

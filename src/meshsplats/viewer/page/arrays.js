@@ -2,7 +2,7 @@
 // uniform of a frame.
 
 import { sortFarToNear } from "./order.js";
-import { counting } from "./scene.js";
+import { counting, ownersOf } from "./scene.js";
 
 export const TILE = 8;
 const RUN = 8;
@@ -22,8 +22,9 @@ export function fitting(mesh, most, runs, groups) {
   const mostVertices = Math.min(room, 256 * DISPATCH);
   const mostFaces = Math.min(most / 4 / words, groups ? Math.min(room, 64 * DISPATCH) : Infinity,
     F * Math.min(1, (runs - 1) / all));
-  const mostFans = mesh.filter > 0 ? Math.min(64 * DISPATCH, (most / 4 - 1) / 2)
-    : mesh.order === "splat" ? Math.min(256 * DISPATCH, (most / 4 - 1) / 2) : Infinity;
+  const mostFans = Math.min(mesh.harmonics ? most / 12 / mesh.harmonics.terms : Infinity,
+    mesh.filter > 0 ? Math.min(64 * DISPATCH, (most / 4 - 1) / 2)
+      : mesh.order === "splat" ? Math.min(256 * DISPATCH, (most / 4 - 1) / 2) : Infinity);
   if (V <= mostVertices && F <= mostFaces && n <= mostFans) return null;
   const importance = new Float32Array(n), point = k => vertices.subarray(3 * k, 3 * k + 3);
   for (let fan = 0; fan < n; fan++) {
@@ -61,13 +62,29 @@ export function fitting(mesh, most, runs, groups) {
   return part;
 }
 
+// The buffers `owners` and `harmonics` of docs/webgpu.md, of a mesh with harmonics or of a part of it.
+export function shadingOf(mesh, part) {
+  const { terms, step, values } = mesh.harmonics, width = 3 * terms, all = ownersOf(mesh);
+  if (!part) return { owners: all, harmonics: Float32Array.from(values, value => value * step) };
+  const owners = new Uint32Array(part.vertices.length / 3), places = new Map();
+  mesh.faces.forEach((v, corner) => {
+    if (!part.kept[Math.floor(corner / 3)]) return;
+    if (!places.has(all[v])) places.set(all[v], places.size);
+    owners[part.vertexOf[v]] = places.get(all[v]);
+  });
+  const harmonics = new Float32Array(width * places.size);
+  for (const [splat, place] of places)
+    for (let k = 0; k < width; k++) harmonics[width * place + k] = values[width * splat + k] * step;
+  return { owners, harmonics };
+}
+
 // Vertices of some triangles that are not used yet.
 function fresh(faces, used, from, to) {
   return new Set(faces.subarray(3 * from, 3 * to).filter(v => !used[v])).size;
 }
 
-// The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last four unused. filter: variance
-// in square samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
+// The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last 3 unused. filter: variance in
+// square samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
 export function frameUniform(
   { width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter, budget,
 ) {
@@ -83,6 +100,7 @@ export function frameUniform(
   words.set([width, height, Math.ceil(width / TILE), Math.ceil(height / TILE)], 28);
   words.set([counts.vertices, counts.faces, counts.runs, counts.splats], 32);
   words.set([counts.groups, capacity, 0, budget, ...offsets, 1], 36);
+  words[60] = counts.harmonics;
   return floats;
 }
 

@@ -1,7 +1,7 @@
 // WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in
 // the page as Python wrote them; docs/webgpu.md says what a host has to do.
 
-import { TILE, findFans, findGroups, findRuns, fitting, frameUniform } from "./arrays.js";
+import { TILE, findFans, findGroups, findRuns, fitting, frameUniform, shadingOf } from "./arrays.js";
 import { counting } from "./scene.js";
 
 const ROWS = 16; // strips of an image begin at multiples of it
@@ -120,7 +120,16 @@ export class ExactRenderer {
     const part = fitting(mesh, this.most, this.kernels.limits.runs, this.kernels.groups);
     this.levels[level] = { mesh, part };
     this.#upload(`${level}/vertices`, part?.vertices ?? mesh.vertices);
-    this.#upload(`${level}/values`, part?.colors ?? mesh.colors);
+    const colors = part?.colors ?? mesh.colors;
+    if (mesh.harmonics) {
+      const { owners, harmonics } = shadingOf(mesh, part);
+      this.#upload(`${level}/base`, colors);
+      this.#upload(`${level}/owners`, owners);
+      this.#upload(`${level}/harmonics`, harmonics);
+      this.#allocate(`${level}/values`, colors.byteLength);
+    } else {
+      this.#upload(`${level}/values`, colors);
+    }
     this.crop(this.kept ?? null);
     if (this.problem) throw new Error(this.problem);
     return part ? 1 - part.count / (mesh.faces.length / 3) : 0;
@@ -148,7 +157,7 @@ export class ExactRenderer {
     if (part) for (let i = 0; i < faces.length; i++) faces[i] = part.vertexOf[faces[i]];
     const vertices = part?.vertices ?? mesh.vertices, runs = findRuns(faces, splat), F = faces.length / 3;
     const counts = { one: 1, vertices: vertices.length / 3, faces: F, runs: runs.length, splats: 0, fans: 0,
-      groups: 0 };
+      groups: 0, harmonics: mesh.harmonics?.terms ?? 0 };
     let offsets = [3 * F, 0, 0];
     const parts = [faces, runs];
     if (this.kernels.groups) {

@@ -46,12 +46,13 @@ export function counting(n) {
 
 // vertices (3 a vertex), colors (4), faces (3 a triangle), splat (1 a triangle) or null, group or null;
 // fans: first triangle of each fan, and their count at the end; without fans, each triangle is one.
+// harmonics: null or {terms, step, values}, with whole numbers of steps, 3 for each of the terms of a splat.
 export function decodeMesh({ header, row, rows }) {
   const V = header.vertices, F = header.triangles;
   const mesh = {
     vertices: new Float32Array(3 * V), colors: new Float32Array(4 * V), faces: new Uint32Array(3 * F),
     splat: null, group: null, fans: null, blending: header.blending, filter: header.filter,
-    order: header.order ?? "fragment",
+    order: header.order ?? "fragment", harmonics: null,
   };
   const steps = { ...header, row, rows, store: (v, x, y, z) => {
     mesh.vertices[3 * v] = x + header.origin[0];
@@ -67,7 +68,19 @@ export function decodeMesh({ header, row, rows }) {
   }
   mesh.fans ??= mesh.order === "splat" ? startsOf(mesh.splat) : counting(F + 1);
   if (header.group >= 0) mesh.group = Int32Array.from(row(header.group));
+  if (header.harmonics) mesh.harmonics = decodeHarmonics(header.harmonics, row);
   return mesh;
+}
+
+function decodeHarmonics({ terms, step, row: first }, row) {
+  const width = 3 * terms;
+  let values = null;
+  for (let k = 0; k < width; k++) {
+    const column = row(first + k);
+    values ??= new Int16Array(width * column.length);
+    for (let i = 0; i < column.length; i++) values[width * i + k] = column[i];
+  }
+  return { terms, step, values };
 }
 
 // First triangle of each splat, and their count at the end.
@@ -75,6 +88,16 @@ function startsOf(splat) {
   const starts = [];
   splat.forEach((name, f) => { if (f === 0 || name !== splat[f - 1]) starts.push(f); });
   return Uint32Array.from([...starts, splat.length]);
+}
+
+// The splat of each vertex, counted in the order of the triangles; 0 for a vertex of no triangle.
+export function ownersOf({ vertices, faces, splat }) {
+  const owners = new Uint32Array(vertices.length / 3);
+  for (let f = 0, index = -1; f < splat.length; f++) {
+    if (f === 0 || splat[f] !== splat[f - 1]) index++;
+    for (let k = 3 * f; k < 3 * f + 3; k++) owners[faces[k]] = index;
+  }
+  return owners;
 }
 
 // Strays, as the two halves of their bits, into points (3 floats each).

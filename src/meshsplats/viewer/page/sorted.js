@@ -4,101 +4,13 @@
 
 import { fanMiddles, middlesOf } from "./crop.js";
 import { depthsOf, sortFarToNear, sortFarToNearExactly } from "./order.js";
-import { counting } from "./scene.js";
+import { counting, ownersOf } from "./scene.js";
+import { MESH_FRAGMENT, PRESENT_FRAGMENT, PRESENT_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, meshVertex }
+  from "./shaders.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
 const PART = 1 << 18; // triangles of a draw call: long ones block slow devices, or lose them
 const SOLID = { blended: -1, opaque: 1, wireframe: 0.8 };
-const LENS = `
-uniform vec4 row0, row1, row2, lens; // world to camera; fx fy cx cy
-uniform vec3 size;                   // width, height, near
-vec3 seen(vec3 p) { vec4 q = vec4(p, 1); return vec3(dot(row0, q), dot(row1, q), dot(row2, q)); }
-vec4 clip(vec3 c) {
-  return vec4(2. * lens.x / size.x * c.x + (2. * lens.z / size.x - 1.) * c.z,
-    -2. * lens.y / size.y * c.y + (1. - 2. * lens.w / size.y) * c.z, c.z - 2. * size.z, c.z);
-}
-ivec2 place(uint i) { return ivec2(i & 4095u, i >> 12); }
-`;
-const HEAD = `#version 300 es
-precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
-`;
-const MESH_VERTEX = HEAD + LENS + `
-in vec3 position; in vec4 color;
-centroid out vec4 rgba;
-void main() {
-  rgba = color;
-  gl_Position = clip(seen(position));
-}`;
-const MESH_FRAGMENT = HEAD + `
-uniform float solid; // opacity of all fragments; negative: that of the vertices
-centroid in vec4 rgba;
-out vec4 result;
-void main() {
-  float alpha = solid < 0. ? rgba.a : solid;
-  result = vec4(rgba.rgb * alpha, alpha);
-}`;
-const SPLAT_VERTEX = HEAD + LENS + `
-uniform sampler2D means, shapes, colors;
-uniform float dilation; uniform bool antialiased;
-in uint item;
-out vec4 rgba; out vec2 offset;
-void main() {
-  gl_Position = vec4(0, 0, 2, 1); // outside
-  vec3 c = seen(texelFetch(means, place(item), 0).xyz);
-  rgba = texelFetch(colors, place(item), 0);
-  if (c.z < size.z || rgba.a < 1. / 255.) return;
-  vec4 s = texelFetch(shapes, place(2u * item), 0), t = texelFetch(shapes, place(2u * item + 1u), 0);
-  mat3 covariance = mat3(s.x, s.y, s.z, s.y, s.w, t.x, s.z, t.x, t.y);
-  // EWA: the local affine approximation, where the direction is limited as in 3D Gaussian Splatting.
-  vec2 limit = 1.3 * vec2(max(lens.z, size.x - lens.z), max(lens.w, size.y - lens.w)) / lens.xy;
-  vec2 slope = clamp(c.xy / c.z, -limit, limit);
-  vec3 jx = vec3(lens.x / c.z, 0, -lens.x * slope.x / c.z),
-    jy = vec3(0, lens.y / c.z, -lens.y * slope.y / c.z);
-  mat3 turn = mat3(row0.xyz, row1.xyz, row2.xyz);
-  vec3 x = turn * jx, y = turn * jy;
-  float a = dot(x, covariance * x), b = dot(x, covariance * y), d = dot(y, covariance * y);
-  float before = max(a * d - b * b, 0.);
-  a += dilation; d += dilation;
-  float determinant = a * d - b * b;
-  if (!(determinant > 0.)) return;
-  if (antialiased) rgba.a *= sqrt(before / determinant);
-  if (rgba.a < 1. / 255.) return;
-  float middle = .5 * (a + d), spread = sqrt(max(middle * middle - determinant, 1e-9));
-  float large = middle + spread, small = max(middle - spread, 1e-9);
-  vec2 axis = abs(b) < 1e-9 ? (a >= d ? vec2(1, 0) : vec2(0, 1)) : normalize(vec2(b, large - a));
-  offset = sqrt(2. * log(255. * rgba.a)) * vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID >> 1) * 2 - 1);
-  vec2 pixel = lens.xy * c.xy / c.z + lens.zw + axis * sqrt(large) * offset.x +
-    vec2(-axis.y, axis.x) * sqrt(small) * offset.y;
-  gl_Position = vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0, 1);
-}`;
-const SPLAT_FRAGMENT = HEAD + `
-in vec4 rgba; in vec2 offset;
-out vec4 result;
-void main() {
-  float alpha = min(.99, rgba.a * exp(-.5 * dot(offset, offset)));
-  if (alpha < 1. / 255.) discard;
-  result = vec4(rgba.rgb * alpha, alpha);
-}`;
-const PRESENT_VERTEX = HEAD + `
-out vec2 uv;
-void main() { uv = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(2. * uv - 1., 0, 1); }`;
-const PRESENT_FRAGMENT = HEAD + `
-uniform sampler2D image; uniform vec3 background; uniform float gain; uniform bool linear;
-in vec2 uv; out vec4 result;
-vec3 decode(vec3 c) { return mix(c / 12.92, pow((max(c, 0.) + .055) / 1.055, vec3(2.4)), step(.04045, c)); }
-vec3 encode(vec3 c) {
-  return mix(c * 12.92, 1.055 * pow(max(c, 0.), vec3(1. / 2.4)) - .055, step(.0031308, c));
-}
-void main() {
-  vec4 c = texture(image, uv);
-  vec3 rgb = c.rgb;
-  if (gain != 1.) {
-    vec3 own = rgb / max(c.a, 1e-6);
-    rgb = c.a * (linear ? own * gain : encode(decode(own) * gain));
-  }
-  rgb += (1. - c.a) * (linear ? decode(background) : background);
-  result = vec4(linear ? encode(rgb) : rgb, 1);
-}`;
 
 export class SortedRenderer {
   // levels: meshes by name; others may be added later. Throws where there is no WebGL2.
@@ -117,16 +29,25 @@ export class SortedRenderer {
     if (this.triangles[level]) return this.triangles[level];
     const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3,
       V = mesh.vertices.length / 3;
-    this.programs.mesh ??= program(gl, MESH_VERTEX, MESH_FRAGMENT);
-    const bytes = new Uint8Array(4 * V);
-    for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
+    const { harmonics } = mesh, terms = harmonics?.terms ?? 0;
+    const drawing = this.programs[`mesh ${terms}`] ??= program(gl, meshVertex(terms), MESH_FRAGMENT);
+    const brightest = mesh.colors.reduce((most, value) => Math.max(most, value), 1), bright = brightest > 1;
+    const largest = bright ? 65535 : 255, colors = new (bright ? Uint16Array : Uint8Array)(4 * V);
+    for (let i = 0; i < 4 * V; i++)
+      colors[i] = Math.round(largest * mesh.colors[i] / (i % 4 === 3 ? 1 : brightest));
+    const attributes = [["position", mesh.vertices, 3, gl.FLOAT],
+      ["color", colors, 4, bright ? gl.UNSIGNED_SHORT : gl.UNSIGNED_BYTE]], textures = {};
+    if (harmonics) {
+      attributes.push(["owner", ownersOf(mesh), 1, gl.UNSIGNED_INT]);
+      textures.harmonics = texture(gl, gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT, inFours(harmonics.values));
+    }
     // In the order of the splats, the centres have the precision of the core's.
     const bySplat = mesh.order === "splat", middles = bySplat ? middlesOf(mesh, fans, Float64Array)
       : fanMiddles(mesh), centers = bySplat || fans.length - 1 === F ? middles
       : middlesOf(mesh, counting(F + 1));
     this.triangles[level] = {
-      ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans, bySplat,
-      order: new Uint32Array(F),
+      ...indexedArray(gl, drawing, attributes), drawing, textures, brightest,
+      harmonicStep: harmonics?.step ?? 0, centers, middles, fans, bySplat, order: new Uint32Array(F),
       depths: new Float32Array(F), fanDepths: new Float32Array(fans.length - 1),
       fanOrder: new Uint32Array(fans.length - 1), count: 0,
     };
@@ -215,12 +136,17 @@ export class SortedRenderer {
         if (stop()) return null;
       }
       const some = list.subarray(at, at + PART);
-      this.#begin(frame, this.programs.mesh, pinhole, at === 0);
+      this.#begin(frame, all.drawing, pinhole, at === 0);
       if (opaque) {
         gl.disable(gl.BLEND);
         gl.enable(gl.DEPTH_TEST);
       }
-      gl.uniform1f(this.programs.mesh.at("solid"), SOLID[style]);
+      const place = all.drawing.at;
+      bindTextures(gl, all.drawing, all.textures);
+      gl.uniform1f(place("solid"), SOLID[style]);
+      gl.uniform1f(place("brightest"), all.brightest);
+      gl.uniform1f(place("harmonicStep"), all.harmonicStep);
+      gl.uniform3fv(place("eye"), pinhole.center);
       gl.bindVertexArray(all.array);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires),
         gl.STREAM_DRAW);
@@ -381,18 +307,17 @@ function cornersOf(faces, some, edges) {
   return indices;
 }
 
-// Vertices with their colours, and room for indices.
-function indexedArray(gl, { id }, positions, colors) {
+// Vertices with their attributes [name, values, width, type], and room for indices.
+function indexedArray(gl, { id }, attributes) {
   const array = gl.createVertexArray();
   gl.bindVertexArray(array);
-  const attributes = [["position", positions, 3, gl.FLOAT, false],
-    ["color", colors, 4, gl.UNSIGNED_BYTE, true]];
-  for (const [name, values, width, type, normalised] of attributes) {
+  for (const [name, values, width, type] of attributes) {
     const at = gl.getAttribLocation(id, name);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
     gl.enableVertexAttribArray(at);
-    gl.vertexAttribPointer(at, width, type, normalised, 0, 0);
+    if (type === gl.UNSIGNED_INT) gl.vertexAttribIPointer(at, width, type, 0, 0);
+    else gl.vertexAttribPointer(at, width, type, type !== gl.FLOAT, 0, 0);
   }
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bindVertexArray(null);
@@ -409,6 +334,13 @@ function vertexArray(gl, { id }) {
   gl.vertexAttribDivisor(at, 1);
   gl.bindVertexArray(null);
   return { array, buffer };
+}
+
+// Triples as the first three of four.
+function inFours(triples) {
+  const fours = new triples.constructor(triples.length / 3 * 4);
+  for (let i = 0; i < triples.length / 3; i++) fours.set(triples.subarray(3 * i, 3 * i + 3), 4 * i);
+  return fours;
 }
 
 function texture(gl, format, layout, type, values) {
