@@ -67,6 +67,13 @@ def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
     return matrix.astype(np.float32)
 
 
+def harmonic_terms(index: int) -> tuple[tuple[float, tuple[int, int, int]], ...]:
+    """The harmonic of ``index``, 1 to 15, as a polynomial of a unit direction: factors, and the powers of x,
+    y and z that each belongs to."""
+    over, under, terms = _POLYNOMIALS[index - 1]
+    return tuple((factor * _norm(over, under), powers) for factor, powers in terms)
+
+
 def turned_harmonics(harmonics: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """(s, k, 3) float32 ``harmonics`` (s, k, 3) of degree 1 and more, k = 3, 8 or 15, each turned by its
     rotation, of (s, 3, 3): seen along ``rotation @ d``, a splat then looks as it did along d."""
@@ -105,3 +112,24 @@ _DIRECTIONS = _spiral(32)
 def _norm(over: int, under: int) -> float:
     """sqrt(over / (under pi)), the constant in front of a polynomial."""
     return float(np.sqrt(over / (under * np.pi)))
+
+
+_X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+_POLYNOMIALS: tuple[tuple[int, int, tuple[tuple[float, tuple[int, int, int]], ...]], ...] = (
+    (3, 4, ((-1, _Y),)),
+    (3, 4, ((1, _Z),)),
+    (3, 4, ((-1, _X),)),
+    (15, 4, ((1, (1, 1, 0)),)),
+    (15, 4, ((-1, (0, 1, 1)),)),
+    (5, 16, ((2, (0, 0, 2)), (-1, (2, 0, 0)), (-1, (0, 2, 0)))),
+    (15, 4, ((-1, (1, 0, 1)),)),
+    (15, 16, ((1, (2, 0, 0)), (-1, (0, 2, 0)))),
+    (35, 32, ((-3, (2, 1, 0)), (1, (0, 3, 0)))),
+    (105, 4, ((1, (1, 1, 1)),)),
+    (21, 32, ((-4, (0, 1, 2)), (1, (2, 1, 0)), (1, (0, 3, 0)))),
+    (7, 16, ((2, (0, 0, 3)), (-3, (2, 0, 1)), (-3, (0, 2, 1)))),
+    (21, 32, ((-4, (1, 0, 2)), (1, (3, 0, 0)), (1, (1, 2, 0)))),
+    (105, 16, ((1, (2, 0, 1)), (-1, (0, 2, 1)))),
+    (35, 32, ((-1, (3, 0, 0)), (3, (1, 2, 0)))),
+)
+"""Of harmonics 1 to 15: n and m of the factor sqrt(n / (m pi)), then factors with powers of x, y and z."""

@@ -55,7 +55,7 @@ def prepare(
     mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions, layers: int
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and facts, the fields of ``inside.scene.Subject``; ``layers`` as from ``count``."""
-    mesh = mesh.plain
+    mesh = mesh if options.light is None else mesh.plain
     bounds = scene_bounds(mesh)
     up = mesh.up.astype(np.float64)
     facts = {
@@ -75,6 +75,8 @@ def prepare(
     }
     if mesh.face_splat is not None:
         arrays["face_splat"] = mesh.face_splat
+    if (harmonics := vertex_harmonics(mesh)) is not None:
+        arrays["harmonics"] = harmonics
     if options.light is not None:
         lit, of_light = lit_subject(mesh, cameras, threads=options.threads)
         if "light_points" in lit:
@@ -82,6 +84,14 @@ def prepare(
             facts["floor"] = ground_height(facts["floor"], points, normals, of_light["light_spacing"])
         return arrays | lit, facts | of_light
     return arrays, facts
+
+
+def vertex_harmonics(mesh: SplatMesh) -> np.ndarray | None:
+    """(v, k, 3) float32 harmonics of the splat that each vertex belongs to; None where ``mesh`` has none."""
+    if mesh.harmonics is None:
+        return None
+    owner = mesh.splats.of_vertex
+    return np.where((owner >= 0)[:, None, None], mesh.harmonics[owner], np.float32(0))
 
 
 def lowest(bounds: Bounds, up: np.ndarray) -> float:

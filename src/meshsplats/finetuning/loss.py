@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import NamedTuple, Protocol
@@ -130,3 +131,16 @@ def own_loss(loss: Loss, image: np.ndarray, target: Target) -> tuple[float, np.n
             f" {gradient.shape}"
         )
     return float(value), np.ascontiguousarray(gradient, np.float32)
+
+
+def check_loss(loss: Loss, config: FinetuneConfig, changes: Mapping[str, object]) -> None:
+    """TypeError if ``loss`` is no function; ValueError if ``changes`` set weights of the default one beside
+    it."""
+    if not callable(loss):
+        raise TypeError(f"loss must be a function of an image and its target, got {described(loss)}")
+    if isinstance(loss, DefaultLoss):
+        return
+    # With opacity 'cutoff', l2_weight weighs the expected error, too.
+    for name in ("ssim_weight", "l2_weight"):
+        if name in changes and not (name == "l2_weight" and config.expected_share and config.cuts):
+            raise ValueError(f"{name} weighs the default loss: leave it out, or the loss of your own")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from meshsplats._arrays import checked_array
-from meshsplats._kinds import described, need, need_path
+from meshsplats._kinds import need, need_path
 from meshsplats._options import Range, check_options
 from meshsplats._origin import need_one_origin
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
@@ -29,7 +29,7 @@ from meshsplats.finetuning.clock import Clock
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
-from meshsplats.finetuning.loss import DefaultLoss, Loss, loss_name
+from meshsplats.finetuning.loss import Loss, check_loss, loss_name
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.phases.choice import PHASE_ARRAYS, check_phases, first_phase
 from meshsplats.finetuning.phases.phase import Moment, Phase
@@ -162,7 +162,7 @@ def finetune(
     if config.order == "file":
         raise ValueError("order 'file' gives a mesh and the order of its triangles: call finetune_ordered")
     if loss is not None:
-        _check_loss(loss, config, changes)
+        check_loss(loss, config, changes)
     return ready_loop(mesh, dataset, config, run, frozen=frozen, loss=loss, on_progress=on_progress).run()
 
 
@@ -198,17 +198,6 @@ def ready_loop(
     resumed = clock.fraction if start.step else None
     phase = first_phase(config, mesh, start.state, resumed=resumed, arrays=start.arrays, listing=listing)
     return TrainingLoop(start, clock, phase, run, on_progress)
-
-
-def _check_loss(loss: Loss, config: FinetuneConfig, changes: Mapping[str, object]) -> None:
-    if not callable(loss):
-        raise TypeError(f"loss must be a function of an image and its target, got {described(loss)}")
-    if isinstance(loss, DefaultLoss):
-        return
-    # With opacity 'cutoff', l2_weight weighs the expected error, too.
-    for name in ("ssim_weight", "l2_weight"):
-        if name in changes and not (name == "l2_weight" and config.expected_share and config.cuts):
-            raise ValueError(f"{name} weighs the default loss: leave it out, or the loss of your own")
 
 
 @dataclass(frozen=True, eq=False)

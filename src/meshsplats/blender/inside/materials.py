@@ -6,7 +6,8 @@ from typing import Any
 
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
-from meshsplats.blender.inside.meshes import COLOR, NORMAL
+from meshsplats.blender.inside.meshes import COLOR, HARMONICS, NORMAL
+from meshsplats.spherical_harmonics import harmonic_terms
 
 SELF_SHADOW = "Self-shadow distance"
 """Name and label of the node with the distance within which layers do not shade each other."""
@@ -44,14 +45,19 @@ class _Tree:
         return node.outputs[0]
 
 
-def unlit(name: str = "Splats, unlit", *, attribute: str = COLOR) -> Any:
+def unlit(name: str = "Splats, unlit", *, attribute: str = COLOR, terms: int = 0) -> Any:
     """Emits the colours of ``attribute`` unchanged, composited by opacity: from any side, in mirrors and
-    through glass."""
+    through glass.
+
+    ``terms``: number of harmonics of each splat, 3, 8 or 15, which add what depends on the direction that a
+    ray comes along; 0: none.
+    """
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
     color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
     emission = tree.node("ShaderNodeEmission", 2, 1)
-    tree.link(color.outputs["Color"], emission.inputs["Color"])
+    shown = color.outputs["Color"] if not terms else _seen(tree, color.outputs["Color"], terms)
+    tree.link(shown, emission.inputs["Color"])
     _translucent(tree, material, color.outputs["Alpha"], emission.outputs[0])
     return material
 
@@ -128,6 +134,58 @@ def lit(
     tree.link(glow.outputs[0], both.inputs[2])
     _translucent(tree, material, alpha, both.outputs[0])
     return material
+
+
+def _seen(tree: _Tree, color: Any, terms: int) -> Any:
+    """Output with the colour of a splat in a view: ``color`` and its harmonics, at least 0."""
+    coming = tree.node("ShaderNodeNewGeometry", -9, 8)
+    turned = tree.node(
+        "ShaderNodeVectorTransform", -8, 8, vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT"
+    )
+    tree.link(coming.outputs["Incoming"], turned.inputs[0])
+    # The object's axes are those of the splats but for its rotation and one scale.
+    length = tree.node("ShaderNodeVectorMath", -7, 8, operation="NORMALIZE")
+    tree.link(turned.outputs[0], length.inputs[0])
+    axes = tree.node("ShaderNodeSeparateXYZ", -6, 8)
+    tree.link(length.outputs[0], axes.inputs[0])
+    # Incoming points to the camera: the direction from it is the opposite.
+    x, y, z = (tree.math("MULTIPLY", -5, 8 + i, axes.outputs[i], -1.0) for i in range(3))
+    basis = [_polynomial(tree, (x, y, z), k) for k in range(1, terms + 1)]
+    sums = []
+    for channel, name in enumerate(HARMONICS):
+        total: Any = None
+        for i in range(-(-terms // 4)):
+            four = tree.node("ShaderNodeAttribute", -3, 10 + 5 * channel + i, attribute_name=f"{name}_{i}")
+            parts = tree.node("ShaderNodeSeparateXYZ", -2, 10 + 5 * channel + i)
+            tree.link(four.outputs["Vector"], parts.inputs[0])
+            values = [*parts.outputs, four.outputs["Alpha"]]
+            for value, b in zip(values, basis[4 * i : 4 * i + 4], strict=False):
+                product = tree.math("MULTIPLY", -1, 10 + 5 * channel + i, value, b)
+                total = product if total is None else tree.math("ADD", 0, 10 + 5 * channel, total, product)
+        sums.append(total)
+    together = tree.node("ShaderNodeCombineXYZ", 1, 10)
+    for value, target in zip(sums, together.inputs, strict=True):
+        tree.link(value, target)
+    added = tree.node("ShaderNodeVectorMath", 1, 2, operation="ADD")
+    tree.link(color, added.inputs[0])
+    tree.link(together.outputs[0], added.inputs[1])
+    above = tree.node("ShaderNodeVectorMath", 2, 2, operation="MAXIMUM")
+    tree.link(added.outputs[0], above.inputs[0])
+    above.inputs[1].default_value = (0, 0, 0)
+    return above.outputs[0]
+
+
+def _polynomial(tree: _Tree, d: tuple[Any, Any, Any], k: int) -> Any:
+    """Output with harmonic ``k``, from 1, of the direction with the outputs ``d``."""
+    total: Any = None
+    for factor, powers in harmonic_terms(k):
+        product: Any = None
+        for axis, power in enumerate(powers):
+            for _ in range(power):
+                product = d[axis] if product is None else tree.math("MULTIPLY", -4, k, product, d[axis])
+        product = tree.math("MULTIPLY", -4, k, product, factor)
+        total = product if total is None else tree.math("ADD", -4, k, total, product)
+    return total
 
 
 def set_baked(material: Any, baked: bool) -> None:

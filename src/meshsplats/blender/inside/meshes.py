@@ -16,6 +16,9 @@ DISPLAY = "DisplayColor"
 """Attribute of a lit mesh: the RGBA that the unlit one has in ``COLOR``."""
 MADE = "LitColor"
 """Attribute of a lit mesh: the RGBA that it was made with in ``COLOR``, so that painted colours show."""
+HARMONICS = ("splat_sh_red", "splat_sh_green", "splat_sh_blue")
+"""Names, up to a number from 0, of attributes with four coefficients each of the harmonics of a vertex'
+splat, of degree 1 and more; the last ones are padded with zeros."""
 NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
@@ -33,10 +36,11 @@ def make_mesh(
     normals: np.ndarray | None = None,
     face_splat: np.ndarray | None = None,
     display: np.ndarray | None = None,
+    harmonics: np.ndarray | None = None,
     edges: bool = True,
 ) -> Any:
     """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored unchanged,
-    as are the unlit ones, ``display`` (v, 4).
+    as are the unlit ones, ``display`` (v, 4), and the (v, k, 3) ``harmonics`` of the vertices' splats.
 
     ``edges`` False skips the edges and, without ``normals``, shades flat: renderers need no edges, an unlit
     material no normals, and both take as long as all the rest.
@@ -49,6 +53,8 @@ def make_mesh(
         attribute.data.foreach_set("color", np.ascontiguousarray(display, np.float32).ravel())
         attribute = mesh.attributes.new(MADE, "FLOAT_COLOR", "POINT")
         attribute.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())
+    if harmonics is not None:
+        _store_harmonics(mesh, harmonics)
     if normals is not None:
         attribute = mesh.attributes.new(NORMAL, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", np.ascontiguousarray(normals, np.float32).ravel())
@@ -65,6 +71,30 @@ def make_mesh(
         # Cycles lights only the side that the mesh's own (smooth) normals face.
         versions.set_normals(mesh, normals)
     return mesh
+
+
+def _store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
+    count, terms, _ = harmonics.shape
+    packed = np.zeros((3, -(-terms // 4), count, 4), np.float32)
+    for k in range(terms):
+        packed[:, k // 4, :, k % 4] = harmonics[:, k].T
+    for name, fours in zip(HARMONICS, packed, strict=True):
+        for i, four in enumerate(fours):
+            attribute = mesh.attributes.new(f"{name}_{i}", "FLOAT_COLOR", "POINT")
+            attribute.data.foreach_set("color", four.ravel())
+
+
+def read_harmonics(mesh: Any) -> np.ndarray | None:
+    """(v, k, 3) float32 harmonics of the vertices' splats, k = 3, 8 or 15; None without."""
+    fours = 0
+    while all(f"{name}_{fours}" in mesh.attributes for name in HARMONICS):
+        fours += 1
+    if not fours:
+        return None
+    found = [
+        np.concatenate([read_colors(mesh, f"{name}_{i}") for i in range(fours)], axis=1) for name in HARMONICS
+    ]
+    return np.stack(found, axis=2)[:, : {1: 3, 2: 8}.get(fours, 15)]
 
 
 def make_plain(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:

@@ -22,11 +22,12 @@ from meshsplats.blender.inside import (
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
-from meshsplats.blender.subject import lit_subject, lowest
+from meshsplats.blender.subject import lit_subject, lowest, vertex_harmonics
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.baking import bake_filter
-from meshsplats.mesh import Blending, SplatMesh
+from meshsplats.face_splats import FaceSplats
+from meshsplats.mesh import MAX_COLOR, Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
 
 LIT = "meshsplats_lit"
@@ -52,7 +53,14 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
         mesh = prior.pose(lift=prior.export_lift)
     if mesh.filter_px2:
         mesh = bake_filter(mesh)
-    arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
+    shown = mesh.plain if lit else mesh
+    arrays: dict[str, Any] = {
+        "faces": mesh.faces,
+        "colors": shown.colors,
+        "normals": None,
+        "self_shadow": 0.0,
+        "harmonics": vertex_harmonics(shown),
+    }
     if lit:
         made, facts = lit_subject(mesh)
         arrays |= made | facts
@@ -162,13 +170,15 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         normals=prepared["normals"],
         face_splat=mesh.face_splat,
         display=prepared.get("display"),
+        harmonics=prepared.get("harmonics"),
     )
     if mesh.binding is not None:
         priors.store(data, mesh.binding)
     if prepared["lit"]:
         data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
     else:
-        data.materials.append(materials.unlit())
+        harmonics = prepared.get("harmonics")
+        data.materials.append(materials.unlit(terms=0 if harmonics is None else harmonics.shape[1]))
     mark(
         data,
         up=mesh.up,
@@ -225,6 +235,7 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
         faces,
         colors,
         face_splat=owner,
+        harmonics=_harmonics_of(data, faces, owner),
         up=np.array(facts[UP]),
         blending=blending,
         origin=np.array(facts.get(WORLD, (0, 0, 0)), np.float64),
@@ -233,6 +244,16 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
         return found
     binding = priors.binding_of(obj)
     return found.moved(binding.positions(), normals=binding.normals(), binding=binding)
+
+
+def _harmonics_of(data: Any, faces: np.ndarray, owner: np.ndarray | None) -> np.ndarray | None:
+    """(s, k, 3) harmonics of the splats of the mesh ``data``; None where it has none, or splats share
+    vertices."""
+    found = None if owner is None else meshes.read_harmonics(data)
+    if found is None or not len(faces):
+        return None
+    splats = FaceSplats(faces, owner, len(found))
+    return None if splats.share_vertices else found[faces[splats.starts, 0]]
 
 
 def unlit_colors(data: Any) -> np.ndarray:
@@ -244,6 +265,8 @@ def _unlit_colors(data: Any, facts: Any) -> np.ndarray:
     """As ``unlit_colors``, of a mesh ``data`` that has its properties from ``facts``."""
     shown = meshes.read_colors(data, meshes.COLOR)
     colors = np.clip(shown, 0, 1)
+    if not facts[LIT] and not facts[LINEAR]:
+        colors[:, :3] = np.clip(shown[:, :3], 0, MAX_COLOR)
     if not facts[LIT]:
         return colors
     if not facts[LINEAR]:

@@ -59,6 +59,9 @@ class Subject:
     """(f,) int32."""
     display: np.ndarray | None = None
     """(v, 4) float32 RGBA as composited unlit, if lit."""
+    harmonics: np.ndarray | None = None
+    """(v, k, 3) float32 spherical harmonics of the vertices' splats, if unlit and colours depend on the
+    view."""
     surface_vertices: np.ndarray | None = None
     """(w, 3) float32; this and the following are the fields of ``StandIn``, if lit and solid."""
     surface_faces: np.ndarray | None = None
@@ -171,6 +174,7 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         normals=subject.normals,
         face_splat=subject.face_splat,
         display=subject.display,
+        harmonics=subject.harmonics,
         edges=edges,
     )
     obj = meshes.make_object(mesh, subject.name, rotation, home)
@@ -186,7 +190,8 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
     if edges or options.engine == "eevee":  # a file may be drawn by either
         far_to_near.add(obj)
     if light is None:
-        mesh.materials.append(materials.unlit())
+        terms = 0 if subject.harmonics is None else subject.harmonics.shape[1]
+        mesh.materials.append(materials.unlit(terms=terms))
         return obj
     material = materials.lit(
         self_shadow=subject.self_shadow,
