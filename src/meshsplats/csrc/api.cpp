@@ -13,8 +13,8 @@
 #include "hidden_new.h"
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
-#include "listing.h"
 #include "fusion.h"
+#include "listing.h"
 #include "merging.h"
 #include "ordering.h"
 #include "viewer.h"

@@ -9,8 +9,8 @@
 #include "edges.h"
 #include "fans.h"
 #ifndef MS_WIDE_ONLY
-#include "listing.h"
 #include "fusion.h"
+#include "listing.h"
 #include "merging.h"
 #include "ordering.h"
 #include "viewer.h"
