@@ -17,7 +17,7 @@ out.mkdir(exist_ok=True)
 
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 camera = ms.orbit(cloud, 1, elevation=22, azimuth=-10, width=340, height=380)[0]
-mesh = ms.convert(cloud, cameras=[camera])
+mesh = ms.convert(cloud, cameras=[camera], colors="base")
 
 # One vertex per corner, so that each triangle has its own shade; smaller fans, so that gaps show.
 corners = mesh.vertices[mesh.faces]

@@ -56,7 +56,7 @@ def test_the_farthest_point_fits_a_depth_image(cloud):
 def test_samples_and_background_suit_the_scene(cloud):
     cameras = orbit(cloud, 1, width=24, height=16)
     assert FrameOptions().for_scene(cloud, cameras).samples == 1
-    mesh = convert(cloud)
+    mesh = convert(cloud, colors="base")
     assert (FrameOptions().for_scene(mesh, cameras).samples or 0) > 1
     assert FrameOptions(samples=5).for_scene(mesh, cameras).samples == 5
     grey = FrameOptions(background=(0.5,) * 3)

@@ -431,7 +431,10 @@ def test_an_order_for_viewers_that_cull(tmp_path, capsys):
     [
         (("--set", "nodes=2"), "nodes and quick are for --alpha ordered"),
         (("--alpha", "ordered", "--lit"), "neither --lit nor --compression"),
-        (("--alpha", "ordered", "--set", "nodes=0"), "nodes must be a number from 1 to 256, got 0"),
+        (
+            ("--alpha", "ordered", "--set", "nodes=0"),
+            "nodes must be a number from 1 to 256, or 'auto', got 0",
+        ),
     ],
 )
 def test_what_an_order_does_not_go_with(tmp_path, capsys, options, message):

@@ -252,7 +252,7 @@ def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--sh-degree", "0"], "images of other splats.*--sh-degree was not given and is 0"),
+        (["--sh-degree", "0"], "began with another mesh.*--sh-degree was not given and is 0"),
         (["--held-out", "1"], "other views.*--held-out was 2 and is 1"),
         (["--axes", "y-up"], "another mesh.*options of reading it.*--axes was auto and is y-up"),
     ],
@@ -518,10 +518,10 @@ def test_meshes_stand_as_asked_however_they_came_about(tmp_path):
         np.testing.assert_allclose(load_mesh(tmp_path / "t.npz").up, (0, 0, 1), atol=1e-6)
 
 
-@pytest.mark.parametrize("option", ["colors", "detail", "footprint"])
+@pytest.mark.parametrize("option", ["colors=mean", "detail=cameras", "footprint=cameras"])
 def test_conversion_options_that_need_cameras(splats, tmp_path, option, monkeypatch):
     monkeypatch.setattr("meshsplats.finetuning.on_splats.TIMED_SPLATS", 1)
-    words = (splats, "-o", tmp_path / "t.npz", *SMALL, "--set", f"{option}=cameras", "--force")
+    words = (splats, "-o", tmp_path / "t.npz", *SMALL, "--set", option, "--force")
     assert run(*words, "--steps", "3") == 0
     assert run(*words, "--minutes", "0.02") == 0
 

@@ -44,7 +44,7 @@ def scene():
     """A data set of images of splats, and their mesh."""
     cloud = make_scene(200)
     dataset = splat_dataset(cloud, train=6, test=2, width=40, sh_degree=0)
-    return dataset, convert(cloud, cameras=[view.camera for view in dataset.train])
+    return dataset, convert(cloud, cameras=[view.camera for view in dataset.train], colors="base")
 
 
 def steps(scene, device, count: int = 5, **options) -> tuple[list[float], State]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -107,7 +107,10 @@ class Blender(Command):
     """cycles: exact. eevee: faster on a graphics card, with triangles sorted per view, which is nearly
     exact."""
     views: ViewOptions = field(default_factory=ViewOptions)
-    lights: Literal["sun", "noon", "overcast", "studio"] | None = None
+    lights: Annotated[
+        Literal["sun", "noon", "overcast", "studio"] | None,
+        tyro.conf.arg(metavar="{sun,noon,overcast,studio}", help_behavior_hint=""),
+    ] = None
     """Light the splats (--lit) by an afternoon sun, the default, a high sun in a clear sky, clouds, or two
     large lamps. The options under "light" change them."""
     light: LightArguments = field(default_factory=LightArguments)
