@@ -373,8 +373,8 @@ class SplatMesh:
         """One mesh of all ``parts``, at least one, vertices and triangles one part behind the other.
 
         The parts must agree in ``blending``, ``filter_px2``, ``order``, ``up``, in their base, and in which
-        optional arrays and attributes they have; only ``depth_group`` may be missing in some. Positions are
-        relative to the first ``origin`` that is not zero. Depth groups stay apart.
+        optional arrays and attributes they have; only ``depth_group`` and ``plain_colors`` may be missing in
+        some. Positions are relative to the first ``origin`` that is not zero. Depth groups stay apart.
 
         Args:
             parts: the meshes.

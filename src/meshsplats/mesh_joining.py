@@ -11,6 +11,8 @@ import numpy as np
 from meshsplats._arrays import joined_rows
 from meshsplats._origin import shared_origin
 
+MAY_MISS = ("depth_group", "plain_colors")
+"""Optional arrays that only some of the parts may have."""
 Mesh = TypeVar("Mesh", bound=Any)
 """``SplatMesh``, which imports this module."""
 
@@ -23,6 +25,8 @@ def joined_meshes(parts: Sequence[Mesh], *, same_splats: bool = False) -> Mesh:
         check_alike(parts[0], part, f"parts[{number}]")
     origin = shared_origin(part.origin for part in parts)
     parts = [part.relative_to(origin) for part in parts]
+    if any(part.plain_colors is not None for part in parts):
+        parts = [replace(part, plain_colors=part.plain.colors[:, :3]) for part in parts]
     first = parts[0]
     prefix = "attribute."
     arrays: dict[str, Any] = joined_rows(
@@ -75,8 +79,8 @@ def check_alike(mesh: Mesh, other: Mesh, name: str) -> None:
 
 
 def _optional(mesh: Mesh) -> dict[str, tuple[int, ...]]:
-    """The optional arrays but ``depth_group``, attributes and binding: the shape of a row by name."""
-    found = {f.name: getattr(mesh, f.name) for f in mesh.FIELDS if f.optional and f.name != "depth_group"}
+    """The optional arrays but ``MAY_MISS``, attributes and binding: the shape of a row by name."""
+    found = {f.name: getattr(mesh, f.name) for f in mesh.FIELDS if f.optional and f.name not in MAY_MISS}
     found |= {f"attribute {name!r}": value for name, value in mesh.attributes.items()}
     shapes = {name: value.shape[1:] for name, value in found.items() if value is not None}
     return shapes if mesh.binding is None else shapes | {"binding": ()}

@@ -166,6 +166,14 @@ def test_what_is_joined_looks_as_it_does_apart():
         SplatMesh.joined([colorful(3), two])
 
 
+def test_plain_colours_may_be_missing_in_some_of_what_is_joined():
+    one, two = colorful(2, 11), colorful(2, 12)
+    grey = np.full((len(two.vertices), 3), 0.25, np.float32)
+    joined = SplatMesh.joined([one, replace(two, plain_colors=grey)])
+    assert np.array_equal(joined.plain_colors, np.concatenate([one.plain.colors[:, :3], grey]))
+    assert SplatMesh.joined([one, two]).plain_colors is None
+
+
 def test_a_choice_of_triangles_keeps_the_colours_of_its_splats():
     mesh, view = colorful(2, 13), camera()
     chosen = np.flatnonzero(np.isin(mesh.face_splat, mesh.splats.numbers[[3, 20, 21]]))[::-1]

@@ -36,11 +36,10 @@ def make_mesh(
     normals: np.ndarray | None = None,
     face_splat: np.ndarray | None = None,
     display: np.ndarray | None = None,
-    harmonics: np.ndarray | None = None,
     edges: bool = True,
 ) -> Any:
     """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored unchanged,
-    as are the unlit ones, ``display`` (v, 4), and the (v, k, 3) ``harmonics`` of the vertices' splats.
+    as are the unlit ones, ``display`` (v, 4).
 
     ``edges`` False skips the edges and, without ``normals``, shades flat: renderers need no edges, an unlit
     material no normals, and both take as long as all the rest.
@@ -53,8 +52,6 @@ def make_mesh(
         attribute.data.foreach_set("color", np.ascontiguousarray(display, np.float32).ravel())
         attribute = mesh.attributes.new(MADE, "FLOAT_COLOR", "POINT")
         attribute.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())
-    if harmonics is not None:
-        _store_harmonics(mesh, harmonics)
     if normals is not None:
         attribute = mesh.attributes.new(NORMAL, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", np.ascontiguousarray(normals, np.float32).ravel())
@@ -73,7 +70,8 @@ def make_mesh(
     return mesh
 
 
-def _store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
+def store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
+    """Gives the bpy ``mesh`` the harmonics (v, k, 3) of its vertices' splats."""
     count, terms, _ = harmonics.shape
     packed = np.zeros((3, -(-terms // 4), count, 4), np.float32)
     for k in range(terms):
@@ -82,6 +80,11 @@ def _store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
         for i, four in enumerate(fours):
             attribute = mesh.attributes.new(f"{name}_{i}", "FLOAT_COLOR", "POINT")
             attribute.data.foreach_set("color", four.ravel())
+
+
+def terms_of(harmonics: np.ndarray | None) -> int:
+    """How many ``harmonics`` (v, k, 3) there are: k; 0 for None."""
+    return 0 if harmonics is None else harmonics.shape[1]
 
 
 def read_harmonics(mesh: Any) -> np.ndarray | None:

@@ -170,15 +170,16 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         normals=prepared["normals"],
         face_splat=mesh.face_splat,
         display=prepared.get("display"),
-        harmonics=prepared.get("harmonics"),
     )
     if mesh.binding is not None:
         priors.store(data, mesh.binding)
     if prepared["lit"]:
         data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
     else:
-        harmonics = prepared.get("harmonics")
-        data.materials.append(materials.unlit(terms=0 if harmonics is None else harmonics.shape[1]))
+        harmonics = prepared["harmonics"]
+        if harmonics is not None:
+            meshes.store_harmonics(data, harmonics)
+        data.materials.append(materials.unlit(terms=meshes.terms_of(harmonics)))
     mark(
         data,
         up=mesh.up,

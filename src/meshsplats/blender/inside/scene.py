@@ -174,7 +174,6 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         normals=subject.normals,
         face_splat=subject.face_splat,
         display=subject.display,
-        harmonics=subject.harmonics,
         edges=edges,
     )
     obj = meshes.make_object(mesh, subject.name, rotation, home)
@@ -190,8 +189,9 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
     if edges or options.engine == "eevee":  # a file may be drawn by either
         far_to_near.add(obj)
     if light is None:
-        terms = 0 if subject.harmonics is None else subject.harmonics.shape[1]
-        mesh.materials.append(materials.unlit(terms=terms))
+        if subject.harmonics is not None:
+            meshes.store_harmonics(mesh, subject.harmonics)
+        mesh.materials.append(materials.unlit(terms=meshes.terms_of(subject.harmonics)))
         return obj
     material = materials.lit(
         self_shadow=subject.self_shadow,
