@@ -422,8 +422,8 @@ def _restored(
         if values.size != v * wide:
             lost.append(name)
             continue
-        shape = (v,) if columns < 0 else (v, wide)
-        restored[f"attribute_{len(report['attributes'])}"] = values.reshape(shape)
+        rows = (v,) if columns < 0 else (v, wide)
+        restored[f"attribute_{len(report['attributes'])}"] = values.reshape(rows)
         report["attributes"].append(name)
     if lost:
         report["warnings"].append(f"another program has altered the file, left out: {', '.join(lost)[:300]}")
