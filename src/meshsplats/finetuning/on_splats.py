@@ -77,11 +77,16 @@ class SplatRun:
     device: Device = "cpu"
 
 
-def as_bright_as(options: ConversionOptions, dataset: Dataset) -> ConversionOptions:
-    """``options`` with the harmonics that images of splats in ``dataset`` show, unless they name colours."""
+def with_colors(options: ConversionOptions, dataset: Dataset, config: FinetuneConfig) -> ConversionOptions:
+    """``options`` with the harmonics that images of splats in ``dataset`` show, unless they name colours. For
+    opacity 'cutoff' with one colour: programs with a depth buffer draw no harmonics."""
     sources = [view.source for view in dataset.train if isinstance(view.source, RenderedSplats)]
     degrees = {source.sh_degree for source in sources}
-    if options.colors is not None or options.color_degree is not None or degrees <= {None}:
+    if options.colors is not None or options.color_degree is not None:
+        return options
+    if config.cuts:
+        return replace(options, colors="base")
+    if degrees <= {None}:
         return options
     degree = max(degree or 0 for degree in degrees)
     return replace(options, colors="view", color_degree=degree) if degree else replace(options, colors="base")
@@ -121,7 +126,7 @@ class SplatTuning:
     def __init__(self, run: SplatRun, setup: Setup) -> None:
         self._run, self._setup = run, setup
         self.dataset, self.config = run.targets(run.config, None), run.config
-        self._options = as_bright_as(replace(run.options, look=self.dataset.look), self.dataset)
+        self._options = with_colors(replace(run.options, look=self.dataset.look), self.dataset, self.config)
         self._record = StartRecord.load(run.folder) if run.resumed else self._timed()
         if self._record.brief_steps is not None:
             self.config = of_brief_run(self.config, self._record.brief_steps, set(run.fixed))
