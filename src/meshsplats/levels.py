@@ -29,6 +29,7 @@ from meshsplats.finetuning import (
 )
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starting_sides
+from meshsplats.finetuning.on_splats import with_colors
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.ordering import drawing_order
@@ -189,6 +190,7 @@ def _starting_level(
         px2 = FILTER_PX2["area"][cloud.kernel]
         sides = starting_sides(level.finest, config, len(cameras))
         options = ConversionOptions(sides=sides, footprint_px2=px2)
+    options = with_colors(options, targets, config)
     return starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
 
 
