@@ -125,7 +125,8 @@ def test_training_in_other_units(unit, backdrop):
         mesh = train(targets, steps=15, start_splats=100, max_splats=300, growth_events=2)
         return evaluate(mesh, targets).method("mesh").mean("psnr")
 
-    assert score(unit) == pytest.approx(score(1.0), abs=0.1)
+    # Where matching decides otherwise by rounding, some of the few fans stand elsewhere.
+    assert score(unit) == pytest.approx(score(1.0), abs=0.1 if unit in EXACT else 0.5)
 
 
 @pytest.mark.parametrize("unit", EXACT)

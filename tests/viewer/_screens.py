@@ -35,7 +35,10 @@ WITHOUT_WEBGPU = "Object.defineProperty(navigator, 'gpu', {value: undefined});"
 
 def font() -> bytes:
     """The same letters everywhere: the font that Pillow has inside, since 10.1 and with FreeType."""
-    found = ImageFont.load_default(16)
+    try:
+        found = ImageFont.load_default(16)
+    except TypeError:  # before 10.1
+        return b""
     return found.font_bytes if isinstance(found, ImageFont.FreeTypeFont) else b""
 
 
