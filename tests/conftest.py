@@ -34,7 +34,7 @@ def shared_data(path: str) -> Path:
     return found
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def node_package() -> Callable[[str], Path]:
     """Gives the folder where a package of npm is installed, which no test installs itself."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from _splats import harmonics_of_3dgs
 
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.spherical_harmonics import degree_of, harmonic_terms, in_fours, sh_basis
 
 
 def sphere(n: int) -> np.ndarray:
@@ -58,3 +58,20 @@ def test_same_as_the_renderer():
 def test_unknown_degree(degree):
     with pytest.raises(ValueError, match="degree must be 0, 1, 2 or 3"):
         sh_basis(np.eye(3), degree)
+
+
+@pytest.mark.parametrize("index", range(1, 16))
+def test_each_harmonic_is_its_polynomial(index):
+    directions = sphere(50)
+    found = sum(f * np.prod(directions ** np.array(powers), axis=1) for f, powers in harmonic_terms(index))
+    np.testing.assert_allclose(found, sh_basis(directions, 3)[:, index], atol=1e-12)
+
+
+def test_coefficients_in_fours():
+    harmonics = np.arange(2 * 8 * 3).reshape(2, 8, 3)
+    fours = in_fours(harmonics)
+    assert fours.shape == (3, 2, 2, 4)
+    assert fours[1, 0, 1].tolist() == harmonics[1, :4, 1].tolist()
+    assert fours[2, 1, 0].tolist() == harmonics[0, 4:, 2].tolist()
+    assert in_fours(harmonics[:, :3])[:, 0, :, 3].tolist() == [[0, 0]] * 3
+    assert [degree_of(np.zeros((1, k, 3))) for k in (3, 8, 15)] == [1, 2, 3]

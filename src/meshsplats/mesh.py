@@ -15,7 +15,7 @@ from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh_joining import joined_meshes
 from meshsplats.order import Order, checked_order
-from meshsplats.spherical_harmonics import turned_harmonics
+from meshsplats.spherical_harmonics import TERMS, degree_of, turned_harmonics
 
 Blending = Literal["display", "linear"]
 
@@ -182,7 +182,7 @@ class SplatMesh:
         return len(self.splats)
 
     def _check_harmonics(self, harmonics: np.ndarray) -> None:
-        if harmonics.shape[1] not in (3, 8, 15):
+        if harmonics.shape[1] not in TERMS:
             raise ValueError(
                 "harmonics must have 3, 8 or 15 coefficients for degree 1, 2 or 3, without the constant one,"
                 f" got shape {harmonics.shape}"
@@ -279,7 +279,7 @@ class SplatMesh:
     @property
     def sh_degree(self) -> int:
         """Degree of ``harmonics``, 1 to 3; 0: colours are the same from everywhere."""
-        return 0 if self.harmonics is None else int((self.harmonics.shape[1] + 1) ** 0.5) - 1
+        return 0 if self.harmonics is None else degree_of(self.harmonics)
 
     def of_degree(self, degree: int) -> SplatMesh:
         """The mesh with its harmonics up to ``degree``, 0 to 3. Without any, colours are limited to 1, as
@@ -289,7 +289,7 @@ class SplatMesh:
         if self.harmonics is None or degree >= self.sh_degree:
             return self
         if degree:
-            return replace(self, harmonics=self.harmonics[:, : (degree + 1) ** 2 - 1])
+            return replace(self, harmonics=self.harmonics[:, : TERMS[degree - 1]])
         return replace(self, harmonics=None, plain_colors=None, colors=np.minimum(self.colors, 1))
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 ODD_AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
@@ -67,6 +69,21 @@ def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
     return matrix.astype(np.float32)
 
 
+def degree_of(harmonics: Any) -> int:
+    """Degree, 1 to 3, of (s, k, 3) ``harmonics`` without the constant one; k as in ``TERMS``."""
+    return TERMS.index(harmonics.shape[1]) + 1
+
+
+def in_fours(harmonics: np.ndarray) -> np.ndarray:
+    """(3, m, s, 4) float32 red, green and blue of ``harmonics`` (s, k, 3), four coefficients at a time; the
+    last ones are padded with zeros."""
+    count, terms, _ = harmonics.shape
+    fours = np.zeros((3, -(-terms // 4), count, 4), np.float32)
+    for k in range(terms):
+        fours[:, k // 4, :, k % 4] = harmonics[:, k].T
+    return fours
+
+
 def harmonic_terms(index: int) -> tuple[tuple[float, tuple[int, int, int]], ...]:
     """The harmonic of ``index``, 1 to 15, as a polynomial of a unit direction: factors, and the powers of x,
     y and z that each belongs to."""
@@ -77,7 +94,7 @@ def harmonic_terms(index: int) -> tuple[tuple[float, tuple[int, int, int]], ...]
 def turned_harmonics(harmonics: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """(s, k, 3) float32 ``harmonics`` (s, k, 3) of degree 1 and more, k = 3, 8 or 15, each turned by its
     rotation, of (s, 3, 3): seen along ``rotation @ d``, a splat then looks as it did along d."""
-    degree = int((harmonics.shape[1] + 1) ** 0.5) - 1
+    degree = degree_of(harmonics)
     basis = sh_basis(_DIRECTIONS, degree)[:, 1:]
     # As in harmonics_map, but from the values of each splat.
     fit = np.linalg.pinv(basis)
@@ -94,7 +111,7 @@ def moved_harmonics(harmonics: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """(s, k, 3) float32 ``harmonics`` (s, k, 3) of degree 1 and more, all turned as points x move to ``matrix
     @ x``: by the rotation or mirror that is nearest to (3, 3) ``matrix``."""
     u, _, v = np.linalg.svd(matrix)
-    turn = harmonics_map(u @ v, int((harmonics.shape[1] + 1) ** 0.5) - 1)
+    turn = harmonics_map(u @ v, degree_of(harmonics))
     return np.ascontiguousarray(turn @ harmonics, np.float32)
 
 

@@ -22,8 +22,7 @@ from meshsplats import (
 )
 from meshsplats.binding import ArrayField, Binding
 from meshsplats.formats import meshes, npz
-from meshsplats.formats.gltf import reader
-from meshsplats.formats.gltf import writer as glb
+from meshsplats.formats.gltf import binary_chunk, reader
 from meshsplats.formats.ply import header
 from meshsplats.formats.sniff import identify
 
@@ -184,9 +183,9 @@ def test_what_save_mesh_refuses(tmp_path):
 
 
 def test_a_glb_beyond_what_32_bits_can_say_is_refused_before_writing(tmp_path, monkeypatch):
-    assert glb._MAX_BYTES == 2**32 - 1
+    assert binary_chunk._MAX_BYTES == 2**32 - 1
     mesh = random_mesh(np.random.default_rng(0), 1000, 10)
-    monkeypatch.setattr(glb, "_MAX_BYTES", 40_000)
+    monkeypatch.setattr(binary_chunk, "_MAX_BYTES", 40_000)
     with pytest.raises(ValueError, match=r"would take \d+,\d+ bytes, a \.glb file can hold 40,000"):
         save_mesh(mesh, tmp_path / "m.glb")
     assert os.listdir(tmp_path) == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import shutil
 import signal
 import struct
@@ -631,15 +630,8 @@ def test_commands(splats, tileset, tmp_path, capsys):
     assert "a tileset, not splats; render and info take it" in capsys.readouterr().err
 
 
-def node_package(name, variable):
-    folder = os.environ.get(variable)
-    if not folder or shutil.which("node") is None or not (Path(folder) / "node_modules" / name).exists():
-        pytest.skip(f"{name} is not here: npm install {name} in a folder, and name it in {variable}")
-    return Path(folder)
-
-
-def test_the_validator_of_khronos_accepts_the_tiles(tileset):
-    folder = node_package("gltf-validator", "MESHSPLATS_NODE_FOLDER")
+def test_the_validator_of_khronos_accepts_the_tiles(tileset, node_package):
+    folder = node_package("gltf-validator")
     script = (
         "const v = require('gltf-validator'), fs = require('fs');"
         "(async () => { for (const f of process.argv.slice(1)) {"

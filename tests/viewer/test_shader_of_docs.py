@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import http.server
 import json
-import os
 import re
 import threading
 from dataclasses import replace
@@ -22,7 +21,6 @@ import _browser
 from _needs import lacking
 
 DOCS = Path(__file__).parents[2] / "docs" / "viewers.md"
-THREE = os.environ.get("MESHSPLATS_NODE_FOLDER")
 PAGE = """<!doctype html><style>body {margin: 0}</style><canvas id="c"></canvas>
 <script type="importmap">{"imports": {"three": "./node_modules/three/build/three.module.js",
   "three/addons/": "./node_modules/three/examples/jsm/"}}</script>
@@ -64,14 +62,13 @@ document.body.dataset.ready = '1';
 
 
 @pytest.fixture(scope="module")
-def drawing(tmp_path_factory):
+def drawing(tmp_path_factory, node_package):
     """Draws a mesh with three.js: (h, w, 3) in [0, 1]."""
     if _browser.PROGRAM is None:
         lacking("browser", "no Chromium was found")
-    if THREE is None:
-        pytest.skip("set MESHSPLATS_NODE_FOLDER to a folder where 'npm install three' was run")
+    three = node_package("three")
     folder = tmp_path_factory.mktemp("three")
-    (folder / "node_modules").symlink_to(Path(THREE) / "node_modules")
+    (folder / "node_modules").symlink_to(three / "node_modules")
     snippet = re.search(r"```js\n(.*?)```", DOCS.read_text("utf-8"), re.DOTALL)[1]
     (folder / "index.html").write_text(PAGE.replace("SNIPPET", snippet))
 

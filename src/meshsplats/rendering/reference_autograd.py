@@ -29,7 +29,7 @@ except ImportError as error:
 from meshsplats.rendering.autograd import Raster
 from meshsplats.rendering.backward import OpacityRamp
 from meshsplats.rendering.reference_samples import sample_positions
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.spherical_harmonics import degree_of, sh_basis
 
 
 def rasterize(
@@ -126,8 +126,7 @@ def _shaded(
     used = torch.from_numpy(np.flatnonzero(owner >= 0))
     away = triangles.vertices.astype(np.float64) + pose[:3, :3].T @ pose[:3, 3]
     away = away[used] / np.linalg.norm(away[used], axis=1, keepdims=True)
-    degree = int((harmonics.shape[1] + 1) ** 0.5) - 1
-    basis = torch.from_numpy(np.ascontiguousarray(sh_basis(away, degree)[:, 1:]))
+    basis = torch.from_numpy(np.ascontiguousarray(sh_basis(away, degree_of(harmonics))[:, 1:]))
     added = torch.einsum("vk,vkc->vc", basis, harmonics.double()[torch.from_numpy(owner)[used]])
     seen = _AtLeastZero.apply(attributes[used, :3].double() + added)  # type: ignore[no-untyped-call]
     return torch.cat([attributes[:, :3].double().index_put((used,), seen), attributes[:, 3:].double()], dim=1)

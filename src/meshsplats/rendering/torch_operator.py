@@ -16,6 +16,7 @@ from meshsplats.mesh import Triangles
 from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.engine import Engine, Taped
+from meshsplats.spherical_harmonics import TERMS
 
 try:
     import torch
@@ -257,9 +258,7 @@ def _check_harmonics(harmonics: torch.Tensor, splats: FaceSplats) -> None:
         "harmonics",
         harmonics,
         f"({len(splats)}, 3, 8 or 15, 3)",
-        lambda shape: (
-            len(shape) == 3 and shape[0] == len(splats) and shape[1] in (3, 8, 15) and shape[2] == 3
-        ),
+        lambda shape: len(shape) == 3 and shape[0] == len(splats) and shape[1] in TERMS and shape[2] == 3,
     )
     if splats.share_vertices:
         raise ValueError("harmonics are of splats, but two splats share a vertex: give each its own")

@@ -23,6 +23,7 @@ from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_st
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
+from meshsplats.spherical_harmonics import TERMS
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.growing import REDUCED_PART, Growing
 from meshsplats.training.growth import SHELL
@@ -123,7 +124,7 @@ def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes:
     vertices = fans * (1 + config.sides)
     needed = estimate_bytes(vertices, fans * config.sides, dataset, cache_bytes)
     if config.sh_degree:
-        coefficients = 3 * ((config.sh_degree + 1) ** 2 - 1)
+        coefficients = 3 * TERMS[config.sh_degree - 1]
         needed += vertices * SHADED_BYTES + fans * coefficients * HARMONIC_BYTES
     views, store = dataset.train, ImageCache(0)
     reduced = [*reduced_views(views, 0.25, store), *reduced_views(views, 0.5, store)]
@@ -151,7 +152,7 @@ def starting_fans(
     up = guess_up(cameras=[view.camera for view in views])
     harmonics = None
     if config.sh_degree:
-        harmonics = np.zeros((len(chosen), (config.sh_degree + 1) ** 2 - 1, 3), np.float32)
+        harmonics = np.zeros((len(chosen), TERMS[config.sh_degree - 1], 3), np.float32)
     mesh = replace(mesh, up=up, origin=dataset.origin, harmonics=harmonics)
     if shell is None:
         return colored(mesh, views, threads)

@@ -9,6 +9,7 @@ import numpy as np
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.cameras.framing import SAMPLE
+from meshsplats.spherical_harmonics import TERMS, in_fours
 
 COLOR = "Color"
 """Attribute with RGBA: display values where the image is unlit, linear light where it is lit."""
@@ -72,11 +73,7 @@ def make_mesh(
 
 def store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
     """Gives the bpy ``mesh`` the harmonics (v, k, 3) of its vertices' splats."""
-    count, terms, _ = harmonics.shape
-    packed = np.zeros((3, -(-terms // 4), count, 4), np.float32)
-    for k in range(terms):
-        packed[:, k // 4, :, k % 4] = harmonics[:, k].T
-    for name, fours in zip(HARMONICS, packed, strict=True):
+    for name, fours in zip(HARMONICS, in_fours(harmonics), strict=True):
         for i, four in enumerate(fours):
             attribute = mesh.attributes.new(f"{name}_{i}", "FLOAT_COLOR", "POINT")
             attribute.data.foreach_set("color", four.ravel())
@@ -97,7 +94,7 @@ def read_harmonics(mesh: Any) -> np.ndarray | None:
     found = [
         np.concatenate([read_colors(mesh, f"{name}_{i}") for i in range(fours)], axis=1) for name in HARMONICS
     ]
-    return np.stack(found, axis=2)[:, : {1: 3, 2: 8}.get(fours, 15)]
+    return np.stack(found, axis=2)[:, : max(terms for terms in TERMS if terms <= 4 * fours)]
 
 
 def make_plain(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:

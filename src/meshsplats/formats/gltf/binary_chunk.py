@@ -1,11 +1,15 @@
-"""The binary chunk of a `.glb` file, as it is written."""
+"""Writing `.glb` files: the binary chunk, and the file around it."""
 
 from __future__ import annotations
 
+import json
+import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+_MAX_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
@@ -41,3 +45,20 @@ class BinaryChunk:
         }
         self.accessors.append(accessor)
         return len(self.accessors) - 1
+
+
+def write_binary(path: Path, document: dict[str, Any], chunk: BinaryChunk, *, what: str, advice: str) -> None:
+    """Writes ``document`` and its ``chunk`` to ``path``. ValueError for more than the 4 GiB that a file can
+    hold: ``what`` takes them, and ``advice`` ends the sentence."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + chunk.length
+    if total > _MAX_BYTES:
+        raise ValueError(f"{what} would take {total:,} bytes, a .glb file can hold {_MAX_BYTES:,}{advice}")
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A))
+        file.write(text)
+        file.write(struct.pack("<II", chunk.length, 0x004E4942))
+        for part in chunk.parts:
+            file.write(part.data)
+            file.write(b"\0" * (-part.nbytes % 4))

@@ -8,8 +8,6 @@ viewers that know points only. What compresses splats in glTF (SPZ) is a draft, 
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ import numpy as np
 from meshsplats._geometry import rotation_rows
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._orientation import HALF_TURN_Z
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
 from meshsplats.formats.gltf.splats import EXTENSION, turn_of
 from meshsplats.formats.splats._quantising import as_bytes
 from meshsplats.formats.writing import FormatWriter, Writing
@@ -25,8 +24,6 @@ from meshsplats.gaussians import GaussianCloud
 
 _FLOAT, _UINT8 = 5126, 5121
 _ARRAY_BUFFER = 34962
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_MAX_BYTES = (1 << 32) - 1
 
 
 def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
@@ -34,23 +31,13 @@ def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     from meshsplats import __version__
 
     turned = cloud.transformed(HALF_TURN_Z)
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    attributes, parts, length = {}, [], 0
+    chunk, attributes = BinaryChunk(), {}
     for name, array in _attributes(turned).items():
         component = _UINT8 if array.dtype == np.uint8 else _FLOAT
-        accessor: dict[str, Any] = {"bufferView": len(views), "componentType": component, "count": len(cloud)}
-        accessor["type"] = _TYPES[1 if array.ndim == 1 else array.shape[1]]
-        if component == _UINT8:
-            accessor["normalized"] = True
+        more: dict[str, Any] = {"normalized": True} if component == _UINT8 else {}
         if name == "POSITION":
-            accessor["min"], accessor["max"] = array.min(axis=0).tolist(), array.max(axis=0).tolist()
-        attributes[name] = len(accessors)
-        accessors.append(accessor)
-        size = {"buffer": 0, "byteOffset": length, "byteLength": array.nbytes}
-        views.append(size | {"target": _ARRAY_BUFFER})
-        parts.append(array)
-        length += array.nbytes  # all are multiples of 4 bytes
+            more = {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        attributes[name] = chunk.accessor(array, component, _ARRAY_BUFFER, **more)
     kind = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     kind |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
@@ -61,23 +48,12 @@ def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "splats", "mesh": 0, **_place(cloud)}],
         "meshes": [{"name": "splats", "primitives": [primitive], **_note(cloud)}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": length}],
+        "accessors": chunk.accessors,
+        "bufferViews": chunk.views,
+        "buffers": [{"byteLength": chunk.length}],
     }
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + length
-    if total > _MAX_BYTES:
-        raise ValueError(
-            f"{writing.where}: the splats would take {total:,} bytes, a .glb file can hold {_MAX_BYTES:,}:"
-            " write .ply, or .sog, which is a twentieth of it"
-        )
-    with open(path, "wb") as file:
-        file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A) + text)
-        file.write(struct.pack("<II", length, 0x004E4942))
-        for part in parts:
-            file.write(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).data)
+    advice = ": write .ply, or .sog, which is a twentieth of it"
+    write_binary(path, document, chunk, what=f"{writing.where}: the splats", advice=advice)
 
 
 def _attributes(cloud: GaussianCloud) -> dict[str, np.ndarray]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import MAX_COLOR, SplatMesh
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.spherical_harmonics import TERMS, in_fours
 
 Harmonics = Literal["attributes", "texcoords"]
 
@@ -95,16 +95,12 @@ def vertex_tables(
         tables = {"_BASE": (base * np.float32(65535) + np.float32(0.5)).astype(np.uint16)}
     if harmonics is None:
         return tables
-    count, terms, _ = harmonics.shape
-    width = -(-terms // _FOUR) * _FOUR
-    rows = np.zeros((count + 1, 3, width), np.float32)  # the last one is of vertices that no splat uses
-    rows[:-1, :, :terms] = harmonics.transpose(0, 2, 1)
+    none = np.zeros((1, *harmonics.shape[1:]), np.float32)  # of vertices that no splat uses
+    rows = in_fours(np.concatenate([harmonics, none]))
     if not exact:
         rows = np.rint(rows * np.float32(127 / scales.harmonics)).astype(np.int8)
-    for c, channel in enumerate(_CHANNELS):
-        for i in range(width // _FOUR):
-            four = np.ascontiguousarray(rows[:, c, _FOUR * i : _FOUR * (i + 1)])
-            tables[f"_SH_{channel}_{i}"] = four[splats.of_vertex]
+    for channel, fours in zip(_CHANNELS, rows, strict=True):
+        tables |= {f"_SH_{channel}_{i}": four[splats.of_vertex] for i, four in enumerate(fours)}
     return tables
 
 

@@ -26,7 +26,7 @@ from meshsplats.draw_order import DrawOrder
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf import copies
-from meshsplats.formats.gltf.binary_chunk import BinaryChunk
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
 from meshsplats.formats.gltf.view_colors import (
     IN_VIEW_COLORS,
     Harmonics,
@@ -42,7 +42,6 @@ Alpha = Literal["blend", "mask", "opaque", "hybrid"]
 _FLOAT, _INT8, _UINT16, _UINT32 = 5126, 5120, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _ROWS = 1 << 15
-_MAX_BYTES = (1 << 32) - 1
 
 
 def write_glb(
@@ -95,27 +94,13 @@ def write_glb(
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
     check_attribute_names(mesh)
     if order is None:
-        document, parts = _document(mesh, lit, _Colors(mesh, color_type, harmonics), alpha, cutoff, extras)
+        document, chunk = _document(mesh, lit, _Colors(mesh, color_type, harmonics), alpha, cutoff, extras)
     elif lit or alpha != "blend":
         raise ValueError("an order of triangles is for alpha='blend' and an unlit material")
     else:
-        document, parts = _ordered_document(mesh, order, _Colors(mesh, color_type, harmonics))
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    binary = document["buffers"][0]["byteLength"]
-    total = 12 + 8 + len(text) + 8 + binary
-    if total > _MAX_BYTES:
-        raise ValueError(
-            f"the mesh would take {total:,} bytes, a .glb file can hold {_MAX_BYTES:,};"
-            " save it as .npz or .ply, or split it"
-        )
-    with open(path, "wb") as file:
-        file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A))
-        file.write(text)
-        file.write(struct.pack("<II", binary, 0x004E4942))
-        for part in parts:
-            file.write(part.data)
-            file.write(b"\0" * (-part.nbytes % 4))
+        document, chunk = _ordered_document(mesh, order, _Colors(mesh, color_type, harmonics))
+    advice = "; save it as .npz or .ply, or split it"
+    write_binary(path, document, chunk, what="the mesh", advice=advice)
 
 
 class _Colors:
@@ -133,8 +118,8 @@ class _Colors:
 
 def _document(
     mesh: SplatMesh, lit: bool, colors: _Colors, alpha: Alpha, cutoff: float, with_extras: bool
-) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """The JSON part, and the arrays of the binary part."""
+) -> tuple[dict[str, Any], BinaryChunk]:
+    """The JSON part, and the binary one."""
     buffer, extras = BinaryChunk(), _note(mesh) | colors.note
     if alpha == "hybrid":
         with_extras = False
@@ -163,12 +148,12 @@ def _document(
         _add_own_arrays(buffer, mesh, primitives[0]["attributes"], extras)
     meshes = [{"name": "splats", "primitives": primitives, "extras": {"meshsplats": extras}}]
     materials = [_material(mode, lit, cutoff) for _, mode in parts]
-    return _scene(buffer, mesh, meshes, materials), buffer.parts
+    return _scene(buffer, mesh, meshes, materials), buffer
 
 
 def _ordered_document(
     mesh: SplatMesh, order: DrawOrder, colors: _Colors
-) -> tuple[dict[str, Any], list[np.ndarray]]:
+) -> tuple[dict[str, Any], BinaryChunk]:
     """As ``_document``, with both windings of all triangles in ``order``."""
     buffer, extras = BinaryChunk(), _note(mesh) | colors.note
     shown, tables = mesh.plain, colors.tables(mesh)
@@ -199,7 +184,7 @@ def _ordered_document(
     _add_own_arrays(buffer, mesh, attributes, extras)
     meshes[0]["extras"] = {"meshsplats": extras}
     material = _material("blend", False, CUTOFF) | {"doubleSided": False}
-    return _scene(buffer, mesh, meshes, [material]), buffer.parts
+    return _scene(buffer, mesh, meshes, [material]), buffer
 
 
 def _note(mesh: SplatMesh) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._display import linear_cloud
 from meshsplats.formats._orientation import HALF_TURN_X
 from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats.usd.stage import new_stage
 from meshsplats.formats.writing import FormatWriter, Writing
 from meshsplats.gaussians import GaussianCloud
 
@@ -59,14 +60,9 @@ def _export(stage: Any, path: Path) -> None:
 
 
 def _stage(cloud: GaussianCloud, *, linear: bool) -> Any:
-    from pxr import Gf, Kind, Sdf, Usd, UsdGeom, Vt
+    from pxr import Gf, Sdf, UsdGeom, Vt
 
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    root = UsdGeom.Xform.Define(stage, "/Splats")
-    stage.SetDefaultPrim(root.GetPrim())
-    Usd.ModelAPI(root.GetPrim()).SetKind(Kind.Tokens.component)
+    stage, root = new_stage()
     x, y, z, w = turn_of(cloud.up)
     if cloud.origin.any():
         place = np.array(list(rotation_rows(w, x, y, z))) @ HALF_TURN_X @ cloud.origin + 0.0

@@ -18,6 +18,7 @@ import numpy as np
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.gltf.writer import computed_normals, linear_colors, turned_origin, up_quaternion
+from meshsplats.formats.usd.stage import new_stage
 from meshsplats.mesh import SplatMesh
 
 
@@ -31,16 +32,11 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     MissingDependencyError without usd-core.
     """
     try:
-        from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
+        from pxr import Gf, Sdf, Tf, UsdGeom, Vt
     except ImportError as error:
         raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
     check_attribute_names(mesh)
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    root = UsdGeom.Xform.Define(stage, "/Splats")
-    stage.SetDefaultPrim(root.GetPrim())
-    Usd.ModelAPI(root.GetPrim()).SetKind(Kind.Tokens.component)
+    stage, root = new_stage()
     x, y, z, w = up_quaternion(mesh.up)
     if mesh.origin.any():
         root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*turned_origin(mesh).tolist()))
