@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.library import pointer, processors, run, thread_count
 from meshsplats._core.structures import (
     AdamStruct,
     CameraStruct,
@@ -230,7 +230,7 @@ def viewer_images(
         image_count=len(cutoffs),
         multisample=multisample,
         culled=culled,
-        threads=min(threads or processors(), 256),
+        threads=thread_count(threads),
     )
     run("ms_viewer_images", struct)
     return result
@@ -298,7 +298,7 @@ def order_triangles(
         cameras=ctypes.addressof(views),
         camera_count=len(cameras),
         sweeps=sweeps,
-        threads=min(threads or processors(), 256),
+        threads=thread_count(threads),
         max_pairs=max_pairs,
         rank=pointer(result),
     )
@@ -335,7 +335,7 @@ def listed_triangles(
         listed=pointer(listed),
         listed_splat=pointer(listed_splats),
         node_count=len(starts) - 1,
-        threads=min(threads or processors(), 256),
+        threads=thread_count(threads),
     )
     run("ms_list_triangles", struct)
     return listed, listed_splats

@@ -156,6 +156,11 @@ def run(name: str, argument: ctypes.Structure) -> None:
         raise ValueError(text)
 
 
+def thread_count(threads: int | None) -> int:
+    """``threads``, by default all processors; at most 256."""
+    return min(int(threads) if threads else processors(), 256)
+
+
 def processors() -> int:
     """Processors this process may use."""
     try:

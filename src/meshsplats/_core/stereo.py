@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.library import pointer, run, thread_count
 from meshsplats._core.structures import (
     CameraStruct,
     CarvingStruct,
@@ -50,7 +50,7 @@ class Layout:
             cameras=ctypes.addressof(self.cameras),
             start=pointer(self.start),
             count=len(self.cameras),
-            threads=min(threads or processors(), 256),
+            threads=thread_count(threads),
         )
 
 
@@ -251,7 +251,7 @@ def fuse_points(surface: SurfaceArrays, wanted: int, largest: float, threads: in
         patches=pointer(table),
         count=len(surface.points),
         wanted=wanted,
-        threads=min(threads or processors(), 256),
+        threads=thread_count(threads),
         largest=largest,
     )
     run("ms_fuse_points", struct)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import time
-
-import numpy as np
 
 from meshsplats.finetuning.config import FinetuneConfig
 
@@ -61,7 +60,7 @@ class Clock:
 
     def plan_plain_images(self, most: int) -> None:
         """Sets ``plain_images``, at most ``most``, by the cost of the last step."""
-        share = np.inf if self._minutes is None else PLAIN_SHARE * 60 * self._minutes
+        share = math.inf if self._minutes is None else PLAIN_SHARE * 60 * self._minutes
         self.plain_images = int(min(max(share / max(self.step_cost, 1e-9), 1), most))
 
     @property

@@ -83,7 +83,7 @@ def checked_options(
     return structures.OptionsStruct(
         samples=int(samples),
         max_layers=0,
-        threads=min(int(threads) if threads else library.processors(), 256),
+        threads=library.thread_count(threads),
         min_transmittance=0,
         background=keep(backdrop),
         background_per_pixel=backdrop.ndim == 3,

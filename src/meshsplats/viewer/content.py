@@ -70,7 +70,7 @@ def content_of_splats(
     _check_size(each * min(count, len(cloud)))
     kept = simplify_in_blocks(cloud, count)
     mesh = convert(kept)
-    content = Content(mesh, _degree_0(kept) if shown else None, _coarse(mesh, kept), len(kept))
+    content = Content(mesh, kept.of_degree(0) if shown else None, _coarse(mesh, kept), len(kept))
     if kept is cloud:
         return content
     images = (render_splats(each, _camera(cloud, cameras)).color for each in (kept, cloud))
@@ -83,7 +83,7 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     _check_size(len(mesh.faces))
     if splats is None:
         return Content(mesh, None)
-    return Content(mesh, _degree_0(splats), _coarse(mesh, splats))
+    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats))
 
 
 def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[str, Any]:
@@ -109,11 +109,6 @@ def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[st
         "alpha_error_levels": packed.alpha_error,
         "image_error_levels": 255 * float(np.abs(images[0] - images[1]).max()),
     }
-
-
-def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
-    """``cloud`` without what a page does not show of splats: up to three quarters of its memory."""
-    return cloud.of_degree(0)
 
 
 def _coarse(mesh: SplatMesh, splats: GaussianCloud) -> SplatMesh | None:

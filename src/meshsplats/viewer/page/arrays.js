@@ -2,7 +2,7 @@
 // uniform of a frame.
 
 import { sortFarToNear } from "./order.js";
-import { counting, ownersOf } from "./scene.js";
+import { counting, ownersOf, startsOf } from "./scene.js";
 
 export const TILE = 8;
 const RUN = 8;
@@ -122,15 +122,10 @@ export function findRuns(faces, splat) {
 }
 
 // The first triangle of each splat, and the count of triangles; then the first run of each splat.
-export function findFans(splat, F) {
-  const starts = [], runs = [];
-  for (let f = 0, run = 0; f < F; f++) {
-    if (f > 0 && splat[f] === splat[f - 1]) continue;
-    if (f > 0) run += Math.ceil((f - starts.at(-1)) / RUN);
-    starts.push(f);
-    runs.push(run);
-  }
-  return Uint32Array.from([...starts, F, ...runs]);
+export function findFans(splat) {
+  const starts = startsOf(splat), runs = new Uint32Array(starts.length - 1);
+  for (let i = 1; i < runs.length; i++) runs[i] = runs[i - 1] + Math.ceil((starts[i] - starts[i - 1]) / RUN);
+  return Uint32Array.from([...starts, ...runs]);
 }
 
 // ofFace: the depth group of each face, without gaps, NONE for none; largest: the face of each with the

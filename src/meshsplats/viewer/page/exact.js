@@ -167,7 +167,7 @@ export class ExactRenderer {
       counts.groups = largest.length;
     }
     if (mesh.filter > 0 || this.kernels.order === "splat") {
-      const fans = findFans(splat, F);
+      const fans = findFans(splat);
       counts.splats = (fans.length - 1) / 2;
       if (mesh.filter > 0) counts.fans = counts.splats;
       this.#upload(`${level}/fans`, fans);

@@ -84,7 +84,7 @@ function decodeHarmonics({ terms, step, row: first }, row) {
 }
 
 // First triangle of each splat, and their count at the end.
-function startsOf(splat) {
+export function startsOf(splat) {
   const starts = [];
   splat.forEach((name, f) => { if (f === 0 || name !== splat[f - 1]) starts.push(f); });
   return Uint32Array.from([...starts, splat.length]);
