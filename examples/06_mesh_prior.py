@@ -12,7 +12,8 @@ import numpy as np
 import meshsplats as ms
 from meshsplats.demo_scene import make_scene
 from meshsplats.images.writing import save_image, strip
-from meshsplats.prior import base_surface, bind, prior_config, train_prior
+from meshsplats.prior import bind, prior_config, train_prior
+from meshsplats.surfaces import make_surface
 
 out = Path("example-output")
 out.mkdir(exist_ok=True)
@@ -20,7 +21,7 @@ steps = int(sys.argv[1]) if len(sys.argv) > 1 else 20
 
 # Train: a base of the surface, splats on it and on shells inside, and images of the splats as targets.
 cloud = make_scene()
-base = base_surface(cloud, resolution=64, faces=10_000, cameras=32)
+base = make_surface(cloud, faces=10_000, texture=0, resolution=64, views=32, size=192)
 data = ms.splat_dataset(cloud, train=30, test=4, width=160, sh_degree=0)
 start = bind(base, views=data.train)
 prior = train_prior(start, data, prior_config(steps=steps))

@@ -83,3 +83,18 @@ def assert_same(got, mesh, color_error=0.0, harmonic_error=0.0):
     for name, values in mesh.attributes.items():
         assert got.attributes[name].shape == values.shape
         np.testing.assert_array_equal(got.attributes[name], values)
+
+
+def unit_ball(times: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """A ball: an octahedron whose triangles are cut in four ``times`` times, closed, facing out."""
+    points = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    for _ in range(times):
+        ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        edges, index = np.unique(ends, axis=0, return_inverse=True)
+        a, b, c = len(points) + index.reshape(3, -1)
+        points = np.concatenate([points, points[edges].mean(axis=1)])
+        x, y, z = faces.T
+        faces = np.concatenate([np.stack(t, 1) for t in ((x, a, c), (a, y, b), (c, b, z), (a, b, c))])
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return points, faces.astype(np.int32)

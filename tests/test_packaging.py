@@ -198,8 +198,8 @@ def test_commands_of_the_documents_work(page, scene_file, tmp_path, monkeypatch,
             command[at : at + 2] = ["--steps", "2"]
         if command[1] == "levels":
             small = ["--no-tune", "--width", "48", "--levels", "2"]
-        if command[1] == "base":
-            small = ["--resolution", "16", "--views", "6"]
+        if command[1] == "surface":
+            small = ["--resolution", "16", "--views", "6", "--size", "96", "--rounds", "1"]
         if command[1] == "deform":
             (tmp_path / "edited.obj").write_bytes((tmp_path / "base.obj").read_bytes())
         if command[1] == "prior":

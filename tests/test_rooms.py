@@ -22,7 +22,7 @@ FLOORS = (
     ("rendering",),
     ("viewpoints",),
     ("conversion", "datasets"),
-    ("evaluation",),
+    ("evaluation", "surfaces"),
     ("finetuning", "viewer"),
     ("levels", "prior", "tiles", "training"),
     ("blender", "chains", "frames", "inspection", "installation", "jobs"),

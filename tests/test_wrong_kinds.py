@@ -55,6 +55,7 @@ FITS = {
     "cameras": {"cameras"},
     "optional cameras": {"cameras", "nothing"},
     "dataset": {"a data set"},
+    "optional dataset": {"a data set", "nothing"},
     "base": {"a base mesh"},
     "prior": {"a prior"},
     "path": PATHS,
@@ -141,6 +142,9 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
         ("save_gaussians", {"cloud": CLOUD, "path": "x"}, {"cloud": "cloud", "path": "path"}),
         ("save_image", {"path": "x", "image": IMAGE}, {"path": "path", "image": "array"}),
         ("save_mesh", {"mesh": MESH, "path": "x"}, {"mesh": "mesh", "path": "path"}),
+        ("draw_surface", {"base": BASE, "camera": CAMERAS[0]}, {"base": "base", "camera": "camera"}),
+        ("make_surface", {"scene": CLOUD}, {"data": "optional dataset", "cameras": "optional cameras"}),
+        ("save_base", {"base": BASE, "path": "x.glb"}, {"base": "base", "path": "path"}),
         ("simplify", {"cloud": CLOUD, "count": 9}, {"cloud": "cloud", "cameras": "optional cameras"}),
         (
             "drawing_order",
@@ -166,7 +170,14 @@ ELSEWHERE = {
     *("GaussianCloud", "SplatMesh", "Camera", "BaseMesh", "Dataset", "SplatStream", "View"),  # tested below
     *("convert_blocks", "save_gaussian_blocks", "save_mesh_blocks", "rasterize", "open_workers"),
     "gaussians_from_tensors",  # tests/formats/test_tensors.py
-    *("ConversionOptions", "FinetuneConfig", "TrainConfig", "TileOptions", "PageOptions"),  # plain values
+    *(
+        "ConversionOptions",
+        "FinetuneConfig",
+        "TrainConfig",
+        "TileOptions",
+        "PageOptions",
+        "SurfaceOptions",
+    ),  # plain values
     *("make_config", "train_config"),
     *("Comparison", "FoundCameras", "Interrupted", "Progress", "Rendering", "Report", "Workers"),  # results
     *("DataWarning", "DivergenceError", "FileFormatError", "MissingDependencyError", "__version__"),

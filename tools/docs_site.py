@@ -31,7 +31,14 @@ NAVIGATION = {
     "Using it": [
         *("docs/install", "docs/commands", "docs/python", "docs/files", "docs/quality", "docs/options"),
         "docs/view-dependent-colour",
-        *("docs/large-captures", "docs/pipelines", "docs/finetuning", "docs/levels", "docs/mesh-prior"),
+        *(
+            "docs/large-captures",
+            "docs/pipelines",
+            "docs/finetuning",
+            "docs/levels",
+            "docs/surfaces",
+            "docs/mesh-prior",
+        ),
         "docs/datasets",
         *("docs/blender", "docs/viewers", "docs/cluster", "examples"),
     ],
@@ -60,6 +67,7 @@ REFERENCE = {
         *("finetune", "FinetuneConfig", "make_config", "starting_mesh", "RunOptions", "Progress"),
         "Interrupted",
     ],
+    "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "save_base"],
     "Mesh priors": ["BaseMesh", "load_base", "bind", "MeshPrior", "load_prior", "train_prior"],
     "Errors": ["FileFormatError", "MissingDependencyError", "DivergenceError", "DataWarning"],
 }

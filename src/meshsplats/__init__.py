@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         make_config,
         starting_mesh,
     )
-    from meshsplats.formats.base_meshes import load_base
+    from meshsplats.formats.base_meshes import load_base, save_base
     from meshsplats.formats.cutting import cut_mesh
     from meshsplats.formats.gaussians import load_gaussians, save_gaussian_blocks, save_gaussians
     from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
@@ -56,6 +56,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.ordering import drawing_order
     from meshsplats.rendering.plain_colors import plain_colors_of
     from meshsplats.rendering.samples import needed_samples
+    from meshsplats.surfaces import SurfaceOptions, draw_surface, make_surface
     from meshsplats.tiles.building import build_tiles
     from meshsplats.tiles.drawing import render_tiles, tiles_mesh
     from meshsplats.tiles.options import TileOptions
@@ -90,7 +91,7 @@ _HOME = {
         *("FinetuneConfig", "Interrupted", "Progress", "RunOptions"),
         *("finetune", "finetune_ordered", "make_config", "starting_mesh"),
     ),
-    "meshsplats.formats.base_meshes": ("load_base",),
+    "meshsplats.formats.base_meshes": ("load_base", "save_base"),
     "meshsplats.formats.cutting": ("cut_mesh",),
     "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussian_blocks", "save_gaussians"),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
@@ -107,6 +108,7 @@ _HOME = {
     "meshsplats.rendering.plain_colors": ("plain_colors_of",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
+    "meshsplats.surfaces": ("SurfaceOptions", "draw_surface", "make_surface"),
     "meshsplats.tiles.building": ("build_tiles",),
     "meshsplats.tiles.drawing": ("render_tiles", "tiles_mesh"),
     "meshsplats.tiles.options": ("TileOptions",),
@@ -139,6 +141,7 @@ __all__ = [
     "RunOptions",
     "SplatMesh",
     "SplatStream",
+    "SurfaceOptions",
     "TileOptions",
     "Tileset",
     "TrainConfig",
@@ -155,6 +158,7 @@ __all__ = [
     "cut_mesh",
     "dome",
     "draw_splats",
+    "draw_surface",
     "drawing_order",
     "evaluate",
     "find_background",
@@ -174,6 +178,7 @@ __all__ = [
     "look_at",
     "make_config",
     "make_page",
+    "make_surface",
     "needed_samples",
     "open_workers",
     "orbit",
@@ -183,6 +188,7 @@ __all__ = [
     "render",
     "render_splats",
     "render_tiles",
+    "save_base",
     "save_cameras",
     "save_gaussian_blocks",
     "save_gaussians",

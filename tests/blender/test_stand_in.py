@@ -9,6 +9,7 @@ import pytest
 from _blender_scenes import ball_splats
 
 from meshsplats import GaussianCloud, convert, orbit, render
+from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
@@ -16,7 +17,6 @@ from meshsplats.blender.subject import ground_height
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import shading_normals
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.prior.surface import Grid
 
 
 def ball_field(count: int = 24, radius: float = 8.0) -> np.ndarray:

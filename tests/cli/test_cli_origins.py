@@ -150,7 +150,7 @@ COMMANDS = {
     "baked.glb": "bake mesh.npz -o baked.glb --cameras cameras.json",
     "levels/level_1.npz": "levels splats.ply -o levels/ --levels 2 --no-tune --format npz --width 64",
     "levels_glb/level_0.glb": "levels splats.ply -o levels_glb/ --levels 1 --steps 2 --width 32",
-    "base.ply": "base splats.ply -o base.ply --resolution 24 --views 12",
+    "base.ply": "surface splats.ply -o base.ply --resolution 24 --views 12 --size 96 --texture 0 --rounds 0",
     "posed.glb": "deform prior.npz --base edited.obj -o posed.glb",
     "tuned.glb": f"finetune splats.ply -o tuned.glb --steps 6 {TARGETS}",
     "tuned_cameras.npz": "finetune splats.ply -o tuned_cameras.npz --steps 4 --views 6 --held-out 2"
@@ -176,8 +176,8 @@ def test_results_stand_where_the_input_does(scenes, output):
     differ in the last bit; where something is chosen or trained by them, few differ by more."""
     if output.endswith("usdc"):
         pytest.importorskip("pxr.Usd")
-    if COMMANDS[output].startswith("base "):
-        pytest.importorskip("skimage", reason="base needs its extra: pip install 'meshsplats[base]'")
+    if COMMANDS[output].startswith("surface "):
+        pytest.importorskip("skimage", reason="surface needs its extra: pip install 'meshsplats[base]'")
     near, far = scenes
     for scene in scenes:
         assert scene.run(COMMANDS[output]) == 0
@@ -351,7 +351,7 @@ def test_origin_options(scenes, capsys, suffix):
         "simplify splats.ply -o o5.ply --share 0.5 --origin local",
         "clean splats.ply -o o6.ply --min-opacity 0.1 --origin x=-1 y=0 z=0",
         "bake mesh.npz -o o7.glb --origin local",
-        "base splats.ply -o o8.ply --resolution 24 --views 8 --origin local",
+        "surface splats.ply -o o8.obj --resolution 24 --views 8 --size 64 --texture 0 --origin local",
         "deform prior.npz --base base.obj -o o9.npz --origin local",
         "finetune splats.ply -o o10.npz --steps 1 --views 4 --held-out 0 --width 24 --origin x=-1 y=0 z=0",
         "train photos/ -o o11.npz --steps 1 --start-splats 100 --max-splats 100 --as-splats o11.ply"
@@ -361,8 +361,8 @@ def test_origin_options(scenes, capsys, suffix):
 )
 def test_every_command_that_writes_can_leave_it_out(scenes, command):
     _, far = scenes
-    if command.startswith("base "):
-        pytest.importorskip("skimage", reason="base needs its extra: pip install 'meshsplats[base]'")
+    if command.startswith("surface "):
+        pytest.importorskip("skimage", reason="surface needs its extra: pip install 'meshsplats[base]'")
     assert far.run(command) == 0
     written = load(far.folder / re.search(r"-o (\S+)", command)[1])
     assert not written.origin.any()

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _meshes import unit_ball
 from _rendering import camera, layers, seen_by, turned
 
-from meshsplats import Camera, SplatMesh
+from meshsplats import Camera, SplatMesh, look_at
 from meshsplats.rendering import render
-from meshsplats.rendering.edges import corners_beyond, edge_gradients, front_faces
+from meshsplats.rendering.edges import edge_gradients, faces_across, front_faces
 
 VIEW = camera(320, 240, fx=180.0, fy=160.0)
 CUTOFF = 0.3
@@ -157,11 +158,28 @@ def test_a_surface_ends_where_it_turns_back():
     assert abs(found[2, 0] - alone[2, 0]) < 1e-3 * abs(alone[2, 0])
 
 
-def test_corners_beyond_edges():
+def test_triangles_across_edges():
     faces = np.array([(0, 1, 2), (2, 1, 3), (4, 5, 6), (0, 2, 7), (7, 2, 8), (2, 7, 9)], np.int32)
-    expected = [(-1, 3, 7), (0, -1, -1), (-1, -1, -1), (1, -1, -1), (-1, -1, -1), (-1, -1, -1)]
-    assert corners_beyond(faces).tolist() == [list(row) for row in expected]
-    assert corners_beyond(faces[:0]).shape == (0, 3)
+    expected = [(-1, 1, 3), (0, -1, -1), (-1, -1, -1), (0, -1, -1), (-1, -1, -1), (-1, -1, -1)]
+    assert faces_across(faces).tolist() == [list(row) for row in expected]
+    assert faces_across(faces[:0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_outlines_of_small_triangles_move_the_image(axis):
+    # At the outline of a finely divided ball, triangles are narrower than a sample.
+    points, faces = unit_ball(4)
+    view = look_at((0, 0.9, -3), (0, 0, 0), up=(0, 1, 0), width=120, height=120, fov=50)
+    weights = np.sin(np.mgrid[:120, :120][axis] / 17)[..., None] * np.ones(3)
+    colors = np.tile(np.array([0.3, 0.5, 0.2, 1]), (len(points), 1))
+
+    def loss(step: float, along: int) -> float:
+        moved = points + step * np.eye(3)[along]
+        return float((render(SplatMesh(moved, faces, colors), view, samples=8).color * weights).sum())
+
+    gradient = edge_gradients(SplatMesh(points, faces, colors), view, CUTOFF, weights.astype(np.float32))
+    slopes = [(loss(0.01, k) - loss(-0.01, k)) / 0.02 for k in range(3)]
+    assert np.abs(gradient.sum(axis=0) - slopes).max() < 0.04 * np.abs(slopes).max()
 
 
 def test_triangles_behind_the_near_plane_get_nothing():

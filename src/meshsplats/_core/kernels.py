@@ -151,8 +151,8 @@ class OpaqueImage(NamedTuple):
     """(f, 3) int32"""
     colors: np.ndarray
     """(v, 4) float32"""
-    beyond: np.ndarray
-    """(f, 3) int32, that of ``corners_beyond`` in rendering/edges.py."""
+    across: np.ndarray
+    """(f, 3) int32, that of ``faces_across`` in rendering/edges.py."""
     front: np.ndarray
     """(h s, w s) int32 triangle in front at each sample, -1 for none."""
     color: np.ndarray
@@ -182,7 +182,7 @@ def edge_gradients(image: OpaqueImage, gradient: np.ndarray, threads: int | None
         screen=pointer(image.screen),
         colors=pointer(image.colors),
         faces=pointer(image.faces),
-        beyond=pointer(image.beyond),
+        across=pointer(image.across),
         front=pointer(image.front),
         color=pointer(image.color),
         gradient=pointer(gradient),

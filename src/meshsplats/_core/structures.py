@@ -159,7 +159,7 @@ class EdgesStruct(CoreStruct):
         ("screen", c_void_p),
         ("colors", c_void_p),
         ("faces", c_void_p),
-        ("beyond", c_void_p),
+        ("across", c_void_p),
         ("front", c_void_p),
         ("color", c_void_p),
         ("gradient", c_void_p),
@@ -204,6 +204,39 @@ class ViewerStruct(CoreStruct):
         ("multisample", c_int32),
         ("culled", c_int32),
         ("threads", c_int32),
+    ]
+
+
+class FusingStruct(CoreStruct):
+    _fields_ = [
+        ("camera", CameraStruct),
+        ("size", c_int64 * 3),
+        ("low", c_double * 3),
+        ("voxel", c_double),
+        ("truncation", c_double),
+        ("behind", c_double),
+        ("depth", c_void_p),
+        ("sum", c_void_p),
+        ("weight", c_void_p),
+        ("threads", c_int32),
+    ]
+
+
+class TextureStruct(CoreStruct):
+    _fields_ = [
+        ("rows", c_int32),
+        ("columns", c_int32),
+        ("samples", c_int32),
+        ("threads", c_int32),
+        ("height", c_int32),
+        ("width", c_int32),
+        ("uv", c_void_p),
+        ("covered", c_void_p),
+        ("texels", c_void_p),
+        ("color", c_void_p),
+        ("gradient", c_void_p),
+        ("texel_sums", c_void_p),
+        ("uv_gradient", c_void_p),
     ]
 
 

@@ -15,12 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshsplats._cells import Cells
+from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.normals import typical_spacing, unit, views_around
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.surface import MIN_PART, Grid, grid_around, signed_distances
+from meshsplats.surfaces.fusion import MIN_PART, grid_around, signed_distances
 
 RESOLUTION = 96
 """Voxels along the longest side of the surface's grid."""

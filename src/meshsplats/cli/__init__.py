@@ -47,7 +47,7 @@ COMMANDS = {
     "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
     "tiles": ("meshsplats.cli.tiles:Tiles", "a 3D Tiles tileset of splats of any number"),
     "bake": ("meshsplats.cli.bake:Bake", "a mesh with its low-pass filter applied, for other programs"),
-    "base": ("meshsplats.cli.base:Base", "a classical mesh of the surface that splats form"),
+    "surface": ("meshsplats.cli.surface:Surface", "a light, textured mesh of the surface that splats form"),
     "prior": ("meshsplats.cli.prior:Prior", "splats bound to a classical mesh, trained and edited with it"),
     "deform": ("meshsplats.cli.deform:Deform", "the splats of a prior moved to an edited base mesh"),
     "evaluate": ("meshsplats.cli.evaluate:Evaluate", "scores on held-out views: PSNR, SSIM, LPIPS"),

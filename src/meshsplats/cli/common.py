@@ -18,6 +18,7 @@ from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats._words import direction_in_words
 from meshsplats._words import parse_color as parse_color
 from meshsplats._words import parse_up as parse_up
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up, warn_of_strays_in
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
+Placed = TypeVar("Placed", GaussianCloud, SplatMesh, BaseMesh, GaussianCloud | SplatMesh)
 # Optional options. Their help describes the default, in place of "(default: None)".
 Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
@@ -372,7 +374,7 @@ class ClusterOptions:
             yield found
 
 
-def placed(scene: Scene, origin: Origin) -> Scene:
+def placed(scene: Placed, origin: Origin) -> Placed:
     """``scene`` as --origin wants it written: with its origin, or without any. UsageError for a point that is
     too far away for float32."""
     if origin == "keep":
@@ -385,7 +387,7 @@ def placed(scene: Scene, origin: Origin) -> Scene:
     return replace(scene, origin=np.zeros(3))
 
 
-def written(scene: Scene, origin: Origin) -> Scene:
+def written(scene: Placed, origin: Origin) -> Placed:
     """``placed``; also says where the file will stand in the world."""
     say_origin(scene.origin, origin, splats=isinstance(scene, GaussianCloud))
     return placed(scene, origin)

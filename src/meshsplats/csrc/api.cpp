@@ -17,6 +17,8 @@
 #include "listing.h"
 #include "merging.h"
 #include "ordering.h"
+#include "texture.h"
+#include "tsdf.h"
 #include "viewer.h"
 #include "witnesses.h"
 #endif
@@ -249,7 +251,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 13; }
+MS_EXPORT int ms_interface_version() { return 14; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -347,6 +349,18 @@ MS_EXPORT int ms_match_photos(const MsMatching *matching, char *message, int mes
 }
 
 #ifndef MS_WIDE_ONLY
+MS_EXPORT int ms_fuse_depth(const MsFusing *fusing, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::fuse_depth(*fusing); });
+}
+
+MS_EXPORT int ms_texture(const MsTexture *texture, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::TexturePass(*texture).forward(); });
+}
+
+MS_EXPORT int ms_texture_backward(const MsTexture *texture, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::TexturePass(*texture).backward(); });
+}
+
 MS_EXPORT int ms_nearest(const MsNearest *points, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::find_nearest(*points); });
 }

@@ -16,8 +16,7 @@ struct MsEdges {
     const double *screen;   // (vertex_count, 3) x and y in samples, depth
     const float *colors;    // (vertex_count, 4) straight RGBA
     const int32_t *faces;   // (face_count, 3) vertex indices
-    const int32_t *beyond;  // (face_count, 3) across the edge from corner i to the next: the corner of the
-                            // adjacent triangle that is not on it, or -1
+    const int32_t *across;  // (face_count, 3) the triangle across the edge from corner i to the next, or -1
     const int32_t *front;   // (rows, columns) the triangle in front at each sample, -1: none
     const float *color;     // (rows, columns, 3)
     const float *gradient;  // (height, width, 3) of a loss with respect to the colour of each pixel
@@ -66,13 +65,17 @@ class EdgePass {
         double value[2];
     };
 
-    // Where a triangle ends on the way from one sample to the other.
+    // Where a surface ends on the way from one sample to the other.
     struct End {
         bool found = false;
         double share = 2;  // of the way
-        int edge = 0;      // from corner `edge` to the next one
+        int32_t face = -1;
+        int edge = 0;      // of the face, from corner `edge` to the next one
         double depth = 0;  // at the first sample
     };
+
+    // Triangles through which a surface is followed. Those at outlines may be narrower than a sample.
+    static constexpr int LONGEST_WAY = 16;
 
     const double *corner(int32_t face, int i) const { return in.screen + 3 * (int64_t)vertex(face, i); }
     int32_t vertex(int32_t face, int i) const { return in.faces[3 * (int64_t)face + i % 3]; }
@@ -81,39 +84,76 @@ class EdgePass {
         return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
     }
 
+    bool drawn(int32_t face) const {
+        for (int i = 0; i < 3; ++i)
+            if (!(corner(face, i)[2] >= in.near)) return false;
+        return true;
+    }
+
+    // Follows the surface from the triangle in front at `inside` towards `outside`, from one triangle to the
+    // next, to an edge behind which it does not go on.
     End end_of(int32_t face, const double *inside, const double *outside) const {
         End end;
         if (face < 0) return end;
         MS_ASSERT(face < in.face_count);
+        if (!drawn(face)) return end;
         double weight[3], total = 0, inverse = 0;
         for (int i = 0; i < 3; ++i) {
-            if (!(corner(face, i)[2] >= in.near)) return end;
             weight[i] = side(corner(face, i + 1), corner(face, i + 2), inside);  // of corner i
             total += weight[i];
             inverse += weight[i] / corner(face, i)[2];
         }
         if (total == 0 || inverse == 0) return end;
         end.depth = total / inverse;
-        const double sign = total > 0 ? 1 : -1;
-        for (int i = 0; i < 3; ++i) {
-            const double *a = corner(face, i), *b = corner(face, i + 1);
-            const double first = sign * weight[(i + 2) % 3], last = sign * side(a, b, outside);
-            if (first < 0 || last >= 0 || first / (first - last) >= end.share) continue;
-            end.found = true;
-            end.share = first / (first - last);
-            end.edge = i;
+        int entry = -1;
+        for (int step = 0; step < LONGEST_WAY; ++step) {
+            double share = 2;
+            int edge = -1;
+            const double sign = area(face) > 0 ? 1 : -1;
+            for (int i = 0; i < 3; ++i) {
+                if (i == entry) continue;
+                const double *a = corner(face, i), *b = corner(face, i + 1);
+                const double first = sign * side(a, b, inside), last = sign * side(a, b, outside);
+                // Behind the first triangle, the way may begin outside; edges that it does not leave by grow.
+                if (last >= 0 || last >= first || (step == 0 && first < 0)) continue;
+                const double at = first / (first - last);
+                if (at < share) share = at, edge = i;
+            }
+            if (edge < 0) return end;  // the other sample lies in this triangle
+            const int32_t next = in.across[3 * (int64_t)face + edge];
+            if (!continues(face, edge, next)) {
+                end.found = share < 1;
+                end.share = share < 0 ? 0 : share;
+                end.face = face;
+                end.edge = edge;
+                return end;
+            }
+            entry = edge_of(next, vertex(face, edge), vertex(face, edge + 1));
+            if (entry < 0) return end;
+            face = next;
         }
         return end;
     }
 
+    double area(int32_t face) const { return side(corner(face, 0), corner(face, 1), corner(face, 2)); }
+
+    // Which edge of a triangle lies between two vertices.
+    int edge_of(int32_t face, int32_t a, int32_t b) const {
+        for (int i = 0; i < 3; ++i)
+            if ((vertex(face, i) == a && vertex(face, i + 1) == b) ||
+                (vertex(face, i) == b && vertex(face, i + 1) == a))
+                return i;
+        return -1;
+    }
+
     // Whether the surface goes on behind an edge: then it is not what ends between the samples.
-    bool continues(int32_t face, int edge) const {
-        const int32_t beyond = in.beyond[3 * (int64_t)face + edge];
-        if (beyond < 0) return false;
-        MS_ASSERT(beyond < in.vertex_count);
-        const double *a = corner(face, edge), *b = corner(face, edge + 1),
-                     *far = in.screen + 3 * (int64_t)beyond;
-        return far[2] >= in.near && side(a, b, corner(face, edge + 2)) * side(a, b, far) < 0;
+    bool continues(int32_t face, int edge, int32_t next) const {
+        if (next < 0) return false;
+        MS_ASSERT(next < in.face_count);
+        if (!drawn(next)) return false;
+        const double *a = corner(face, edge), *b = corner(face, edge + 1);
+        const int entry = edge_of(next, vertex(face, edge), vertex(face, edge + 1));
+        return entry >= 0 && side(a, b, corner(face, edge + 2)) * side(a, b, corner(next, entry + 2)) < 0;
     }
 
     void add_pair(int64_t x, int64_t y, int axis, std::vector<Term> &list) const {
@@ -127,9 +167,8 @@ class EdgePass {
         // Where both end, the nearer one covers the end of the other.
         const bool takes_first = of_first.found && (!of_second.found || of_first.depth <= of_second.depth);
         const End &end = takes_first ? of_first : of_second;
-        const int32_t face = takes_first ? first : second;
+        const int32_t face = end.face;
         const double share = takes_first ? end.share : 1 - end.share;
-        if (continues(face, end.edge)) return;
         const int64_t a = vertex(face, end.edge), b = vertex(face, end.edge + 1);
         const double *from = in.screen + 3 * a, *to = in.screen + 3 * b;
         const double along[2] = {to[0] - from[0], to[1] - from[1]};

@@ -13,6 +13,8 @@
 #include "listing.h"
 #include "merging.h"
 #include "ordering.h"
+#include "texture.h"
+#include "tsdf.h"
 #include "viewer.h"
 #include "witnesses.h"
 #endif
@@ -158,7 +160,7 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsEdges, screen),
     MS_FIELD(MsEdges, colors),
     MS_FIELD(MsEdges, faces),
-    MS_FIELD(MsEdges, beyond),
+    MS_FIELD(MsEdges, across),
     MS_FIELD(MsEdges, front),
     MS_FIELD(MsEdges, color),
     MS_FIELD(MsEdges, gradient),
@@ -201,6 +203,31 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsMatching, planes),
     MS_FIELD(MsMatching, rounds),
 #ifndef MS_WIDE_ONLY
+    MS_WHOLE(MsFusing),
+    MS_FIELD(MsFusing, camera),
+    MS_FIELD(MsFusing, size),
+    MS_FIELD(MsFusing, low),
+    MS_FIELD(MsFusing, voxel),
+    MS_FIELD(MsFusing, truncation),
+    MS_FIELD(MsFusing, behind),
+    MS_FIELD(MsFusing, depth),
+    MS_FIELD(MsFusing, sum),
+    MS_FIELD(MsFusing, weight),
+    MS_FIELD(MsFusing, threads),
+    MS_WHOLE(MsTexture),
+    MS_FIELD(MsTexture, rows),
+    MS_FIELD(MsTexture, columns),
+    MS_FIELD(MsTexture, samples),
+    MS_FIELD(MsTexture, threads),
+    MS_FIELD(MsTexture, height),
+    MS_FIELD(MsTexture, width),
+    MS_FIELD(MsTexture, uv),
+    MS_FIELD(MsTexture, covered),
+    MS_FIELD(MsTexture, texels),
+    MS_FIELD(MsTexture, color),
+    MS_FIELD(MsTexture, gradient),
+    MS_FIELD(MsTexture, texel_sums),
+    MS_FIELD(MsTexture, uv_gradient),
     MS_WHOLE(MsNearest),
     MS_FIELD(MsNearest, count),
     MS_FIELD(MsNearest, neighbours),

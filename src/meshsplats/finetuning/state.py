@@ -23,7 +23,7 @@ from meshsplats.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
 from meshsplats.order import Order, checked_order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
-from meshsplats.rendering.edges import corners_beyond
+from meshsplats.rendering.edges import faces_across
 from meshsplats.rendering.engine import Device, Need, Taped, WholeSteps
 from meshsplats.webgpu.training import Moments, Parameters, Sums
 from meshsplats.webgpu.training import Rates as StepRates
@@ -106,9 +106,9 @@ class State:
         )
 
     @cached_property
-    def beyond(self) -> np.ndarray:
-        """``corners_beyond`` of the triangles."""
-        return corners_beyond(self.mesh.faces)
+    def across(self) -> np.ndarray:
+        """``faces_across`` of the triangles."""
+        return faces_across(self.mesh.faces)
 
     @property
     def colors(self) -> np.ndarray:

@@ -226,7 +226,7 @@ def view_gradients(
             plan.edges,
             grad_image,
             background=target.background,
-            beyond=state.beyond,
+            across=state.across,
             threads=state.threads,
         )
     expected, share = None, plan.expected

@@ -1,23 +1,41 @@
-"""Base meshes for a mesh prior: any mesh file, with the textures that ``load_mesh`` leaves out."""
+"""Base meshes, with their textures: any mesh file is read, and surfaces are written."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
-from meshsplats._kinds import need_path
+from meshsplats._files.atomic import atomic_path, together
+from meshsplats._kinds import need, need_path
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
+from meshsplats.formats.npz import write_npz
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
+from meshsplats.formats.surfaces.glb import write_surface_glb
+from meshsplats.formats.surfaces.solids import write_3mf, write_stl
+from meshsplats.formats.surfaces.text import plain_mesh, write_surface_obj, write_surface_ply
+from meshsplats.formats.surfaces.usd import write_surface_usd
 from meshsplats.mesh import SplatMesh
+
+TextureImage = Literal["png", "jpg", "webp"]
+"""Kinds of image files of textures."""
+_BESIDE = (".obj", ".ply", ".usdc", ".usda", ".usd")
+"""Formats whose texture is a file of its own."""
+_SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
+"""Formats that say whether lights shade a surface."""
+PRINTED = (".stl", ".3mf")
+"""Formats of shapes without colour."""
+BASE_SUFFIXES = (".glb", ".obj", ".ply", ".usdc", ".usda", ".usd", ".usdz", ".npz", *PRINTED)
+"""Suffixes that ``save_base`` knows."""
 
 
 def load_base(
@@ -73,6 +91,74 @@ def load_base(
             f"{source}: {len(uv):,} faces with texture coordinates, {len(base.faces):,} in all"
         )
     return replace(base, uv=uv, face_texture=index, textures=images)
+
+
+def save_base(
+    base: BaseMesh, path: str | os.PathLike[str], *, unlit: bool = False, image: TextureImage | None = None
+) -> None:
+    """Writes a surface, opaque, with its texture or else its vertex colours, whole or not at all.
+
+    - `.glb`: texture and smooth normals inside, a rough material without metal.
+    - `.usdz`: a package with the texture inside. `.usdc`, `.usda`, `.usd`: the texture is a file beside. They
+      need the extra ``usd``.
+    - `.obj`: with a material library and a texture beside, of the same name. `.ply`: with a texture beside,
+      as MeshLab has it.
+    - `.npz`: of this project; without the texture.
+    - `.stl`, `.3mf`: the shape alone, for printing: z up, from 0 on, a scene unit is a millimetre.
+
+    Args:
+        base: the surface; all of its faces have the first of its textures, or none has one.
+        path: the file; its suffix decides the format.
+        unlit: (`.glb`, USD) a material that shows the texture as it is, without lights.
+        image: how the texture is stored; by default as PNG, or where that takes more than a megabyte, not in
+            USD, as JPEG of quality 95. WebP keeps every byte, but not all programs read it in `.glb`.
+
+    Raises:
+        ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, or has
+            several textures.
+        MissingDependencyError: a package is missing.
+        OSError: a file cannot be written.
+    """
+    need(BaseMesh, base=base, instead={"SplatMesh": "save_mesh writes meshes of splats"})
+    need_path(path=path)
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in BASE_SUFFIXES:
+        known = ", ".join(BASE_SUFFIXES)
+        raise ValueError(f"{target.name!r} does not name a format; choose a name that ends in {known}")
+    if unlit and suffix not in _SHADED:
+        raise ValueError(f"unlit applies to {', '.join(_SHADED)} only, not to {suffix}")
+    if image is not None and image not in get_args(TextureImage):
+        raise ValueError(f"image must be one of {', '.join(get_args(TextureImage))}, got {image!r}")
+    if image is not None and (suffix == ".npz" or suffix in PRINTED or not base.textured):
+        raise ValueError(f"image is for surfaces with a texture, and formats that keep it, not for {suffix}")
+    if not len(base.faces):
+        raise ValueError("the surface has no faces")
+    if base.textured and not (len(base.textures) == 1 and base.textured_faces().all()):
+        raise ValueError(f"a surface has one texture on all faces, this mesh has {len(base.textures)}")
+    own = None if image is None else f".{image}"
+    writers: dict[str, Callable[[Path], None]] = {
+        ".glb": lambda to: write_surface_glb(base, to, unlit=unlit, image=own),
+        ".obj": lambda to: write_surface_obj(base, to, target, own),
+        ".ply": lambda to: write_surface_ply(base, to, target, own),
+        ".npz": lambda to: write_npz(plain_mesh(base), to),
+        ".stl": lambda to: write_stl(base, to),
+        ".3mf": lambda to: write_3mf(base, to),
+    }
+
+    def usd(to: Path) -> None:
+        write_surface_usd(base, to, target, unlit=unlit, image=own)
+
+    with together(), atomic_path(target) as temporary:
+        writers.get(suffix, usd)(temporary)
+
+
+def companions(path: Path, image: TextureImage | None = None) -> list[Path]:
+    """The files that ``save_base`` may write beside ``path`` for a surface with a texture."""
+    suffix = path.suffix.lower()
+    kinds = ("png",) if suffix in _SHADED else ("png", "jpg")
+    pictures = [path.with_suffix(f".{kind}") for kind in ((image,) if image else kinds)]
+    return ([path.with_suffix(".mtl")] if suffix == ".obj" else []) + (pictures if suffix in _BESIDE else [])
 
 
 def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Mesh priors: splats bound to the faces of a classical mesh, trained on it and edited with it.
 
-Needs NumPy alone; ``base_surface`` needs the extra ``base``.
+Needs NumPy alone.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.prior.bind import bind
 from meshsplats.prior.model import LIFT, MeshPrior, load_prior
-from meshsplats.prior.surface import base_surface
 from meshsplats.prior.training import prior_config, train_prior
 
 __all__ = [
@@ -16,7 +15,6 @@ __all__ = [
     "BaseMesh",
     "MeshPrior",
     "Texture",
-    "base_surface",
     "bind",
     "load_prior",
     "prior_config",

@@ -14,10 +14,10 @@ from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
 from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.color_projection import colors_from_views
 from meshsplats.prior.model import MeshPrior
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 from meshsplats.prior.shells import DepthViews, render_depth_views
+from meshsplats.surfaces.color_projection import colors_from_views
 
 Source = Literal["auto", "texture", "vertices", "views", "grey"]
 MAX_LAYERS = 16

@@ -60,15 +60,14 @@ def front_faces(
     return FrontFaces(found, image.color)
 
 
-def corners_beyond(faces: np.ndarray) -> np.ndarray:
-    """(f, 3) int32: across the edge from corner i of a triangle to its next corner, the corner of the
-    adjacent triangle that is not on that edge. -1 where no triangle is adjacent, or several are.
+def faces_across(faces: np.ndarray) -> np.ndarray:
+    """(f, 3) int32: the triangle across the edge from corner i of a triangle to its next corner. -1 where no
+    triangle is adjacent, or several are.
 
     Args:
         faces: (f, 3) int32 vertex indices.
     """
     tails, heads = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
-    others = np.roll(faces, -2, axis=1).ravel()
     keys = np.minimum(tails, heads) * (int(faces.max(initial=0)) + 1) + np.maximum(tails, heads)
     order = np.argsort(keys, kind="stable")
     ends = np.append(np.flatnonzero(np.diff(keys[order])) + 1, len(keys))
@@ -76,7 +75,7 @@ def corners_beyond(faces: np.ndarray) -> np.ndarray:
     first = starts[ends - starts == 2]
     result = np.full(len(keys), -1, np.int32)
     one, other = order[first], order[first + 1]
-    result[one], result[other] = others[other], others[one]
+    result[one], result[other] = other // 3, one // 3
     return result.reshape(-1, 3)
 
 
@@ -87,7 +86,7 @@ def edge_gradients(
     gradient: np.ndarray,
     *,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    beyond: np.ndarray | None = None,
+    across: np.ndarray | None = None,
     threads: int | None = None,
 ) -> np.ndarray:
     """(v, 3) float32 gradient of a loss with respect to the vertices of ``mesh``, by the motion of visible
@@ -102,7 +101,7 @@ def edge_gradients(
         mesh, camera, cutoff, background: as in ``render(..., cutoff=cutoff)``; the mesh has no filter.
         gradient: (h, w, 3) float32 gradient of the loss with respect to the image, whose pixels are means
             over their area.
-        beyond: ``corners_beyond(mesh.faces)``, precomputed, if you have it.
+        across: ``faces_across(mesh.faces)``, precomputed, if you have it.
     """
     mesh = seen_from(mesh, camera, threads=threads)
     camera = camera.with_near_plane(mesh.vertices)  # not measured again on the triangles of front_faces
@@ -114,9 +113,9 @@ def edge_gradients(
     drawn = depth >= near
     scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [fine.fx, fine.fy]
     screen = np.column_stack([points[:, :2] * scale + [fine.cx, fine.cy], depth])
-    beyond = corners_beyond(mesh.faces) if beyond is None else beyond
+    across = faces_across(mesh.faces) if across is None else across
     image = kernels.OpaqueImage(
-        screen, mesh.faces, mesh.colors, beyond, front.faces, front.color, near, cutoff
+        screen, mesh.faces, mesh.colors, across, front.faces, front.color, near, cutoff
     )
     moved = scale * kernels.edge_gradients(image, gradient, threads)
     along = -(moved * points[:, :2]).sum(axis=1) / np.where(drawn, depth, 1)

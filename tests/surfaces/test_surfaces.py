@@ -1,4 +1,4 @@
-"""Base meshes from splats: closed, where the surface is, in its colours."""
+"""Surfaces of splats: where they are, in their colours, closed or open."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, psnr
 from meshsplats.cli import main
 from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
-from meshsplats.prior.surface import base_surface, isosurface
+from meshsplats.surfaces import make_surface
+from meshsplats.surfaces.fusion import isosurface
 
+QUICK = {"texture": 0, "rounds": 0, "views": 24, "size": 96, "resolution": 32, "threads": 1}
 needs_extra = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("skimage", "fast_simplification")),
     reason="install meshsplats[base]",
@@ -82,15 +84,15 @@ def test_as_many_faces_as_asked_for():
 
 def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    monkeypatch.setattr("meshsplats.prior.surface.render", None)  # refused up front
+    monkeypatch.setattr("meshsplats.surfaces.fusion.render", None)  # refused up front
     with pytest.raises(MissingDependencyError, match=r"extra 'base': pip install scikit-image"):
-        base_surface(ball(), resolution=8, cameras=4)
+        make_surface(ball(), resolution=8, views=4)
 
 
 @needs_extra
 def test_the_surface_of_a_ball():
     center = np.array([3.0, -2, 5])
-    base = base_surface(ball(2, center), resolution=32, cameras=24, threads=1)
+    base = make_surface(ball(2, center), **QUICK)
     assert open_edges(base.faces) == 0
     away = base.vertices - center
     voxel = 4 * 1.1 / 32
@@ -110,7 +112,7 @@ def test_crumbs_are_left_out():
         np.concatenate([large.faces, crumb.faces + len(large.vertices)]),
         np.concatenate([large.colors, crumb.colors]),
     )
-    base = base_surface(both, resolution=32, cameras=16, threads=1)
+    base = make_surface(both, **QUICK)
     assert base.vertices[:, 0].max() < 1.2
 
 
@@ -121,14 +123,16 @@ def test_what_cannot_be_done():
         ({"resolution": 4}, "resolution must be"),
         ({"resolution": 600}, "resolution must be"),
         ({"faces": 3}, "faces must be"),
-        ({"cameras": 2}, "cameras must be"),
+        ({"views": 2}, "views must be"),
+        ({"texture": 32}, "texture must be 64"),
+        ({"shape": "round"}, "shape must be one of"),
         ({"cameras": []}, "at least one camera"),
     ]:
         with pytest.raises(ValueError, match=message):
-            base_surface(mesh, **options)
+            make_surface(mesh, **options)
     haze = SplatMesh(mesh.vertices, mesh.faces, mesh.colors * (1, 1, 1, 0.1))
     with pytest.raises(ValueError, match="nothing solid"):
-        base_surface(haze, resolution=16, cameras=8)
+        make_surface(haze, **QUICK)
 
 
 def discs(count=1500) -> GaussianCloud:
@@ -150,20 +154,24 @@ def discs(count=1500) -> GaussianCloud:
     )
 
 
+PLAIN = ["--texture", "0", "--rounds", "0", "--views", "16", "--size", "96", "--no-preview"]
+"""Quick: colours of vertices, and the shape as fused."""
+
+
 @needs_extra
 def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
     out = tmp_path / "base.obj"
-    options = ["--resolution", "24", "--views", "16", "--faces", "600"]
-    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out), *options]) == 0
+    options = [*PLAIN, "--resolution", "24", "--faces", "600"]
+    assert main(["surface", str(tmp_path / "scene.ply"), "-o", str(out), *options]) == 0
     assert "next: meshsplats prior" in capsys.readouterr().out
     base = load_mesh(out)
     assert np.abs(np.linalg.norm(base.vertices, axis=1) - 1).max() < 0.15
     assert open_edges(base.faces) == 0
     assert len(base.faces) == pytest.approx(600, abs=2)
-    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out)]) == 3
-    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
-    assert main(["base", str(out), "-o", str(out), "--force"]) == 2
+    assert main(["surface", str(tmp_path / "scene.ply"), "-o", str(out)]) == 3
+    assert main(["surface", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
+    assert main(["surface", str(out), "-o", str(out), "--force"]) == 2
     assert "is read by this command" in capsys.readouterr().err
 
 
@@ -172,14 +180,14 @@ def test_a_collider_lies_where_the_mesh_is_in_other_programs(tmp_path):
     save_gaussians(discs(), tmp_path / "scene.ply")
     paths = [tmp_path / name for name in ("engine.glb", "collider.glb")]
     assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(paths[0]), "--up", "x"]) == 0
-    options = ["--faces", "200", "--resolution", "24", "--views", "16"]
-    assert main(["base", str(paths[0]), "-o", str(paths[1]), *options]) == 0
+    options = [*PLAIN, "--faces", "200", "--resolution", "24"]
+    assert main(["surface", str(paths[0]), "-o", str(paths[1]), *options]) == 0
     documents = []
     for path in paths:
         data = path.read_bytes()
         (length,) = struct.unpack_from("<I", data, 12)
         documents.append(json.loads(data[20 : 20 + length]))
-    assert documents[0]["nodes"] == documents[1]["nodes"]
+    assert [d["nodes"][0]["rotation"] for d in documents] == [documents[0]["nodes"][0]["rotation"]] * 2
     scene, collider = (load_mesh(path) for path in paths)
     for limit in (np.min, np.max):
         assert limit(scene.vertices, axis=0) == pytest.approx(limit(collider.vertices, axis=0), abs=0.2)
@@ -191,11 +199,11 @@ def test_a_collider_lies_where_the_mesh_is_in_other_programs(tmp_path):
 def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
     assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.npz")]) == 0
-    options = ["--resolution", "16", "--views", "8"]
+    options = [*PLAIN, "--resolution", "16"]
     printed = []
     for source, more in (("scene.ply", ["--axes", "y-up"]), ("mesh.npz", [])):
-        arguments = ["base", str(tmp_path / source), "-o", str(tmp_path / f"{source}.obj"), *options, *more]
-        assert main(arguments) == 0
+        arguments = [str(tmp_path / source), "-o", str(tmp_path / f"{source}.obj"), *options, *more]
+        assert main(["surface", *arguments]) == 0
         printed.append(capsys.readouterr().out.splitlines()[-1])
     assert re.search(r"--splats \S*scene.ply --axes y-up -o prior.npz", printed[0])
     assert "--data photos/ -o prior.npz" in printed[1]
@@ -213,7 +221,7 @@ def test_a_base_of_real_splats_looks_like_them():
     from meshsplats import orbit, render, render_splats
 
     cloud = load_gaussians(shared_data("splats/playbot_lod5_3k_sh2.ply"))
-    base = base_surface(cloud, resolution=64, cameras=32, threads=1)
+    base = make_surface(cloud, resolution=64, views=32, size=192, texture=0, rounds=0, threads=1)
     assert open_edges(base.faces) == 0
     mesh = bind(base).mesh
     for camera in orbit(cloud, 2, width=96, height=96):

@@ -1,0 +1,156 @@
+"""``meshsplats surface``: an ordinary, textured mesh of the surface that splats form."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tyro
+
+from meshsplats._files.atomic import together
+from meshsplats.cli.arguments import Command, as_cli_options
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Folder,
+    Missing,
+    Number,
+    Origin,
+    Output,
+    SplatOptions,
+    load_scene,
+    size_of,
+    written,
+)
+from meshsplats.cli.messages import UsageError, command_line
+from meshsplats.cli.records import write_configuration
+from meshsplats.cli.training import progress_display
+from meshsplats.formats.base_meshes import BASE_SUFFIXES, PRINTED, TextureImage, companions, save_base
+from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
+from meshsplats.mesh import SplatMesh
+from meshsplats.surfaces.options import SurfaceOptions
+
+if TYPE_CHECKING:
+    Options = SurfaceOptions
+else:
+    Options = as_cli_options(
+        SurfaceOptions,
+        "What is made, and how.",
+        defaults=lambda name: f"(default: {getattr(SurfaceOptions(), name)})",
+    )
+
+
+@dataclass(frozen=True)
+class Surface(Command):
+    """Makes a light, connected, textured mesh of the surface that splats form: to be lit, edited, walked on,
+    printed, or to carry a mesh prior.
+
+    Writes a preview and the configuration beside it.
+    """
+
+    EXCLUSIVE = (("cameras", "data"),)
+    CONFIGURABLE = True
+
+    input: tyro.conf.Positional[Path]
+    """Splats, a model folder, or a mesh of splats."""
+    output: Output
+    """The mesh, opaque: .glb, .usdz with the texture inside; .obj, .ply, .usdc with the texture beside; .npz
+    without; .stl, .3mf for printing."""
+    surface: Options = field(default_factory=Options)
+    data: Folder = None
+    """Data set of photographs to fit shape and texture to, in place of images of the scene."""
+    missing: Missing = "error"
+    cameras: File = None
+    """Camera file: from where images are made, in place of --views."""
+    unlit: bool = False
+    """A material that shows the texture as it is, without lights."""
+    image: TextureImage | None = None
+    """File of the texture. Default: png, or jpg where that is large and the format knows it."""
+    scale: Number = None
+    """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
+    no_preview: bool = False
+    """Write no preview."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """Maximum number of threads. Default: all processors."""
+    origin: Origin = "keep"
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def execute(self) -> None:
+        from meshsplats.cameras.files import load_cameras
+        from meshsplats.datasets.folder import load_dataset
+        from meshsplats.images.writing import save_image
+        from meshsplats.rendering.previews import preview_camera
+        from meshsplats.surfaces import draw_surface, make_surface
+
+        start = time.perf_counter()
+        options = self._checked()
+        preview, config = beside(self.output, PREVIEW), beside(self.output, CONFIGURATION)
+        more = companions(self.output, self.image) if options.texture else []
+        outputs = [self.output, *more, config, *([] if self.no_preview else [preview])]
+        check_outputs(outputs, self.force, inputs=[self.input])
+        scene = load_scene(self.input, self.reading)
+        origin = scene.origin
+        with _progress() as progress:
+            base = make_surface(
+                scene,
+                None if self.data is None else load_dataset(self.data, missing=self.missing, origin=origin),
+                options,
+                cameras=None if self.cameras is None else load_cameras(self.cameras, origin=origin),
+                threads=self.threads,
+                progress=progress,
+            )
+        factor = 1.0 if self.scale is None else self.scale
+        placed = replace(base, vertices=base.vertices * np.float32(factor), origin=base.origin * factor)
+        with together():
+            save_base(written(placed, self.origin), self.output, unlit=self.unlit, image=self.image)
+            write_configuration(config, "surface", self)
+            if not self.no_preview:
+                save_image(preview, draw_surface(base, preview_camera(scene), threads=self.threads))
+        seconds, count = time.perf_counter() - start, len(base.faces)
+        if self.json:
+            result = {"mesh": str(self.output), "triangles": count, "bytes": self.output.stat().st_size}
+            print(json.dumps(result | {"seconds": round(seconds, 2)}, indent=1))
+            return
+        look = f"a texture of {options.texture} texels" if base.textures else "colours of vertices"
+        print(f"{self.output} ({count:,} triangles, {look}, {size_of(self.output)}) in {seconds:.1f} s")
+        if not self.no_preview:
+            print(f"preview: {preview}")
+        if self.output.suffix.lower() not in (*PRINTED, ".usdz"):
+            splats = ["--splats", str(self.input), *self.reading.again()]
+            source = ["--data", "photos/"] if isinstance(scene, SplatMesh) else splats
+            print(f"next: {command_line(['meshsplats', 'prior', self.output, *source, '-o', 'prior.npz'])}")
+
+    def resolved(self) -> dict[str, Any]:
+        return asdict(self._checked())
+
+    def _checked(self) -> SurfaceOptions:
+        """The options of the library; UsageError or ValueError where they are wrong."""
+        suffix = self.output.suffix.lower()
+        if suffix not in BASE_SUFFIXES:
+            raise UsageError(f"-o must end in {', '.join(BASE_SUFFIXES)}, got {self.output.name!r}")
+        if suffix in PRINTED and self.surface.shape == "open":
+            raise UsageError(f"{suffix} is for printing, which wants a solid: --shape closed")
+        if self.cameras is not None and self.data is not None:
+            raise UsageError("give --cameras or --data, not both")
+        if self.missing != "error" and self.data is None:
+            raise UsageError("--missing has no effect without --data")
+        if self.scale is not None and not 0 < self.scale < np.inf:
+            raise UsageError(f"--scale must be above 0, got {self.scale}")
+        given = {name: value for name, value in asdict(self.surface).items() if value is not None}
+        return SurfaceOptions(**given).checked()
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    with progress_display() as display:
+        yield lambda phase, done, total: display.phase(phase, done / total)

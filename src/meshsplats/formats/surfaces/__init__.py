@@ -1,0 +1,1 @@
+"""Writers of opaque surfaces with textures, for programs of all kinds."""

@@ -1,0 +1,70 @@
+"""Surfaces as files want them: a vertex for each pair of a place and its texture coordinates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from meshsplats._geometry import vertex_normals
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.images.writing import encode_image
+
+LARGE_PNG = 1 << 20
+"""Textures whose PNG is larger than this, in bytes, are written as JPEG where nothing else is asked for."""
+
+
+class Corners(NamedTuple):
+    """A surface whose vertices have one texture coordinate each."""
+
+    vertices: np.ndarray
+    """(w, 3) float32."""
+    normals: np.ndarray
+    """(w, 3) float32 unit."""
+    faces: np.ndarray
+    """(f, 3) int32."""
+    uv: np.ndarray | None
+    """(w, 2) float32, v down."""
+    colors: np.ndarray | None
+    """(w, 4) float32 display RGBA."""
+
+
+def corners_of(base: BaseMesh) -> Corners:
+    """The vertices of ``base``, several where charts of its texture meet, with smooth normals."""
+    normals = smooth_normals(base)
+    if not base.textured:
+        return Corners(base.vertices, normals, base.faces, None, base.colors)
+    assert base.uv is not None
+    place = base.faces.ravel()
+    key = np.empty((len(place), 3), np.int32)
+    key[:, 0] = place
+    key[:, 1:] = base.uv.reshape(-1, 2).view(np.int32)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")  # as they come, for caches of vertices
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order))
+    rows = place[first[order]]
+    return Corners(
+        base.vertices[rows],
+        normals[rows],
+        rank[inverse.reshape(-1)].reshape(-1, 3),
+        base.uv.reshape(-1, 2)[first[order]],
+        None if base.colors is None else base.colors[rows],
+    )
+
+
+def smooth_normals(base: BaseMesh) -> np.ndarray:
+    """(v, 3) float32 unit normals: area-weighted means of those of the triangles around each vertex."""
+    return vertex_normals(base.vertices, base.faces, fallback=base.up).astype(np.float32)
+
+
+def texture_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]:
+    """The suffix and the content of the file of the texture of ``base``: `.png`, `.jpg` or `.webp`; by
+    default PNG, or JPEG of quality 95 where that is large. Alpha is left out, as surfaces are opaque."""
+    pixels = base.textures[0].pixels[..., :3].astype(np.float32) / 255
+    if suffix is None:
+        content = encode_image("a.png", pixels)
+        if len(content) <= LARGE_PNG:
+            return ".png", content
+        suffix = ".jpg"
+    return suffix, encode_image(f"a{suffix}", pixels)

@@ -1,0 +1,89 @@
+"""Surfaces as Wavefront `.obj` and as `.ply`, each with its texture in a file beside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from meshsplats._files.atomic import write_bytes
+from meshsplats._origin import in_words
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.formats.obj.mesh import write_obj
+from meshsplats.formats.ply.mesh import write_mesh_ply
+from meshsplats.formats.surfaces.corners import smooth_normals, texture_file
+from meshsplats.mesh import SplatMesh
+
+_ROWS = 1 << 14
+
+
+def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
+    """Writes ``base`` to ``path``, which will be ``target``; its material and its texture are beside that."""
+    if not base.textured:
+        write_obj(plain_mesh(base), path)
+        return
+    assert base.uv is not None
+    suffix, content = texture_file(base, image)
+    material, picture = target.with_suffix(".mtl"), target.with_suffix(suffix)
+    write_bytes(picture, content)
+    lines = ["newmtl surface", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {picture.name}"]
+    write_bytes(material, "\n".join([*lines, ""]).encode())
+    coordinates = base.uv.reshape(-1, 2).astype(np.float64)
+    coordinates[:, 1] = 1 - coordinates[:, 1]
+    places, index = np.unique(coordinates, axis=0, return_inverse=True)
+    corner = np.stack([base.faces.ravel() + 1, index.reshape(-1) + 1, base.faces.ravel() + 1], axis=1)
+    up = " ".join(repr(float(u)) for u in base.up)
+    with open(path, "wb") as file:
+        file.write(f"# meshsplats up {up}\n# meshsplats origin {in_words(base.origin)}\n".encode())
+        file.write(f"mtllib {material.name}\nusemtl surface\n".encode())
+        for line, values in (
+            ("v %r %r %r\n", base.origin + base.vertices),
+            ("vt %.9g %.9g\n", places),
+            ("vn %.6f %.6f %.6f\n", smooth_normals(base)),
+            ("f %d/%d/%d %d/%d/%d %d/%d/%d\n", corner.reshape(-1, 9)),
+        ):
+            for start in range(0, len(values), _ROWS):
+                rows = values[start : start + _ROWS]
+                file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
+
+
+def write_surface_ply(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
+    """Writes ``base`` to ``path``, which will be ``target``: as this project's meshes, or with a texture as
+    MeshLab has it, with coordinates of the corners of each face, v up, and a comment TextureFile."""
+    if not base.textured:
+        write_mesh_ply(plain_mesh(base), path)
+        return
+    assert base.uv is not None
+    suffix, content = texture_file(base, image)
+    picture = target.with_suffix(suffix)
+    write_bytes(picture, content)
+    wide = "double" if base.origin.any() else "float"
+    vertex = np.dtype([("p", "<f8" if base.origin.any() else "<f4", 3), ("n", "<f4", 3)])
+    rows = np.empty(len(base.vertices), vertex)
+    rows["p"], rows["n"] = base.origin + base.vertices, smooth_normals(base)
+    face = np.dtype([("n", "u1"), ("index", "<i4", 3), ("m", "u1"), ("uv", "<f4", 6)])
+    faces = np.empty(len(base.faces), face)
+    uv = base.uv.copy()
+    uv[..., 1] = 1 - uv[..., 1]
+    faces["n"], faces["index"], faces["m"], faces["uv"] = 3, base.faces, 6, uv.reshape(-1, 6)
+    header = [
+        *("ply", "format binary_little_endian 1.0", f"comment TextureFile {picture.name}"),
+        f"element vertex {len(rows)}",
+        *(f"property {wide} {name}" for name in "xyz"),
+        *(f"property float n{name}" for name in "xyz"),
+        f"element face {len(faces)}",
+        *("property list uchar int vertex_indices", "property list uchar float texcoord", "end_header", ""),
+    ]
+    with open(path, "wb") as file:
+        file.write("\n".join(header).encode())
+        file.write(rows.tobytes())
+        file.write(faces.tobytes())
+
+
+def plain_mesh(base: BaseMesh) -> SplatMesh:
+    """``base`` as a mesh without texture: with its vertex colours, else grey."""
+    colors = base.colors
+    if colors is None:
+        colors = np.tile(np.array([0.5, 0.5, 0.5, 1], np.float32), (len(base.vertices), 1))
+    normals = smooth_normals(base)
+    return SplatMesh(base.vertices, base.faces, colors, normals=normals, up=base.up, origin=base.origin)

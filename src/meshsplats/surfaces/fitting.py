@@ -1,0 +1,144 @@
+"""The shape and the texture of a surface, fitted to images by gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from meshsplats.datasets.views import View
+from meshsplats.errors import MissingDependencyError
+from meshsplats.surfaces.atlas import filled
+from meshsplats.surfaces.images import Surface, SurfaceImage
+
+BETAS = 0.9, 0.99
+"""Decay of the means of the vertices' gradients and of their squares."""
+RELAXATION = 0.5, 0.1
+"""Share of the error of a view that its texels take over, at the beginning and at the end."""
+DOUBT = 0.25
+"""Samples that a texel must have in a view for that view to count half."""
+ROBUST = 0.1
+"""Error of a pixel, in units of 1, from which it counts for a texture by its size only: highlights that few
+views see, and what lies before the surface, do not stay in it."""
+BACKGROUNDS = 1.0, 0.0, 0.5
+_WHOLE = 0.99
+"""Coverage of a pixel that shows nothing but the surface."""
+_SEED = 7
+
+
+class SmoothSteps:
+    """Adam on vertices, in coordinates in which smooth motions are short (Nicolet and others 2021, Large
+    Steps in Inverse Rendering of Geometry): u = (1 + stiffness L) x with the combinatorial Laplacian L, and
+    one second moment for all coordinates."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, stiffness: float) -> None:
+        try:
+            from scipy import sparse
+            from scipy.sparse.linalg import splu
+        except ImportError as error:
+            raise MissingDependencyError("a surface needs the extra 'base': pip install scipy") from error
+        count = len(vertices)
+        tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        near = sparse.coo_matrix((np.ones(len(tails)), (tails, heads)), (count, count))
+        near = ((near + near.T) > 0).astype(np.float64)
+        matrix = sparse.identity(count) + stiffness * (sparse.diags(near.sum(axis=1).A1) - near)
+        self._solve: Callable[[np.ndarray], np.ndarray] = splu(matrix.tocsc()).solve
+        self._place = matrix @ vertices
+        self._mean, self._square, self._count = np.zeros_like(vertices), 0.0, 0
+
+    def step(self, gradient: np.ndarray, rate: float) -> np.ndarray:
+        """The vertices (v, 3) float64 after a step down ``gradient`` (v, 3) of about ``rate`` scene units."""
+        slope = self._solve(gradient)
+        first, second = BETAS
+        self._count += 1
+        self._mean = first * self._mean + (1 - first) * slope
+        self._square = second * self._square + (1 - second) * float(np.square(slope).sum(axis=1).max())
+        if self._square > 0:
+            mean = self._mean / (1 - first**self._count)
+            self._place = self._place - rate * mean / np.sqrt(self._square / (1 - second**self._count))
+        return self._solve(self._place)
+
+
+def mean_colors(
+    surface: Surface,
+    views: Sequence[View],
+    *,
+    threads: int | None = None,
+    progress: Callable[[], object] | None = None,
+) -> Surface:
+    """The surface with the mean of the images' colours at each texel; unseen ones are filled."""
+    sums = np.zeros((*surface.texels.shape[:2], 4), np.float32)
+    for view in views:
+        target, background, counts = target_of(view)
+        image = SurfaceImage(surface, view.camera, background, gradients=False, threads=threads)
+        sums += image.texel_sums(target, counts * (image.coverage > _WHOLE))
+        if progress is not None:
+            progress()
+    weight = sums[..., 3]
+    return surface._replace(texels=filled(sums[..., :3] / np.where(weight > 0, weight, 1)[..., None], weight))
+
+
+def fit(
+    surface: Surface,
+    views: Sequence[View],
+    *,
+    rounds: int,
+    move: float,
+    stiffness: float,
+    threads: int | None = None,
+    progress: Callable[[], object] | None = None,
+) -> Surface:
+    """The surface whose images are nearer to those of ``views``.
+
+    Each round takes every view once, in a random order: the vertices follow the gradient of the square error,
+    and the texels take over a part of their error in the view.
+
+    Args:
+        surface: with colours that are about right, such as ``mean_colors``.
+        rounds: 1 or more.
+        move: largest step of a vertex at the beginning, relative to the median edge; 0: the shape stays.
+        stiffness: weight of the Laplacian.
+        progress: called after each view.
+    """
+    rng = np.random.default_rng(_SEED)
+    steps = SmoothSteps(surface.vertices, surface.faces, stiffness)
+    corners = surface.vertices[surface.faces]
+    edge = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    total = rounds * len(views)
+    for number, index in enumerate(np.concatenate([rng.permutation(len(views)) for _ in range(rounds)])):
+        target, background, counts = target_of(views[index], number)
+        image = SurfaceImage(surface, views[index].camera, background, gradients=move > 0, threads=threads)
+        error = (image.color - target) * counts[..., None]
+        vertices = surface.vertices
+        if move:
+            slope = image.vertex_gradients(error * np.float32(2 / error.size))
+            vertices = steps.step(slope, move * edge * 0.1 ** (number / total))
+        weight = (
+            counts
+            * (image.coverage > _WHOLE)
+            * np.minimum(1, ROBUST / np.maximum(np.abs(error).max(2), ROBUST))
+        )
+        sums = image.texel_sums(error, weight)
+        part = RELAXATION[0] + (RELAXATION[1] - RELAXATION[0]) * number / total
+        change = sums[..., :3] * (part / (sums[..., 3:] + DOUBT))
+        surface = surface._replace(vertices=vertices, texels=np.clip(surface.texels - change, 0, 1))
+        if progress is not None:
+            progress()
+    return surface
+
+
+def target_of(view: View, number: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the image of a surface is compared with: the target (h, w, 3), the background (3,) or (h, w, 3),
+    and (h, w) which pixels count, 0 or 1; all float32.
+
+    Images with alpha lie on white, black and grey in turn, so that there is an outline on one of them. Behind
+    the surface, photographs show themselves: what it does not cover is no error.
+    """
+    image = view.load()
+    height, width = image.color.shape[:2]
+    counts = np.ones((height, width), np.float32) if image.mask is None else image.mask.astype(np.float32)
+    if image.alpha is None:
+        target = image.over()
+        return target, target, counts
+    background = np.full(3, BACKGROUNDS[number % len(BACKGROUNDS)], np.float32)
+    return image.over(background), background, counts

@@ -1,0 +1,158 @@
+"""Depth images of a scene fused into truncated signed distances on a grid, and the surface in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from meshsplats._core.surfaces import Grid, fuse_depth
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import scene_bounds, weighted_quantile
+from meshsplats.errors import MissingDependencyError
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import Rendering, render
+from meshsplats.rendering.core_arguments import camera_struct
+
+MAX_RESOLUTION = 512
+"""Maximum number of voxels along the longest side of the grid."""
+TRUNCATION = 3.0
+"""Truncation of signed distances, in voxels."""
+_SOLID = 0.5
+"""Minimum alpha of a pixel that shows the surface; below it the whole ray is empty."""
+_OUTLIERS = 0.002
+"""Share of the opacity that may lie beyond each side of the box, so that floaters do not enlarge it."""
+_MARGIN = 0.05
+"""Margin around the box, relative to its longest side."""
+MIN_PART = 0.01
+"""Connected parts with a smaller volume, relative to the largest part, are removed."""
+
+
+def signed_distances(
+    mesh: SplatMesh,
+    cameras: Sequence[Camera],
+    grid: Grid,
+    *,
+    behind: float = 1.0,
+    unseen: float | None = -1.0,
+    threads: int | None = None,
+    each: Callable[[Camera, Rendering], object] | None = None,
+) -> np.ndarray:
+    """(x, y, z) float32 truncated signed distances to the surface of ``mesh`` at the points of ``grid``.
+
+    The unit is ``TRUNCATION`` voxels; positive outside. Points that no camera sees count as interior, with
+    the distance ``unseen``, and those on the border of the grid as exterior, so that the surface is closed.
+    With None they have no distance (NaN), and the surface ends where no camera saw it. ``each`` is called
+    with every camera and its image on black.
+
+    ``behind`` is the weight of distances behind a surface. Points near a sheet without thickness are as far
+    in front of it for some cameras as behind it for others: with 1 a sheet leaves noise, with less nothing.
+    """
+    total, weight = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
+    for camera in (camera.with_near_plane(mesh.vertices) for camera in cameras):
+        drawn = render(mesh, camera, background=(0, 0, 0), depth=True, threads=threads)
+        fuse_depth(
+            total,
+            weight,
+            drawn.mean_depth(min_alpha=_SOLID),
+            camera_struct(camera),
+            grid,
+            truncation=TRUNCATION * grid.voxel,
+            behind=behind,
+            threads=threads,
+        )
+        if each is not None:
+            each(camera, drawn)
+    seen = weight > 0
+    np.divide(total, weight, out=total, where=seen)
+    total[~seen] = np.nan if unseen is None else unseen
+    if unseen is not None:
+        for axis in range(3):
+            sides = np.moveaxis(total, axis, 0)
+            sides[0] = sides[-1] = 1
+    return total
+
+
+def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """The surface where ``field``, an (x, y, z) grid, is 0, between points that all are numbers.
+
+    The triangles face the positive side. Parts of the interior with less than ``MIN_PART`` of the volume of
+    the largest part are removed, and of an open surface those with less than that of its triangles.
+    ``faces`` is the approximate maximum number of triangles; 0: no maximum.
+
+    Returns:
+        (n, 3) float64 vertices in grid steps, (m, 3) int32 triangles.
+    """
+    label, marching_cubes, simplify = libraries()
+    part = label(field < 0, connectivity=1)
+    sizes = np.bincount(part.ravel())
+    if len(sizes) == 1 or sizes[0] == 0:  # all exterior, or all interior
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)
+    small = sizes < MIN_PART * sizes[1:].max()
+    small[0] = False
+    known = np.isfinite(field)
+    vertices, triangles, _, _ = marching_cubes(
+        np.where(known, np.where(small[part], -field, field), 1),
+        0.0,
+        gradient_direction="descent",
+        allow_degenerate=False,
+        mask=None if known.all() else known,
+    )
+    if not known.all():
+        vertices, triangles = large_parts(vertices, triangles)
+    if 0 < faces < len(triangles):
+        vertices, triangles = simplify(vertices, triangles, target_count=faces)
+    return vertices.astype(np.float64), triangles.astype(np.int32)
+
+
+def large_parts(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The connected parts of a mesh, (n, 3) vertices and (m, 3) triangles, with at least ``MIN_PART`` of the
+    triangles of the largest."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(triangles):
+        return vertices, triangles
+    tails, heads = triangles.ravel(), np.roll(triangles, 1, axis=1).ravel()
+    links = coo_matrix((np.ones(len(tails), bool), (tails, heads)), (len(vertices), len(vertices)))
+    part = connected_components(links, directed=False)[1][triangles[:, 0]]
+    counts = np.bincount(part)
+    kept = triangles[counts[part] >= MIN_PART * counts.max()]
+    used, index = np.unique(kept, return_inverse=True)
+    return vertices[used], index.reshape(-1, 3).astype(triangles.dtype)
+
+
+def libraries() -> tuple[Callable[..., Any], ...]:
+    """scikit-image's label and marching_cubes, and simplify. MissingDependencyError names the extra."""
+    try:
+        from fast_simplification import simplify
+        from skimage.measure import label, marching_cubes
+    except ImportError as error:
+        raise MissingDependencyError(
+            "a surface needs the extra 'base': pip install scikit-image fast-simplification uvunwrap scipy"
+        ) from error
+    return label, marching_cubes, simplify
+
+
+def grid_around(scene: GaussianCloud | SplatMesh, resolution: int) -> Grid:
+    """The grid around ``scene`` without its floaters, ``resolution`` voxels along the longest side.
+
+    Raises ValueError for a scene that is empty or has no extent.
+    """
+    bounds = scene_bounds(scene)
+    if not len(bounds.points):
+        raise ValueError("the scene is empty")
+    weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(bounds.points))
+    sides = [
+        [weighted_quantile(bounds.points[:, k], weights, share) for share in (_OUTLIERS, 1 - _OUTLIERS)]
+        for k in range(3)
+    ]
+    low, high = np.array(sides, np.float64).T
+    longest = float((high - low).max())
+    if not longest > 0:
+        raise ValueError("the scene has no extent")
+    low, high = low - _MARGIN * longest, high + _MARGIN * longest
+    voxel = float((high - low).max()) / resolution
+    return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1))

@@ -1,0 +1,173 @@
+"""Images of a textured surface, opaque and unlit, with gradients for its vertices and its texture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from meshsplats._core import kernels
+from meshsplats._core.surfaces import Samples, coordinate_gradients, texel_sums, texture_samples
+from meshsplats._kinds import need
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.camera import Camera
+from meshsplats.mesh import SplatMesh, Triangles
+from meshsplats.rendering import render
+from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
+from meshsplats.rendering.edges import faces_across
+
+SAMPLES = 2
+"""Samples along each side of a pixel."""
+_ROOT = 1024
+
+
+class Surface(NamedTuple):
+    """Triangles with a texture."""
+
+    vertices: np.ndarray
+    """(v, 3) float64."""
+    faces: np.ndarray
+    """(f, 3) int32."""
+    uv: np.ndarray
+    """(f, 3, 2) float32 texture coordinates of the corners, u to the right, v down."""
+    texels: np.ndarray
+    """(th, tw, 3) float32 display RGB."""
+
+
+class SurfaceImage:
+    """The image of a surface: the mean over ``SAMPLES`` x ``SAMPLES`` samples of each pixel."""
+
+    color: np.ndarray
+    """(h, w, 3) float32."""
+    coverage: np.ndarray
+    """(h, w) float32: the share of each pixel that shows the surface."""
+
+    def __init__(
+        self,
+        surface: Surface,
+        camera: Camera,
+        background: np.ndarray,
+        *,
+        gradients: bool = True,
+        threads: int | None = None,
+    ) -> None:
+        """Draws the image.
+
+        Args:
+            surface: its arrays are kept, not copied.
+            camera: with a near plane.
+            background: (3,) or (h, w, 3) float32.
+            gradients: whether the image gets a backward pass.
+        """
+        self._surface, self._threads = surface, threads
+        self._camera = fine = camera.scaled(SAMPLES)
+        count = len(surface.faces)
+        # Each triangle has corners of its own with its index, in two digits that float32 keeps exactly.
+        index = np.repeat(np.arange(count), 3)
+        digits = np.stack([index % _ROOT, index // _ROOT], axis=1)
+        corners = Triangles(
+            surface.vertices[surface.faces].reshape(-1, 3).astype(np.float32),
+            np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
+            np.tile(np.array([0, 0, 0, 1], np.float32), (3 * count, 1)),
+            values=np.concatenate([surface.uv.reshape(-1, 2), digits], axis=1, dtype=np.float32),
+        )
+        options, tape = TapeOptions(background=(0, 0, 0)), TAPE_BYTES if gradients else None
+        self._image = TapedRendering(corners, fine, options, threads=threads, tape_bytes=tape)
+        covered = self._image.alpha > 0.5
+        attributes = self._image.attributes
+        self._samples = Samples(np.ascontiguousarray(attributes[..., :2]), covered, SAMPLES)
+        empty = np.asarray(background, np.float32)
+        if empty.ndim == 3:
+            empty = empty.repeat(SAMPLES, axis=0).repeat(SAMPLES, axis=1)
+        self._colors = texture_samples(self._samples, surface.texels, empty, threads=threads)
+        self.color, self.coverage = _pixels(self._colors), _pixels(covered.astype(np.float32))
+
+    def vertex_gradients(self, gradient: np.ndarray) -> np.ndarray:
+        """(v, 3) float64 gradient of a loss with respect to the vertices, of which ``gradient`` (h, w, 3)
+        float32 is that with respect to the image: by the motion of the texture, and of visible edges."""
+        surface, samples = self._surface, self._samples
+        each = np.zeros((*gradient.shape[:2], 4), np.float32)
+        each[..., :3] = gradient / SAMPLES**2
+        attributes = np.zeros((*samples.covered.shape, 4), np.float32)
+        attributes[..., :2] = coordinate_gradients(samples, surface.texels, each, threads=self._threads)
+        count = 3 * len(surface.faces)
+        moved = np.zeros((count, 3), np.float32)
+        self._image.backward(
+            np.zeros((*samples.covered.shape, 3), np.float32),
+            None,
+            attributes,
+            vertices=moved,
+            colors=np.zeros((count, 4), np.float32),
+            vertex_attributes=np.zeros((count, 4), np.float32),
+        )
+        corners = surface.faces.ravel()
+        total = [np.bincount(corners, moved[:, k], len(surface.vertices)) for k in range(3)]
+        return np.stack(total, axis=1) + self._edges(gradient)
+
+    def texel_sums(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """(th, tw, 4) float32 sums of ``values`` (h, w, 3) times ``weight`` (h, w), and of the weights, of
+        the pixels that show each texel, in samples."""
+        each = np.concatenate([values * weight[..., None], weight[..., None]], axis=2, dtype=np.float32)
+        return texel_sums(self._samples, self._surface.texels, each, threads=self._threads)
+
+    def _edges(self, gradient: np.ndarray) -> np.ndarray:
+        """(v, 3) float64 gradient by the motion of visible edges (``rendering.edges``)."""
+        vertices, faces, camera = self._surface.vertices, self._surface.faces, self._camera
+        assert camera.near is not None
+        rotation, offset = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        points = vertices @ rotation.T + offset
+        depth = points[:, 2]
+        drawn = depth >= camera.near
+        scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [camera.fx, camera.fy]
+        digits = np.rint(self._image.attributes[..., 2:]).astype(np.int32)
+        image = kernels.OpaqueImage(
+            np.column_stack([points[:, :2] * scale + [camera.cx, camera.cy], depth]),
+            faces,
+            np.ones((len(vertices), 4), np.float32),
+            faces_across(faces),
+            np.where(self._samples.covered, digits[..., 0] + _ROOT * digits[..., 1], np.int32(-1)),
+            self._colors,
+            camera.near,
+            0.5,
+        )
+        moved = scale * kernels.edge_gradients(image, np.ascontiguousarray(gradient), self._threads)
+        along = -(moved * points[:, :2]).sum(axis=1) / np.where(drawn, depth, 1)
+        return np.column_stack([moved, along]) @ rotation
+
+
+def draw_surface(
+    base: BaseMesh,
+    camera: Camera,
+    *,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    threads: int | None = None,
+) -> np.ndarray:
+    """(h, w, 3) float32 image of an opaque mesh with one texture or with vertex colours, unlit: display RGB,
+    the mean over 2 x 2 samples of each pixel.
+
+    Args:
+        base: the mesh; grey where it has neither.
+        camera: viewpoint, lens and size of the image.
+        background: RGB, (3,) or (h, w, 3).
+        threads: at most this many; all processors by default.
+    """
+    need(BaseMesh, base=base)
+    need(Camera, camera=camera)
+    if base.textured and base.uv is not None and len(base.textures) == 1:
+        texels = base.textures[0].pixels[..., :3].astype(np.float32) / 255
+        surface = Surface(base.vertices.astype(np.float64), base.faces, base.uv, texels)
+        camera = camera.with_near_plane(base.vertices)
+        behind = np.asarray(background, np.float32)
+        return SurfaceImage(surface, camera, behind, gradients=False, threads=threads).color
+    colors = base.colors
+    if colors is None:
+        colors = np.tile(np.array([0.5, 0.5, 0.5, 1], np.float32), (len(base.vertices), 1))
+    mesh = SplatMesh(base.vertices, base.faces, colors)
+    return render(mesh, camera, background=background, samples=SAMPLES, threads=threads).color
+
+
+def _pixels(samples: np.ndarray) -> np.ndarray:
+    """The means over the samples of each pixel."""
+    rows, columns = samples.shape[0] // SAMPLES, samples.shape[1] // SAMPLES
+    return samples.reshape(rows, SAMPLES, columns, SAMPLES, *samples.shape[2:]).mean(axis=(1, 3))

@@ -1,0 +1,230 @@
+"""make_surface: an ordinary textured mesh of the surface that splats form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from meshsplats._core.surfaces import Grid
+from meshsplats._kinds import need, need_all
+from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.binding import Binding
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up
+from meshsplats.conversion import convert
+from meshsplats.datasets.views import Dataset, View
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render
+from meshsplats.surfaces.atlas import cells, cells_side, unwrap
+from meshsplats.surfaces.color_projection import colors_from_views
+from meshsplats.surfaces.fitting import fit, mean_colors
+from meshsplats.surfaces.fusion import grid_around, isosurface, libraries, signed_distances
+from meshsplats.surfaces.images import Surface
+from meshsplats.surfaces.options import SurfaceOptions
+from meshsplats.surfaces.views import Sources, smaller, sources_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from meshsplats.surfaces.options import SurfaceChanges
+
+ProgressOf = Callable[[str, int, int], object]
+"""Called with the name of a phase, how much of it is done, and how much there is."""
+
+_COARSE = 2
+"""The first rounds compare images, and have textures, whose sides are smaller by this factor."""
+_LATER = 0.3
+"""Steps of the vertices in the last round, relative to those before."""
+_BOX_SIDE = 128
+"""Sides of the depth images by which the box of a place is found."""
+_BOX_SHARE = 0.02
+"""Share of what these show beyond each side of the box."""
+
+
+def make_surface(
+    scene: GaussianCloud | SplatMesh,
+    data: Dataset | None = None,
+    options: SurfaceOptions | None = None,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    threads: int | None = None,
+    progress: ProgressOf | None = None,
+    **changes: Unpack[SurfaceChanges],
+) -> BaseMesh:
+    """A light, connected, textured mesh of the surface that splats form.
+
+    The scene is rendered with depth from many sides. The depth images are fused into a truncated signed
+    distance function on a grid (Curless and Levoy 1996), whose zero level set marching cubes extract and
+    quadric edge collapses simplify (Garland and Heckbert 1997). An atlas of charts gives it a texture. Shape
+    and texture are then fitted to images: vertices follow the gradients of visible edges and of the texture,
+    in coordinates in which smooth motions are short; texels take the colours of the pixels that show them.
+    Needs the extra ``base``.
+
+    Args:
+        scene: splats, or a mesh of splats, for instance a fine-tuned one.
+        data: photographs to fit to, in place of images of the scene; their training views.
+        options: what to make; ``changes`` replace single fields.
+        cameras: cameras of the images, in place of those that are placed around an object or found in a
+            place.
+        threads: at most this many; all processors by default.
+        progress: called as the work goes on.
+
+    Returns:
+        The mesh in scene units and relative to the scene's origin, with a texture or, with ``texture=0``,
+        with vertex colours. A closed one has no holes and faces outwards.
+
+    Raises:
+        ValueError: an option out of its range, a scene without extent, images that show nothing solid, or a
+            texture that is too small.
+        MissingDependencyError: the libraries of the extra ``base`` are missing.
+    """
+    if not isinstance(scene, SplatMesh):
+        need(GaussianCloud, scene=scene)
+    need(Dataset, data=data, optional=True)
+    need_all(Camera, cameras=cameras, optional=True)
+    chosen = replace(options or SurfaceOptions(), **changes).checked()
+    libraries()  # fails early
+    said = progress or (lambda *_: None)
+    if data is not None:
+        data = data.relative_to(scene.origin)
+    sources = sources_of(scene, data, cameras, chosen, threads)
+    vertices, faces = _fused(scene, sources, chosen, threads, said)
+    surface = Surface(vertices, faces, *_blank_texture(vertices, faces, chosen.texture))
+    if chosen.texture or chosen.rounds:
+        surface = _fitted(surface, sources, chosen, threads, said)
+    base = BaseMesh(surface.vertices.astype(np.float32), faces, up=guess_up(scene), origin=scene.origin)
+    if not chosen.texture:
+        return replace(base, colors=_vertex_colors(base, sources.views, threads))
+    pixels = np.full((*surface.texels.shape[:2], 4), 255, np.uint8)
+    pixels[..., :3] = np.rint(255 * surface.texels)
+    return replace(
+        base,
+        uv=surface.uv,
+        face_texture=np.zeros(len(faces), np.int32),
+        textures=(Texture(pixels, ("clamp", "clamp")),),
+    )
+
+
+def _blank_texture(vertices: np.ndarray, faces: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates, and texels without colours; for a ``side`` of 0 those of triangles one by one."""
+    if side:
+        return unwrap(vertices, faces, side), np.zeros((side, side, 3), np.float32)
+    side = cells_side(len(faces))
+    return cells(len(faces), side), np.zeros((side, side, 3), np.float32)
+
+
+def _fused(
+    scene: GaussianCloud | SplatMesh,
+    sources: Sources,
+    options: SurfaceOptions,
+    threads: int | None,
+    progress: ProgressOf,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The surface in the depth images: vertices (v, 3) float64, triangles (f, 3) int32."""
+    mesh = scene
+    if isinstance(mesh, GaussianCloud):
+        # As wide as viewers draw splats: gaps between them would be holes in the surface.
+        mesh = convert(mesh, cameras=sources.depth, look="splats", colors="base", threads=threads)
+    grid = (
+        grid_around(scene, options.resolution)
+        if sources.closed
+        else _grid_seen(mesh, sources.depth, options.resolution, threads)
+    )
+    done = _Counter(progress, "shape", len(sources.depth))
+    field = signed_distances(
+        mesh,
+        sources.depth,
+        grid,
+        unseen=-1.0 if sources.closed else None,
+        threads=threads,
+        each=lambda *_: done(),
+    )
+    vertices, faces = isosurface(field, options.faces)
+    if not len(faces):
+        raise ValueError(
+            "the images show nothing solid: a surface is made of objects and places, not of haze"
+        )
+    return grid.low + grid.voxel * vertices, faces
+
+
+def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, threads: int | None) -> Grid:
+    """The grid around what the cameras see, without what is farther than nearly all of it."""
+    points = []
+    for camera in cameras:
+        small = camera.scaled(_BOX_SIDE / max(camera.width, camera.height)).with_near_plane(mesh.vertices)
+        depth = render(mesh, small, depth=True, threads=threads).mean_depth(min_alpha=0.5)
+        rows, columns = np.nonzero(np.isfinite(depth))
+        away = depth[rows, columns].astype(np.float64)
+        x = (columns + 0.5 - small.cx) / small.fx * away
+        y = (rows + 0.5 - small.cy) / small.fy * away
+        matrix = small.world_to_camera
+        points.append((np.stack([x, y, away], axis=1) - matrix[:3, 3]) @ matrix[:3, :3])
+    every = np.concatenate(points)
+    if not len(every):
+        raise ValueError(
+            "the images show nothing solid: a surface is made of objects and places, not of haze"
+        )
+    low, high = np.quantile(every, [_BOX_SHARE, 1 - _BOX_SHARE], axis=0)
+    voxel = float((high - low).max()) / (resolution - 4)
+    if not voxel > 0:
+        raise ValueError("the scene has no extent")
+    low = low - 2 * voxel
+    return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 3))
+
+
+def _fitted(
+    surface: Surface, sources: Sources, options: SurfaceOptions, threads: int | None, progress: ProgressOf
+) -> Surface:
+    """``surface`` with a texture, and fitted to the images."""
+    side = len(surface.texels)
+    views = [replace(v, camera=v.camera.with_near_plane(surface.vertices)) for v in sources.views]
+    if not options.rounds:
+        return mean_colors(
+            surface, views, threads=threads, progress=_Counter(progress, "texture", len(views))
+        )
+    small: list[View] = []
+    reading = _Counter(progress, "images", len(views))
+    for view in views:
+        small.append(smaller(view, _COARSE))
+        reading()
+    coarse = -(-side // _COARSE)
+    surface = surface._replace(texels=np.zeros((coarse, coarse, 3), np.float32))
+    surface = mean_colors(surface, small, threads=threads)
+    fitting = partial(fit, stiffness=options.stiffness, threads=threads)
+    done = _Counter(progress, "fit", options.rounds * len(views))
+    surface = fitting(surface, small, rounds=options.rounds, move=options.move, progress=done)
+    texels = surface.texels.repeat(_COARSE, axis=0).repeat(_COARSE, axis=1)[:side, :side]
+    done = _Counter(progress, "texture", len(views))
+    return fitting(
+        surface._replace(texels=texels), views, rounds=1, move=_LATER * options.move, progress=done
+    )
+
+
+def _vertex_colors(base: BaseMesh, views: Sequence[View], threads: int | None) -> np.ndarray:
+    """(v, 4) float32 display RGBA of the vertices, projected from the images."""
+    points, faces = base.vertices, base.faces
+    # Every vertex is bound to itself, in one of its faces.
+    face = np.zeros(len(points), np.int32)
+    face[faces.ravel()] = np.repeat(np.arange(len(faces), dtype=np.int32), 3)
+    corner = (faces[face] == np.arange(len(points))[:, None]).argmax(axis=1)
+    weights = np.eye(3, dtype=np.float32)[corner]
+    binding = Binding(points, faces, face, weights, np.zeros(len(points), np.int32))
+    colors = np.ones((len(points), 4), np.float32)
+    colors[:, :3] = colors_from_views(binding, views, threads=threads)
+    return colors
+
+
+class _Counter:
+    """Counts the steps of a phase for ``progress``."""
+
+    def __init__(self, progress: ProgressOf, name: str, total: int) -> None:
+        self._progress, self._name, self._total, self._done = progress, name, total, 0
+
+    def __call__(self) -> None:
+        self._done += 1
+        self._progress(self._name, self._done, self._total)

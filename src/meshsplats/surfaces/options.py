@@ -1,0 +1,67 @@
+"""Options of a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypedDict
+
+from meshsplats._options import Advanced, Range, With, check_options
+from meshsplats.surfaces.fusion import MAX_RESOLUTION
+
+Shape = Literal["auto", "closed", "open"]
+
+MAX_TEXTURE = 8192
+"""Largest side of a texture."""
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """The options of ``make_surface``."""
+
+    faces: Annotated[int, Range(0, 10_000_000)] = 20_000
+    """Approximate largest number of triangles; 0: as many as the voxels give."""
+    texture: Annotated[int, Range(0, MAX_TEXTURE)] = 2048
+    """Side of the texture in texels; 0: colours of vertices instead."""
+    shape: Shape = "auto"
+    """closed: a solid that can be seen from all sides; what no image sees becomes interior. open: only what
+    images see, for rooms, streets and gardens. auto: closed for objects, open for places."""
+    resolution: Annotated[int, Range(8, MAX_RESOLUTION)] = 256
+    """Voxels along the longest side, from whose surface triangles are made. Memory grows with its
+    cube."""
+    views: Annotated[int, Range(4, 1000)] = 64
+    """Images that are made of the scene, from all around or, of a place, from within."""
+    size: Annotated[int, Range(16, 4096)] = 800
+    """Side of these images in pixels; photographs are used at most this wide."""
+    rounds: Annotated[int, Range(0, 1000)] = 3
+    """How often shape and texture are compared with each image; 0: the surface stays as fused, and has the
+    mean colours of the images."""
+    sh_degree: Annotated[int | None, Range(0, 4), Advanced] = None
+    """Largest degree of the splats' view-dependent colour in the images; None: all."""
+    move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 1.5
+    """Step of the vertices, relative to the length of an edge."""
+    stiffness: Annotated[float, Range(0, 1000), With("rounds"), Advanced] = 2.0
+    """How far a vertex takes its neighbours along: the weight of the Laplacian."""
+
+    def checked(self) -> SurfaceOptions:
+        """The same options. Raises ValueError for one out of its range."""
+        check_options(self)
+        if 0 < self.faces < 4:
+            raise ValueError(f"faces must be 4 or more, or 0 for all, got {self.faces}")
+        if 0 < self.texture < 64:
+            raise ValueError(f"texture must be 64 texels or more, or 0 for none, got {self.texture}")
+        return self
+
+
+class SurfaceChanges(TypedDict, total=False):
+    """The fields of ``SurfaceOptions`` as keywords, for type checkers and editors."""
+
+    faces: int
+    texture: int
+    shape: Shape
+    resolution: int
+    views: int
+    size: int
+    rounds: int
+    sh_degree: int | None
+    move: float
+    stiffness: float

@@ -1,0 +1,141 @@
+"""Images that a surface is made from and fitted to, and the cameras of its depth images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up
+from meshsplats.cameras.placing import has_surroundings
+from meshsplats.cameras.trajectories import dome
+from meshsplats.datasets.splat_targets import splat_dataset, splat_views
+from meshsplats.datasets.views import Dataset, View, ViewImage
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render
+from meshsplats.surfaces.images import SAMPLES
+from meshsplats.surfaces.options import SurfaceOptions
+from meshsplats.viewpoints.finding import find_cameras
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where a surface comes from."""
+
+    depth: tuple[Camera, ...]
+    """Cameras of the depth images."""
+    views: tuple[View, ...]
+    """Images to be fitted to."""
+    closed: bool
+    """Whether the surface is a solid."""
+
+
+def sources_of(
+    scene: GaussianCloud | SplatMesh,
+    data: Dataset | None,
+    cameras: Sequence[Camera] | None,
+    options: SurfaceOptions,
+    threads: int | None,
+) -> Sources:
+    """The cameras and images for a surface of ``scene``: of an object on all sides of it, else where data
+    sets of splats have theirs.
+
+    Raises ValueError for too few cameras.
+    """
+    side, shape = options.size, options.shape
+    given = None if cameras is None else [fitted(camera, side) for camera in cameras]
+    photos = None if data is None else [reduced(view, side) for view in data.train]
+    if [] in (given, photos):
+        raise ValueError("a surface needs at least one camera")
+    closed = shape == "closed" or (shape == "auto" and _is_object(scene, options, threads))
+    if photos is None:
+        photos = _drawn(scene, given, closed, options, threads)
+    if given is None:
+        given = _around(scene, options) if closed else [view.camera for view in photos]
+    return Sources(tuple(given), tuple(photos), closed)
+
+
+def _is_object(scene: GaussianCloud | SplatMesh, options: SurfaceOptions, threads: int | None) -> bool:
+    """Whether a scene can be seen from all around, against nothing."""
+    if isinstance(scene, SplatMesh):
+        return True
+    if has_surroundings(scene):
+        return False
+    return find_cameras(scene, 1, width=options.size, height=options.size, threads=threads).kind == "object"
+
+
+def _around(scene: GaussianCloud | SplatMesh, options: SurfaceOptions) -> list[Camera]:
+    """Cameras on all sides of a scene, below it, too."""
+    side = options.size
+    return list(dome(scene, options.views, whole=True, up=guess_up(scene), width=side, height=side))
+
+
+def _drawn(
+    scene: GaussianCloud | SplatMesh,
+    cameras: list[Camera] | None,
+    closed: bool,
+    options: SurfaceOptions,
+    threads: int | None,
+) -> list[View]:
+    """Images of the scene from ``cameras``, by default from where it is well seen."""
+    if isinstance(scene, SplatMesh):
+        cameras = _around(scene, options) if cameras is None else cameras
+        return [_image_of(scene, camera, threads) for camera in cameras]
+    look: dict[str, Any] = {"sh_degree": options.sh_degree, "samples": SAMPLES, "threads": threads}
+    if cameras is not None:
+        return list(splat_views(scene, cameras, **look))
+    data = splat_dataset(
+        scene,
+        placement="object" if closed else "auto",
+        train=options.views,
+        test=0,
+        width=options.size,
+        below=True,
+        zooms=(1,),
+        **look,
+    )
+    return list(data.train)
+
+
+def _image_of(mesh: SplatMesh, camera: Camera, threads: int | None) -> View:
+    drawn = render(mesh, camera, background=(0, 0, 0), samples=SAMPLES, threads=threads)
+    color = np.clip(drawn.color, 0, 1).astype(np.float16)
+    return View(camera, ViewImage(color, drawn.alpha.astype(np.float16)))
+
+
+def fitted(camera: Camera, side: int) -> Camera:
+    """``camera`` with an image at most ``side`` pixels wide and high."""
+    return camera.scaled(min(1.0, side / max(camera.width, camera.height)))
+
+
+def reduced(view: View, side: int) -> View:
+    """``view`` with an image at most ``side`` pixels wide and high, by a whole factor."""
+    factor = -(-max(view.camera.width, view.camera.height) // side)
+    return view if factor == 1 else smaller(view, factor)
+
+
+def smaller(view: View, factor: int) -> View:
+    """``view`` with the mean of each ``factor`` x ``factor`` pixels, without what is left over at the right
+    and at the bottom. A pixel counts if all of them do."""
+    camera, image = view.camera, view.load()
+    height, width = camera.height // factor, camera.width // factor
+
+    def blocks(values: np.ndarray) -> np.ndarray:
+        kept = values[: height * factor, : width * factor]
+        return kept.reshape(height, factor, width, factor, *values.shape[2:])
+
+    def means(values: np.ndarray) -> np.ndarray:
+        mean = blocks(values).mean(axis=(1, 3), dtype=np.float32)
+        return np.rint(mean).astype(np.uint8) if values.dtype == np.uint8 else mean.astype(values.dtype)
+
+    small = ViewImage(
+        means(image.color),
+        None if image.alpha is None else means(image.alpha),
+        None if image.mask is None else np.asarray(blocks(image.mask).all(axis=(1, 3))),
+    )
+    lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
+    return replace(view, camera=replace(camera, width=width, height=height, **lens), source=small)

@@ -1,0 +1,210 @@
+"""Surfaces as files, read back by us and by others."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import struct
+import zipfile
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from meshsplats import BaseMesh, load_base, load_mesh, save_base
+from meshsplats.base_mesh import Texture
+from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
+
+needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="install meshsplats[usd]")
+
+
+def tetrahedron(*, textured: bool = True, origin=(0, 0, 0), noise: bool = False) -> BaseMesh:
+    """Closed, facing out, each face a chart of its own."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    if not textured:
+        colors = np.array([[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0.5, 0.25, 0.75, 1]])
+        return BaseMesh(points, faces, colors, up=(0, -1, 0), origin=np.array(origin, float))
+    uv = np.array([[[0.1, 0.1], [0.4, 0.1], [0.1, 0.4]]], np.float32) + np.array(
+        [[[0, 0]], [[0.5, 0]], [[0, 0.5]], [[0.5, 0.5]]], np.float32
+    )
+    pixels = np.full((64, 32, 4), 255, np.uint8)
+    y, x = np.mgrid[:64, :32]
+    pixels[..., 0], pixels[..., 1], pixels[..., 2] = 4 * y, 8 * x, 90
+    if noise:
+        pixels = np.random.default_rng(0).integers(0, 256, (1024, 1024, 4), np.uint8)
+        pixels[..., 3] = 255
+    return BaseMesh(
+        points,
+        faces,
+        uv=uv,
+        face_texture=np.zeros(4, np.int32),
+        textures=(Texture(pixels, ("clamp", "clamp")),),
+        up=(0, -1, 0),
+        origin=np.array(origin, float),
+    )
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+@pytest.mark.parametrize("origin", [(0, 0, 0), (5e5, 4.5e6, 100)])
+def test_a_texture_comes_back(tmp_path, suffix, origin):
+    base = tetrahedron(origin=origin)
+    save_base(base, tmp_path / f"a{suffix}")
+    again = load_base(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(again.vertices[again.faces], base.vertices[base.faces], atol=1e-6)
+    np.testing.assert_allclose(again.uv, base.uv, atol=1e-6)
+    np.testing.assert_array_equal(again.textures[0].pixels, base.textures[0].pixels)
+    np.testing.assert_allclose(again.up, base.up, atol=1e-6)
+    np.testing.assert_array_equal(again.origin, base.origin)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply", ".npz", pytest.param(".usdc", marks=needs_usd)])
+def test_colours_of_vertices_come_back(tmp_path, suffix):
+    base = tetrahedron(textured=False)
+    save_base(base, tmp_path / f"a{suffix}")
+    mesh = load_mesh(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(mesh.vertices, base.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, base.faces)
+    np.testing.assert_allclose(mesh.colors, base.colors, atol=1e-3)
+    np.testing.assert_allclose(mesh.up, base.up, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
+def test_another_library_reads_the_texture(tmp_path, suffix):
+    trimesh = pytest.importorskip("trimesh")
+    base = tetrahedron()
+    save_base(base, tmp_path / f"a{suffix}")
+    mesh = trimesh.load(tmp_path / f"a{suffix}", force="mesh", process=False)
+    assert len(mesh.faces) == 4
+    material = mesh.visual.material
+    picture = material.baseColorTexture if suffix == ".glb" else material.image
+    colors = np.asarray(picture.convert("RGB")).astype(int)
+    np.testing.assert_array_equal(colors, base.textures[0].pixels[..., :3])
+    corners = mesh.visual.uv[mesh.faces]  # its v is up
+    places = np.stack([corners[..., 0], 1 - corners[..., 1]], axis=2)
+    np.testing.assert_allclose(places, base.uv, atol=1e-6)
+    whole = trimesh.load(tmp_path / f"a{suffix}", force="mesh")
+    whole.merge_vertices(merge_tex=True, merge_norm=True)
+    assert whole.is_watertight
+    assert whole.volume == pytest.approx(1)
+
+
+@needs_usd
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
+def test_usd_names_the_texture(tmp_path, suffix):
+    from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils
+
+    base = tetrahedron()
+    save_base(base, tmp_path / f"a{suffix}")
+    stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
+    mesh = UsdGeom.Mesh(next(p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)))
+    np.testing.assert_array_equal(np.array(mesh.GetPointsAttr().Get()), base.vertices)
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get()).reshape(-1, 3, 2)
+    np.testing.assert_allclose(np.stack([st[..., 0], 1 - st[..., 1]], axis=2), base.uv, atol=1e-6)
+    texture = UsdShade.Shader(stage.GetPrimAtPath("/Splats/Material/Texture"))
+    path = texture.GetInput("file").Get()
+    assert path.resolvedPath
+    assert not UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(tmp_path / f"a{suffix}")))[2]
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == ({f"a{suffix}"} if suffix == ".usdz" else {f"a{suffix}", "a.png"})
+
+
+def test_prints_are_solids_in_millimetres_with_z_up(tmp_path):
+    base = tetrahedron(origin=(1e6, 0, 0))
+    for suffix in (".stl", ".3mf"):
+        save_base(base, tmp_path / f"a{suffix}")
+    data = (tmp_path / "a.stl").read_bytes()
+    assert struct.unpack_from("<I", data, 80) == (4,)
+    kind = np.dtype([("n", "<f4", 3), ("p", "<f4", (3, 3)), ("unused", "<u2")])
+    rows = np.frombuffer(data, kind, offset=84)
+    with zipfile.ZipFile(tmp_path / "a.3mf") as package:
+        model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+    space = {"m": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"}
+    assert model.get("unit") == "millimeter"
+    points = np.array([[float(v.get(k)) for k in "xyz"] for v in model.iterfind(".//m:vertex", space)])
+    triangles = model.iterfind(".//m:triangle", space)
+    faces = np.array([[int(t.get(k)) for k in ("v1", "v2", "v3")] for t in triangles])
+    np.testing.assert_allclose(rows["p"], points[faces], atol=1e-6)
+    assert points.min() == 0
+    # Up is -y: what is lowest along it ends at the top.
+    np.testing.assert_allclose(points[:, 2], 2 - base.vertices[:, 1], atol=1e-6)
+    corners = points[faces]
+    assert np.linalg.det(corners).sum() / 6 == pytest.approx(1), "no mirror image"
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(rows["n"], normals / np.linalg.norm(normals, axis=1)[:, None], atol=1e-6)
+
+
+def test_large_textures_are_jpeg_unless_asked_otherwise(tmp_path):
+    base = tetrahedron(noise=True)
+    found = {}
+    for name, image in (("default", None), ("png", "png"), ("webp", "webp")):
+        save_base(base, tmp_path / f"{name}.glb", image=image)
+        data = (tmp_path / f"{name}.glb").read_bytes()
+        (length,) = struct.unpack_from("<I", data, 12)
+        document = json.loads(data[20 : 20 + length])
+        found[name] = document["images"][0]["mimeType"]
+        assert ("EXT_texture_webp" in document.get("extensionsRequired", [])) == (name == "webp")
+        again = load_base(tmp_path / f"{name}.glb")
+        if name != "default":
+            np.testing.assert_array_equal(again.textures[0].pixels, base.textures[0].pixels)
+    assert found == {"default": "image/jpeg", "png": "image/png", "webp": "image/webp"}
+
+
+@pytest.mark.parametrize("unlit", [False, True])
+def test_materials(tmp_path, unlit):
+    save_base(tetrahedron(), tmp_path / "a.glb", unlit=unlit)
+    data = (tmp_path / "a.glb").read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + length])
+    material = document["materials"][0]
+    assert ("KHR_materials_unlit" in material.get("extensions", {})) == unlit
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert "NORMAL" in document["meshes"][0]["primitives"][0]["attributes"]
+
+
+def test_what_cannot_be_written(tmp_path):
+    base, plain = tetrahedron(), tetrahedron(textured=False)
+    both = BaseMesh(
+        base.vertices,
+        base.faces,
+        uv=base.uv,
+        face_texture=[0, 1, 0, 1],
+        textures=(*base.textures, *base.textures),
+    )
+    for mesh, name, options, message in [
+        (base, "a.fbx", {}, "choose a name that ends in .glb"),
+        (base, "a.obj", {"unlit": True}, "unlit applies to"),
+        (base, "a.glb", {"image": "gif"}, "image must be one of"),
+        (plain, "a.glb", {"image": "png"}, "with a texture"),
+        (base, "a.stl", {"image": "png"}, "with a texture"),
+        (BaseMesh(np.zeros((0, 3)), np.zeros((0, 3), int)), "a.glb", {}, "no faces"),
+        (both, "a.glb", {}, "one texture on all faces"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            save_base(mesh, tmp_path / name, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_beside_are_those_that_are_named(tmp_path):
+    for suffix in BASE_SUFFIXES:
+        if suffix.startswith(".usd") and importlib.util.find_spec("pxr") is None:
+            continue
+        folder = tmp_path / suffix[1:]
+        folder.mkdir()
+        save_base(tetrahedron(), folder / f"a{suffix}")
+        assert {p.name for p in folder.iterdir()} - {f"a{suffix}"} <= {
+            p.name for p in companions(folder / f"a{suffix}")
+        }
+
+
+def test_a_failure_leaves_nothing(tmp_path, monkeypatch):
+    import meshsplats.formats.surfaces.text as text
+
+    def broken(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(text, "smooth_normals", broken)
+    for suffix in (".obj", ".ply"):
+        with pytest.raises(OSError, match="disk full"):
+            save_base(tetrahedron(), tmp_path / f"a{suffix}")
+    assert list(tmp_path.iterdir()) == []
