@@ -124,12 +124,15 @@ def test_what_an_image_is_compared_with():
     camera = cameras(1, 8)[0]
     color, alpha = np.full((8, 8, 3), 0.2, np.float32), np.full((8, 8), 0.5, np.float32)
     for number, background in enumerate((1.0, 0.0, 0.5, 1.0)):
-        target, behind, counts = target_of(View(camera, ViewImage(color, alpha)), number)
+        target, behind, counts, solid = target_of(View(camera, ViewImage(color, alpha)), number)
+        assert solid.all()
         np.testing.assert_allclose(target, 0.2 + 0.5 * background)
         np.testing.assert_array_equal(behind, np.full(3, background))
         assert counts.all()
     mask = np.zeros((8, 8), bool)
-    target, behind, counts = target_of(View(camera, ViewImage(color, mask=mask)))
+    assert not target_of(View(camera, ViewImage(color, 0.9 * alpha))).solid.any()
+    target, behind, counts, solid = target_of(View(camera, ViewImage(color, mask=mask)))
+    assert solid.all()
     np.testing.assert_array_equal(target, behind)
     assert not counts.any()
 

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from conftest import shared_data
 
-from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, psnr, save_gaussians
+from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, look_at, psnr, save_gaussians
 from meshsplats.cli import main
 from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
 from meshsplats.surfaces import make_surface
 from meshsplats.surfaces.fusion import isosurface
+from meshsplats.surfaces.holes import close_holes
 
 QUICK = {"texture": 0, "rounds": 0, "views": 24, "size": 96, "resolution": 32, "threads": 1}
 needs_extra = pytest.mark.skipif(
@@ -226,3 +227,63 @@ def test_a_base_of_real_splats_looks_like_them():
     mesh = bind(base).mesh
     for camera in orbit(cloud, 2, width=96, height=96):
         assert psnr(render(mesh, camera).color, render_splats(cloud, camera).color) > 17
+
+
+def test_small_holes_are_closed_and_the_rim_stays():
+    # A plate of 20 x 20 squares, of which some are missing.
+    x, y = np.meshgrid(np.arange(21.0), np.arange(21.0), indexing="ij")
+    vertices = np.stack([x, y, 0 * x], axis=2).reshape(-1, 3)
+    number = np.arange(441).reshape(21, 21)
+    a, b, c, d = (n.ravel() for n in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+    faces = np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 3).astype(np.int32)
+    gone = np.zeros((20, 20), bool)
+    gone[5, 5] = gone[10, 4] = gone[15, 15] = True
+    kept = faces[~gone.ravel().repeat(2)]
+    kept = np.delete(kept, len(kept) // 3, axis=0)  # and a single triangle
+    points, whole = close_holes(vertices, kept)
+    corners = points[whole]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normals[:, 2] > 0).all(), "all face the same side"
+    assert normals[:, 2].sum() / 2 == pytest.approx(400)
+    assert open_edges(whole) == 80
+    same = close_holes(vertices, faces)
+    np.testing.assert_array_equal(same[1], faces)
+    far = np.zeros((20, 20), bool)
+    far[3:17, 3:17] = True
+    large = faces[~far.ravel().repeat(2)]
+    assert len(close_holes(vertices, large)[1]) == len(large)
+
+
+def wall(side: float = 2.0, n: int = 12) -> SplatMesh:
+    """An opaque square that looks along -z, with a pattern."""
+    x, y = np.meshgrid(np.linspace(-side, side, n + 1), np.linspace(-side, side, n + 1), indexing="ij")
+    points = np.stack([x, y, 0 * x], axis=2).reshape(-1, 3)
+    number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = (k.ravel() for k in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+    faces = np.concatenate([np.stack(t, 1) for t in ((a, c, b), (a, d, c))])
+    colors = np.column_stack([0.5 + 0.4 * np.sin(3 * points[:, :2]), np.full((len(points), 2), [0.3, 1.0])])
+    return SplatMesh(points, faces, colors)
+
+
+@needs_extra
+def test_a_wall_that_is_seen_from_one_side_is_open():
+    mesh = wall()
+    cameras = [
+        look_at((x, y, -4), (0, 0, 0), up=(0, -1, 0), width=96, height=96, fov=50)
+        for x in (-1.0, 0, 1)
+        for y in (-1.0, 0, 1)
+    ]
+    options = {**QUICK, "resolution": 48}
+    base = make_surface(mesh, cameras=cameras, shape="open", **options)
+    assert np.abs(base.vertices[:, 2]).max() < 0.25
+    inner = np.abs(base.vertices[:, :2]).max(axis=1) < 1.3
+    assert np.abs(base.vertices[inner, 2]).max() < 0.05
+    corners = base.vertices[base.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert open_edges(base.faces) > 0
+    facing = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    inside = inner[base.faces].all(axis=1)
+    assert (facing[inside] < -0.9).mean() > 0.99, "towards the cameras"
+    # Closed, the same is a slab.
+    solid = make_surface(mesh, cameras=cameras, shape="closed", **options)
+    assert open_edges(solid.faces) == 0

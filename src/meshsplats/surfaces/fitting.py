@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,8 @@ ROBUST = 0.1
 """Error of a pixel, in units of 1, from which it counts for a texture by its size only: highlights that few
 views see, and what lies before the surface, do not stay in it."""
 BACKGROUNDS = 1.0, 0.0, 0.5
+_SOLID = 0.5
+"""Opacity of an image from which its colour is that of a surface."""
 _WHOLE = 0.99
 """Coverage of a pixel that shows nothing but the surface."""
 _SEED = 7
@@ -69,9 +72,9 @@ def mean_colors(
     """The surface with the mean of the images' colours at each texel; unseen ones are filled."""
     sums = np.zeros((*surface.texels.shape[:2], 4), np.float32)
     for view in views:
-        target, background, counts = target_of(view)
+        target, background, counts, solid = target_of(view)
         image = SurfaceImage(surface, view.camera, background, gradients=False, threads=threads)
-        sums += image.texel_sums(target, counts * (image.coverage > _WHOLE))
+        sums += image.texel_sums(target, counts * solid * (image.coverage > _WHOLE))
         if progress is not None:
             progress()
     weight = sums[..., 3]
@@ -106,7 +109,7 @@ def fit(
     edge = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
     total = rounds * len(views)
     for number, index in enumerate(np.concatenate([rng.permutation(len(views)) for _ in range(rounds)])):
-        target, background, counts = target_of(views[index], number)
+        target, background, counts, solid = target_of(views[index], number)
         image = SurfaceImage(surface, views[index].camera, background, gradients=move > 0, threads=threads)
         error = (image.color - target) * counts[..., None]
         vertices = surface.vertices
@@ -115,6 +118,7 @@ def fit(
             vertices = steps.step(slope, move * edge * 0.1 ** (number / total))
         weight = (
             counts
+            * solid
             * (image.coverage > _WHOLE)
             * np.minimum(1, ROBUST / np.maximum(np.abs(error).max(2), ROBUST))
         )
@@ -127,18 +131,31 @@ def fit(
     return surface
 
 
-def target_of(view: View, number: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the image of a surface is compared with: the target (h, w, 3), the background (3,) or (h, w, 3),
-    and (h, w) which pixels count, 0 or 1; all float32.
+class Target(NamedTuple):
+    """What the image of a surface is compared with, float32."""
+
+    color: np.ndarray
+    """(h, w, 3)."""
+    background: np.ndarray
+    """(3,) or (h, w, 3): what is behind the surface."""
+    counts: np.ndarray
+    """(h, w): which pixels count, 0 or 1."""
+    solid: np.ndarray
+    """(h, w): which of them show something solid, 0 or 1."""
+
+
+def target_of(view: View, number: int = 0) -> Target:
+    """What the image of a surface is compared with in step ``number``.
 
     Images with alpha lie on white, black and grey in turn, so that there is an outline on one of them. Behind
     the surface, photographs show themselves: what it does not cover is no error.
     """
     image = view.load()
-    height, width = image.color.shape[:2]
-    counts = np.ones((height, width), np.float32) if image.mask is None else image.mask.astype(np.float32)
-    if image.alpha is None:
+    everywhere = np.ones(image.color.shape[:2], np.float32)
+    counts = everywhere if image.mask is None else image.mask.astype(np.float32)
+    alpha = view.alpha
+    if alpha is None:
         target = image.over()
-        return target, target, counts
+        return Target(target, target, counts, everywhere)
     background = np.full(3, BACKGROUNDS[number % len(BACKGROUNDS)], np.float32)
-    return image.over(background), background, counts
+    return Target(image.over(background), background, counts, (alpha >= _SOLID).astype(np.float32))

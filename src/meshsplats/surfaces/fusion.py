@@ -26,6 +26,10 @@ _OUTLIERS = 0.002
 """Share of the opacity that may lie beyond each side of the box, so that floaters do not enlarge it."""
 _MARGIN = 0.05
 """Margin around the box, relative to its longest side."""
+_CLOSE = 0.9
+"""Distance before a surface, in units of the truncation, from which there must be something behind."""
+_GAP = 3
+"""Points across which gaps in a surface are closed."""
 MIN_PART = 0.01
 """Connected parts with a smaller volume, relative to the largest part, are removed."""
 
@@ -68,11 +72,28 @@ def signed_distances(
     seen = weight > 0
     np.divide(total, weight, out=total, where=seen)
     total[~seen] = np.nan if unseen is None else unseen
-    if unseen is not None:
+    if unseen is None:
+        close_gaps(total)
+    else:
         for axis in range(3):
             sides = np.moveaxis(total, axis, 0)
             sides[0] = sides[-1] = 1
     return total
+
+
+def close_gaps(field: np.ndarray) -> None:
+    """Gives points without a distance (NaN), but near points close before a surface, one behind it, in place:
+    cameras that disagree on where a surface is leave none that lies behind it for all of them."""
+    close = field < _CLOSE
+    near = close.copy()
+    for _ in range(_GAP):
+        grown = near.copy()
+        for axis in range(3):
+            for ahead in (slice(1, None), slice(None, -1)):
+                back = slice(None, -1) if ahead.start else slice(1, None)
+                np.moveaxis(grown, axis, 0)[ahead] |= np.moveaxis(near, axis, 0)[back]
+        near = grown
+    field[np.isnan(field) & near] = -_CLOSE
 
 
 def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarray]:

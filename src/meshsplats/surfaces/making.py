@@ -24,6 +24,7 @@ from meshsplats.surfaces.atlas import cells, cells_side, unwrap
 from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors
 from meshsplats.surfaces.fusion import grid_around, isosurface, libraries, signed_distances
+from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
 from meshsplats.surfaces.options import SurfaceOptions
 from meshsplats.surfaces.views import Sources, smaller, sources_of
@@ -149,6 +150,8 @@ def _fused(
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
+    if not sources.closed:
+        vertices, faces = close_holes(vertices, faces)
     return grid.low + grid.voxel * vertices, faces
 
 
