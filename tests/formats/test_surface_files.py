@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import struct
+import subprocess
 import zipfile
 from xml.etree import ElementTree
 
@@ -208,3 +209,23 @@ def test_a_failure_leaves_nothing(tmp_path, monkeypatch):
         with pytest.raises(OSError, match="disk full"):
             save_base(tetrahedron(), tmp_path / f"a{suffix}")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_validator_finds_nothing(tmp_path, node_package):
+    folder = node_package("gltf-validator")
+    script = (
+        "const v=require('gltf-validator'),fs=require('fs');"
+        "v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1]))).then("
+        "r=>console.log(JSON.stringify(r.issues)))"
+    )
+    cases = [
+        (tetrahedron(), {}),
+        (tetrahedron(noise=True), {}),
+        (tetrahedron(origin=(5e5, 4.5e6, 100)), {"unlit": True}),
+        (tetrahedron(textured=False), {}),
+    ]
+    for base, options in cases:
+        save_base(base, tmp_path / "m.glb", **options)
+        command = ["node", "-e", script, str(tmp_path / "m.glb")]
+        issues = json.loads(subprocess.run(command, cwd=folder, capture_output=True, check=True).stdout)
+        assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]

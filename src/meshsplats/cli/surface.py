@@ -26,6 +26,7 @@ from meshsplats.cli.common import (
     SplatOptions,
     load_scene,
     size_of,
+    views_of_a_place,
     written,
 )
 from meshsplats.cli.messages import UsageError, command_line
@@ -115,7 +116,10 @@ class Surface(Command):
             save_base(written(placed, self.origin), self.output, unlit=self.unlit, image=self.image)
             write_configuration(config, "surface", self)
             if not self.no_preview:
-                save_image(preview, draw_surface(base, preview_camera(scene), threads=self.threads))
+                camera = preview_camera(scene)
+                lens = {"width": camera.width, "height": camera.height, "up": None}
+                found = views_of_a_place(scene, 1, lens) if options.shape != "closed" else None
+                save_image(preview, draw_surface(base, found[0] if found else camera, threads=self.threads))
         seconds, count = time.perf_counter() - start, len(base.faces)
         if self.json:
             result = {"mesh": str(self.output), "triangles": count, "bytes": self.output.stat().st_size}
