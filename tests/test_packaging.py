@@ -173,7 +173,8 @@ def scene_file(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("page", ["docs/commands.md", "README.md"])
 def test_commands_of_the_documents_work(page, scene_file, tmp_path, monkeypatch, capsys):
     """One after the other in one folder, on a small scene and with small images."""
-    pytest.importorskip("skimage", reason="base needs its extra: pip install 'meshsplats[base]'")
+    for name in ("skimage", "uvunwrap"):
+        pytest.importorskip(name, reason="surface needs its extra: pip install 'meshsplats[base]'")
     lines = "".join(code_blocks(ROOT / page, "sh")).replace("\\\n", " ").splitlines()
     commands = [shlex.split(line, comments=True) for line in lines if line.startswith("meshsplats ")]
     # blender needs an environment of its own, where tests/blender runs it; demo runs some of these commands.

@@ -36,6 +36,7 @@ PACKAGES = [
     "scikit-image>=0.22,<0.26",
     "scipy<1.16",
     "fast-simplification>=0.1.7",
+    "uvunwrap>=0.3",
 ]
 LAUNCHER = """
 #include <windows.h>
