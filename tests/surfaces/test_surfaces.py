@@ -19,6 +19,7 @@ from meshsplats.prior import bind
 from meshsplats.surfaces import make_surface
 from meshsplats.surfaces.fusion import isosurface
 from meshsplats.surfaces.holes import close_holes
+from meshsplats.surfaces.manifold import split_pinches
 
 QUICK = {"texture": 0, "rounds": 0, "views": 24, "size": 96, "resolution": 32, "threads": 1}
 needs_extra = pytest.mark.skipif(
@@ -287,3 +288,59 @@ def test_a_wall_that_is_seen_from_one_side_is_open():
     # Closed, the same is a slab.
     solid = make_surface(mesh, cameras=cameras, shape="closed", **options)
     assert open_edges(solid.faces) == 0
+
+
+def box(low) -> tuple[np.ndarray, np.ndarray]:
+    """A unit cube, facing out."""
+    points = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return points + low, np.array(faces, np.int32)
+
+
+def uses_of_edges(faces) -> list[int]:
+    """How many triangles the edges have, each number once."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return sorted(set(np.unique(edges, axis=0, return_counts=True)[1].tolist()))
+
+
+def joined(parts) -> tuple[np.ndarray, np.ndarray]:
+    """Meshes as one, with vertices at one place as one."""
+    points = np.concatenate([p for p, _ in parts])
+    counts = np.cumsum([0, *(len(p) for p, _ in parts)])
+    faces = np.concatenate([f + n for (_, f), n in zip(parts, counts, strict=False)])
+    places, index = np.unique(points, axis=0, return_inverse=True)
+    return places, index.reshape(-1)[faces].astype(np.int32)
+
+
+@needs_extra
+def test_solids_that_touch_at_an_edge_are_two():
+    points, faces = joined([box((0, 0, 0)), box((1, 1, 0))])
+    assert uses_of_edges(faces) == [2, 4]
+    split, apart = split_pinches(points, faces)
+    assert uses_of_edges(apart) == [2]
+    assert len(split) == 16, "the inside of each cube stays together"
+    np.testing.assert_array_equal(split[apart], points[faces])
+    # A ring of cubes that closes at an edge: its sheets meet at both ends of that edge, too.
+    ring = [(0, 0, 0), (1, 1, 0), (0, 0, 1), (1, 1, 1), (0, 1, 2)]
+    points, faces = joined([box(low) for low in ring])
+    split, apart = split_pinches(points, faces)
+    assert uses_of_edges(apart) == [2]
+    assert open_edges(apart) == 0
+    assert volume(split, apart) == pytest.approx(5)
+
+
+@needs_extra
+@pytest.mark.parametrize("seed", range(6))
+def test_collapsed_surfaces_become_manifold(seed):
+    rng = np.random.default_rng(seed)
+    field = rng.normal(size=(14, 14, 14))
+    for axis in range(3):
+        field = (np.roll(field, 1, axis) + field + np.roll(field, -1, axis)) / 3
+        sides = np.moveaxis(field, axis, 0)
+        sides[0] = sides[-1] = 0.5
+    vertices, faces = isosurface(field.astype(np.float32), 300)
+    split, apart = split_pinches(vertices, faces)
+    assert uses_of_edges(apart) == [2]
+    assert open_edges(apart) == 0
+    assert volume(split, apart) == pytest.approx(volume(vertices, faces), abs=1e-6)

@@ -26,6 +26,7 @@ from meshsplats.surfaces.fitting import fit, mean_colors
 from meshsplats.surfaces.fusion import grid_around, isosurface, libraries, signed_distances
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
+from meshsplats.surfaces.manifold import split_pinches
 from meshsplats.surfaces.options import SurfaceOptions
 from meshsplats.surfaces.views import Sources, smaller, sources_of
 
@@ -150,8 +151,7 @@ def _fused(
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
-    if not sources.closed:
-        vertices, faces = close_holes(vertices, faces)
+    vertices, faces = (split_pinches if sources.closed else close_holes)(vertices, faces)
     return grid.low + grid.voxel * vertices, faces
 
 
