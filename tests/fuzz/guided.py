@@ -8,9 +8,9 @@ changed further.
 
 A target is one file of a seed of ``fuzz_readers.py``; NAME/inside is what is inside its compression, with
 the compression made anew around it. Each input gives what the reader reads, or an error that it promises
-(``Seed.errors``), within 10 s and 2 GB. Findings are kept and named; the exit status is 1 if there is one.
---corpus keeps what was reached for the next run. --inputs, in place of a time, tries the same inputs each
-time.
+(``Seed.errors``), within --seconds and 2 GB. Findings are kept and named; the exit status is 1 if there is
+one. --corpus keeps what was reached for the next run. --inputs, in place of a time, tries the same inputs
+each time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ import meshsplats
 sys.path[:0] = [str(Path(__file__).parents[1] / part) for part in ("", "formats", "core", "rendering")]
 
 PACKAGE = str(Path(meshsplats.__file__).parent)
-SECONDS, MEGABYTES, MAX_BYTES = 10, 2048, 1 << 16
+MEGABYTES, MAX_BYTES = 2048, 1 << 16
 """Limits of one input."""
 OPAQUE = (".png", ".webp")
 """Parsed by Pillow alone."""
@@ -132,12 +132,12 @@ def outcome(name: str, code: int | None, printed: str) -> tuple[int, list[Path]]
 
 
 def fuzz_all(
-    chosen: dict[str, Target], limit: str, corpus: Path, keep: Path, scratch: Path
+    chosen: dict[str, Target], limits: list[str], corpus: Path, keep: Path, scratch: Path
 ) -> tuple[int, int]:
     """The numbers of inputs and of findings of all targets. Each is a process of its own, as many at a time
-    as there are processors: forks of this one, so that readers are imported and instrumented once. ``limit``:
-    libFuzzer's."""
-    flags = [limit, f"-timeout={SECONDS}", f"-rss_limit_mb={MEGABYTES}", f"-max_len={MAX_BYTES}"]
+    as there are processors: forks of this one, so that readers are imported and instrumented once.
+    ``limits``: libFuzzer's."""
+    flags = [*limits, f"-rss_limit_mb={MEGABYTES}", f"-max_len={MAX_BYTES}"]
     flags += ["-print_final_stats=1", "-seed=1"]
     for start, read, _ in chosen.values():
         read(start)  # imports the reader
@@ -177,6 +177,9 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60, help="for all targets together (default: 60)")
     parser.add_argument("--inputs", type=int, help="for each target, in place of a time")
     parser.add_argument(
+        "--seconds", type=int, default=10, help="for one input; more where the machine is busy (default: 10)"
+    )
+    parser.add_argument(
         "--corpus", type=Path, help="folder of inputs that reach new lines (default: not kept)"
     )
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "meshsplats-fuzz")
@@ -194,9 +197,10 @@ def main() -> int:
                 read(options.replay.read_bytes())
             return 0
         seconds = max(1, round(60 * options.minutes * (os.cpu_count() or 1) / len(chosen)))
-        limit = f"-runs={options.inputs}" if options.inputs else f"-max_total_time={seconds}"
+        limits = [f"-runs={options.inputs}" if options.inputs else f"-max_total_time={seconds}"]
+        limits += [f"-timeout={options.seconds}", f"-report_slow_units={options.seconds}"]
         corpus = options.corpus or Path(scratch) / "corpus"
-        counts, findings = fuzz_all(chosen, limit, corpus, options.keep, Path(scratch) / "runs")
+        counts, findings = fuzz_all(chosen, limits, corpus, options.keep, Path(scratch) / "runs")
     print(f"{counts:,} inputs to {len(chosen)} targets, {findings} findings")
     return 1 if findings else 0
 
