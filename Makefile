@@ -175,7 +175,7 @@ core_tests = -m pytest --capture=sys -k 'not ($(CORE_TESTS_LEFT_OUT))' \
 
 test-sanitizers: test-memory test-threads
 test-memory: $(VENV)/installed-dev $(SANITIZED)/address.so
-	$(call sanitized,libasan.so,address) $(core_tests) $(PARALLEL)
+	$(call sanitized,libasan.so,address) $(core_tests) $(PARALLEL) --max-worker-restart 0
 test-threads: $(VENV)/installed-dev $(SANITIZED)/thread.so
 	$(call sanitized,libtsan.so,thread) $(core_tests) -k 'threads'
 
