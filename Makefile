@@ -6,6 +6,9 @@ DEMO ?= demo-output
 PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 10))' 2>/dev/null && echo $$name && break; done)
 
+# Else each of the processes that tests start compiles the package anew, for half a second.
+unexport PYTHONDONTWRITEBYTECODE
+
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 CORE_SOURCES := $(wildcard src/meshsplats/csrc/*.h src/meshsplats/csrc/*.cpp)
@@ -51,8 +54,8 @@ CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help dawn demo fuzz fuzz-core test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
-	release docs lint format clean
+.PHONY: help dawn demo fuzz fuzz-core test test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
+	test-memory test-threads test-windows test-arm64 wheels release docs lint format clean
 .DEFAULT_GOAL := help
 
 help:
@@ -91,8 +94,9 @@ demo: $(VENV)/installed
 	$(BIN)/meshsplats demo -o $(DEMO) --force
 
 # A worker for each processor; each takes whole files, whose tests share what they make.
+PARALLEL := --numprocesses auto --dist loadfile
 test: $(VENV)/installed-dev dawn
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest $(PARALLEL)
 
 # Chromium's compiler of WGSL, for tests/webgpu/test_dawn.py: 130 MB. Without npm, these tests are skipped.
 DAWN := build/dawn
@@ -117,12 +121,18 @@ $(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
 	@echo 'Installing the lowest versions into $(@D) with $(LOWEST_PYTHON)'
 	@test -x $(@D)/bin/python || $(LOWEST_PYTHON) -m venv $(@D)
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --only-binary :all: \
-	  --constraint lowest-constraints.txt pytest hypothesis $(<D)/*.whl
+	  --constraint lowest-constraints.txt pytest pytest-xdist hypothesis $(<D)/*.whl
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --force-reinstall --no-deps $(<D)/*.whl
 	@touch $@
 
+# Left out is what does not depend on the versions: what Chromium and Dawn draw and compile, the rules of this
+# repository, and real scenes, which go through the same lines as small ones.
+LOWEST_LEFT_OUT := $(addprefix viewer/test_,compilers.py controls.py docs_page.py exact.py screens.py \
+	shader_of_docs.py) webgpu/test_dawn.py test_benchmarks.py test_compare_commits.py test_house.py test_rooms.py
+
 test-lowest: $(LOWEST_VENV)/installed
-	$(LOWEST_VENV)/bin/python -m pytest
+	MESHSPLATS_SHARED_DATA=left-out $(LOWEST_VENV)/bin/python -m pytest $(PARALLEL) \
+	  $(LOWEST_LEFT_OUT:%=--ignore=tests/%)
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
 $(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')
@@ -138,12 +148,12 @@ $(BLENDER_VENV)/%/installed: build/wheel/made
 	  || echo 'Mitsuba cannot be installed here: the test that compares it with Cycles is skipped'
 	@touch $@
 
-test-blender: $(BPY:%=$(BLENDER_VENV)/%/installed)
-	@for version in $(BPY); do \
-	  echo "Blender $$version"; \
-	  MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$$version/bin/python -m pytest \
-	    tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py || exit 1; \
-	done
+BLENDER_TESTS := $(BPY:%=test-blender-%)
+test-blender: $(BLENDER_TESTS)
+$(BLENDER_TESTS): test-blender-%: $(BLENDER_VENV)/%/installed
+	@echo 'Blender $*'
+	@MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$*/bin/python -m pytest \
+	  tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py
 
 $(SANITIZED)/address.so: SANITIZERS := address,undefined,float-cast-overflow
 $(SANITIZED)/thread.so: SANITIZERS := thread
@@ -163,8 +173,10 @@ sanitized = LD_PRELOAD="$$($(SANITIZER_CXX) -print-file-name=$(1)) $$($(SANITIZE
 core_tests = -m pytest --capture=sys -k 'not ($(CORE_TESTS_LEFT_OUT))' \
 	$(foreach name,$(CORE_TESTS),$(or $(shell find tests -name $(name).py),tests/$(name).py))
 
-test-sanitizers: $(VENV)/installed-dev $(SANITIZED)/address.so $(SANITIZED)/thread.so
-	$(call sanitized,libasan.so,address) $(core_tests)
+test-sanitizers: test-memory test-threads
+test-memory: $(VENV)/installed-dev $(SANITIZED)/address.so
+	$(call sanitized,libasan.so,address) $(core_tests) $(PARALLEL) --max-worker-restart 0
+test-threads: $(VENV)/installed-dev $(SANITIZED)/thread.so
 	$(call sanitized,libtsan.so,thread) $(core_tests) -k 'threads'
 
 $(WHEELS_VENV)/installed: tools/requirements.txt

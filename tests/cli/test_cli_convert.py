@@ -437,8 +437,8 @@ def test_an_order_for_viewers_that_cull(tmp_path, capsys):
         ),
     ],
 )
-def test_what_an_order_does_not_go_with(tmp_path, capsys, options, message):
-    save_gaussians(nested_balls(0.95), tmp_path / "balls.ply")
+def test_what_an_order_does_not_go_with_is_said_before_the_input_is_read(tmp_path, capsys, options, message):
+    (tmp_path / "balls.ply").write_bytes(b"not splats")
     assert run(tmp_path / "balls.ply", "-o", tmp_path / "m.glb", *options) != 0
     assert message in capsys.readouterr().err
     assert not (tmp_path / "m.glb").exists()

@@ -8,6 +8,7 @@ import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
@@ -26,6 +27,10 @@ run programs, here or on a cluster, and --json, --resume and --skip-existing bel
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """Tables and keys of a configuration file. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed, tyro.conf.FlagCreatePairsOff)
+# Without the docstrings of fields, whose reading takes half of the time of parsing; --help has them from
+# ``_described``.
+_PARSED = (*_MARKERS, tyro.conf.HelptextFromCommentsOff)
+_FILLED = (*_PARSED[:2], tyro.conf.HelptextFromCommentsOff)  # --no-FLAG clears a flag that the file sets
 
 
 class Command:
@@ -97,7 +102,7 @@ def _parsed(command: type[C], prog: str, line: Line) -> C:
     flags = {word.partition("=")[0] for word in line.words if word[:2] == "--"}
     _refuse_flags_of_settings(command, flags)
     if line.config is None and not line.settings:
-        return tyro.cli(command, prog=prog, args=line.words, config=_MARKERS)
+        return tyro.cli(command, prog=prog, args=line.words, config=_PARSED)
     name = prog.rpartition(" ")[2]
     given = _read_settings(command, line.settings, flags, name)
     values: dict[str, Any] = {}
@@ -109,13 +114,11 @@ def _parsed(command: type[C], prog: str, line: Line) -> C:
     for group in command.EXCLUSIVE:
         if any(flag(option) in flags or option in given for option in group):
             values = {option: value for option, value in values.items() if option not in group}
-    # --no-FLAG clears a flag that the file sets.
     default = _filled(command, values | given)
-    return tyro.cli(command, prog=prog, args=line.words, default=default, config=_MARKERS[:2])
+    return tyro.cli(command, prog=prog, args=line.words, default=default, config=_FILLED)
 
 
-def options_of(command: type) -> dict[str, Option]:
-    """The options of ``command`` by their names, those of its groups included."""
+def _find_options(command: type) -> Mapping[str, Option]:
     found: dict[str, Option] = {}
     hints, marked = get_type_hints(command), get_type_hints(command, include_extras=True)
     for part in fields(command):
@@ -127,7 +130,11 @@ def options_of(command: type) -> dict[str, Option]:
         elif hint is not object:
             has_flag = tyro.conf.Fixed not in getattr(marked[part.name], "__metadata__", ())
             found[part.name] = Option((part.name,), hint, has_flag)
-    return found
+    return types.MappingProxyType(found)
+
+
+options_of: Callable[[type], Mapping[str, Option]] = lru_cache(_find_options)
+"""The options of a command by their names, those of its groups included."""
 
 
 def spelled(command: type, name: str) -> str:

@@ -70,7 +70,7 @@ from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.jobs import Job, is_batch, jobs, sources, without_results
 from meshsplats.mesh import SplatMesh, checked_cutoff
-from meshsplats.rendering.ordering import NODES
+from meshsplats.rendering.ordering import NODES, check_nodes
 
 _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
@@ -262,6 +262,8 @@ class Convert(Command):
             raise UsageError("--set nodes and quick are for --alpha ordered")
         if self.alpha == "ordered" and (self.lit or self.compression != "none"):
             raise UsageError("--alpha ordered goes with neither --lit nor --compression")
+        if self.nodes is not None:
+            check_nodes(self.nodes)
         if self.data is not None and self.cameras is not None:
             raise UsageError("give --cameras or --data, not both")
         if self.missing != "error" and self.data is None:

@@ -94,6 +94,12 @@ def pieces_of(mesh: SplatMesh) -> Pieces:
     return Pieces(piece, turned, np.stack(sums, axis=1), normals, total / 2, numbers // PLANES)
 
 
+def check_nodes(nodes: int | Literal["auto"]) -> None:
+    """ValueError for a number of parts that no order can have."""
+    if nodes != "auto" and not (isinstance(nodes, (int, np.integer)) and 1 <= nodes <= MAX_NODES):
+        raise ValueError(f"nodes must be a number from 1 to {MAX_NODES}, or 'auto', got {nodes!r}")
+
+
 def drawing_order(
     mesh: SplatMesh,
     cameras: Sequence[Camera] | None = None,
@@ -130,8 +136,7 @@ def drawing_order(
     need_all(Camera, optional=True, cameras=cameras)
     if not len(mesh.faces):
         raise ValueError("a mesh without triangles has no order")
-    if nodes != "auto" and not (isinstance(nodes, (int, np.integer)) and 1 <= nodes <= MAX_NODES):
-        raise ValueError(f"nodes must be a number from 1 to {MAX_NODES}, or 'auto', got {nodes!r}")
+    check_nodes(nodes)
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
         raise ValueError(f"threads must be at least 1, got {threads!r}")
     if cameras is not None and not len(cameras):
