@@ -1,8 +1,8 @@
 """What colours that depend on the view are worth and cost, by degree of the harmonics.
 
     python benchmarks/view_dependence.py --data ../shared/data
-    python benchmarks/view_dependence.py --data ../shared/data --splats capture.ply --steps 150
-    python benchmarks/view_dependence.py --data ../shared/data --splats capture.ply --steps 300 --opacity cutoff
+    python benchmarks/view_dependence.py --data ../shared/data --splats FILE --steps 150
+    python benchmarks/view_dependence.py --data ../shared/data --splats FILE --steps 300 --opacity cutoff
 
 PSNR of conversions against the splats with all their harmonics, look "area", in eight views from around, in
 both orders of blending, and of the splats themselves at that degree; processor milliseconds of shading, and
