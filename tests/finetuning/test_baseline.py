@@ -95,7 +95,7 @@ def test_part_of_the_way_of_plain_colours():
     assert start.harmonics is not None
     faint = 0.1 / np.abs(start.harmonics).max()
     start = replace(start, colors=start.colors.clip(0.4, 0.6), harmonics=faint * start.harmonics)
-    end = replace(start, colors=start.colors + [0.1, -0.1, 0, 0], harmonics=1.5 * start.harmonics)
+    end = replace(start, colors=start.colors + np.array([0.1, -0.1, 0, 0]), harmonics=1.5 * start.harmonics)
     cameras = orbit(start, 3, width=24, height=24)
     start, end = (replace(m, plain_colors=plain_colors_of(m, cameras)) for m in (start, end))
     for share in (0.25, 1.0):
