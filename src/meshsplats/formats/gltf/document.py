@@ -290,3 +290,7 @@ class GltfDocument:
 
 def _known(extension: str) -> bool:
     return extension in _READABLE or extension.startswith("KHR_materials_")
+
+
+def dict_or_empty(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}

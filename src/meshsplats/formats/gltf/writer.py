@@ -72,7 +72,7 @@ def write_glb(
             buffer. 'opaque' is for a mesh of ``cut_mesh``, which is solid: viewers ignore opacity. 'hybrid'
             writes triangles with three opaque corners as an 'opaque' primitive, and all others as a 'blend'
             primitive, the lowest first, as most views look down; without the arrays that only this project
-            reads. docs/viewers.md compares them.
+            reads, but for harmonics and their splats. docs/viewers.md compares them.
         cutoff: least opacity that 'mask' renders.
         extras: False leaves out the arrays that only this project reads.
         order: with 'blend', unlit: every triangle is written twice, with both windings and a single-sided
@@ -140,10 +140,17 @@ def _document(
             (mesh.take(~solid), "blend"),
         )
         parts = [(half, mode) for half, mode in halves if len(half.faces)]
-    primitives = []
+    primitives, splats = [], []
     for k, (part, mode) in enumerate(parts):
-        shown = _lowest_first(part.plain) if alpha == "hybrid" and mode == "blend" else part.plain
-        primitives.append(_primitive(buffer, shown, colors.type, k, colors.tables(part)))
+        tables, shown, own = colors.tables(part), part.plain, part.face_splat
+        if alpha == "hybrid" and mode == "blend":
+            order = _lowest_first(part)
+            shown = replace(shown, face_splat=None, depth_group=None, order="fragment").take(order)
+            own = None if own is None else own[order]
+        primitives.append(_primitive(buffer, shown, colors.type, k, tables))
+        splats += [] if own is None else [own]
+    if alpha == "hybrid" and mesh.harmonics is not None:
+        extras["splats"] = _raw(buffer, np.concatenate(splats))
     if with_extras:
         _add_own_arrays(buffer, mesh, primitives[0]["attributes"], extras)
     meshes = [{"name": "splats", "primitives": primitives, "extras": {"meshsplats": extras}}]
@@ -225,11 +232,10 @@ def _scene(
     return document
 
 
-def _lowest_first(mesh: SplatMesh) -> SplatMesh:
-    """``mesh`` with its triangles in the order of their heights."""
+def _lowest_first(mesh: SplatMesh) -> np.ndarray:
+    """(f,) the triangles of ``mesh`` in the order of their heights."""
     heights = (mesh.vertices @ mesh.up)[mesh.faces].sum(axis=1)
-    plain = replace(mesh, face_splat=None, depth_group=None, order="fragment")
-    return plain.take(np.argsort(heights, kind="stable"))
+    return np.argsort(heights, kind="stable")
 
 
 def _primitive(
