@@ -16,7 +16,6 @@ from test_mesh_foreign import edit_glb
 from meshsplats import (
     DataWarning,
     FileFormatError,
-    MissingDependencyError,
     drawing_order,
     load_mesh,
     orbit,
@@ -131,13 +130,16 @@ def test_usd_passes_the_validators_of_usd(tmp_path):
     ] == []
 
 
-def test_compression_says_what_it_leaves_out(tmp_path, monkeypatch):
-    monkeypatch.setenv("MESHSPLATS_GLTFPACK", str(tmp_path / "none"))
-    with (
-        pytest.warns(DataWarning, match="harmonics are left out, compression has no place for them"),
-        pytest.raises(MissingDependencyError),
-    ):
-        save_mesh(mesh_of(1), tmp_path / "m.glb", compression="meshopt")
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("packing", ["attributes", "texcoords"])
+def test_compressed_files_have_the_same_colours(tmp_path, degree, plain, packing):
+    mesh = mesh_of(degree, plain=plain)
+    for name, compression in (("a.glb", None), ("b.glb", "meshopt")):
+        save_mesh(mesh, tmp_path / name, harmonics=packing, compression=compression)
+    whole, packed = (load_mesh(tmp_path / name) for name in ("a.glb", "b.glb"))
+    for name in ("colors", "harmonics", "plain_colors"):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(whole, name))
 
 
 def accessor_of(path, name):

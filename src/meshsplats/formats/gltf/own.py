@@ -13,6 +13,7 @@ from meshsplats.binding import Binding
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import checked
 from meshsplats.formats.gltf import copies
+from meshsplats.formats.gltf.compressed import Grid
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.view_colors import IN_VIEW_COLORS
@@ -39,9 +40,25 @@ def origin_of(note: dict[str, Any]) -> np.ndarray:
     return np.array(note.get("origin", [0, 0, 0]), np.float64)
 
 
-def is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
-    """Whether the node is still ours: it turns the mesh's up direction to +y and puts the mesh at its origin,
-    nothing more."""
+def grid_of(document: GltfDocument, note: dict[str, Any]) -> Grid | None:
+    """What positions are rounded to; None where they are not."""
+    if "grid" not in note:
+        return None
+    entry = dict_or_empty(note["grid"])
+    scale = float(document.numbers([entry.get("scale")], 1, "the scale of a grid")[0])
+    x, y, z = document.numbers(entry.get("offset"), 3, "the offset of a grid").tolist()
+    if scale <= 0:
+        raise document.error(f"the scale of a grid must be above 0, got {scale}")
+    return Grid(scale, (x, y, z))
+
+
+def is_own_placement(matrix: np.ndarray, note: dict[str, Any], grid: Grid | None) -> bool:
+    """Whether the nodes are still ours: they turn the mesh's up direction to +y and put the mesh at its
+    origin, after making positions of the places in a ``grid``; nothing more."""
+    if grid is not None:
+        matrix = matrix.copy()
+        matrix[:3, :3] /= grid.scale
+        matrix[:3, 3] -= matrix[:3, :3] @ grid.offset
     wanted = rotation_matrix(up_quaternion(np.array(note["up"], np.float64)))
     wanted[:3, 3] = wanted[:3, :3] @ origin_of(note)
     rounding = 1e-12 * np.abs(wanted[:3, 3]).max()

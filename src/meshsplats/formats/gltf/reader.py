@@ -18,6 +18,7 @@ from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.own import (
     fits,
+    grid_of,
     in_order_of_splats,
     is_own_placement,
     origin_of,
@@ -69,7 +70,8 @@ def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     of our files, or to one that suits those of others, whose nodes are applied in float64.
 
     Raises:
-        FileFormatError: the file is broken, or has Draco or meshopt compression or sparse accessors.
+        FileFormatError: the file is broken, or has Draco compression, meshopt compression with filters, or
+            sparse accessors.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # SplatMesh refuses values that are not finite
         return _read(GltfDocument(path), origin)
@@ -93,9 +95,9 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     if len(placed) != max(1, copies.counts(note.get("copies"))):
         note = {}
     own = placed[0].mesh if note else {}
-    stored = stored_colors(note, document.error)
+    stored, grid = stored_colors(note, document.error), grid_of(document, note)
     named: np.ndarray | None = None
-    kept = bool(note) and all(is_own_placement(place.matrix, note) for place in placed)
+    kept = bool(note) and all(is_own_placement(place.matrix, note, grid) for place in placed)
     if kept:
         placed = [place._replace(matrix=np.eye(4)) for place in placed]
         named = origin_of(note)
@@ -125,6 +127,8 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     else:
         shift = origin = _chosen_origin(document, pieces) if origin is None else origin
     for piece in pieces:
+        if kept and grid is not None:
+            piece.vertices = (piece.vertices * grid.scale + np.array(grid.offset)).astype(np.float32)
         piece.put(shift)
     mesh = _join(document, pieces, own, note | {"viewColors": stored}, origin)
     if mesh.harmonics is not None and (motion != np.eye(3)).any():
