@@ -182,7 +182,7 @@ def save_mesh(
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh.
-        MissingDependencyError: a package or program is missing.
+        MissingDependencyError: a package is missing.
         OSError: the file cannot be written.
     """
     need(
