@@ -66,7 +66,7 @@ class Tiles(Command):
     """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
     colors: Literal["base", "view"] = "base"
     """base: one colour for each splat, which every program shows. view: also the harmonics of colours that
-    depend on the view, for this program's images and for shaders; tiles are 1.5 to 2.5 times as large."""
+    depend on the view, for this program's images and for shaders; 1.6 to 2 times as large."""
     color_degree: Count = None
     """With --colors view: harmonics up to this degree, 1 to 3. Default: all that the splats have."""
     crop: Box = None

@@ -29,7 +29,7 @@ class TileOptions:
     """What to do otherwise than the preset does; not ``max_splats``, ``max_triangles``, ``detail='cameras'``,
     ``colors='mean'``, and of the footprints framing, distance and none. Colours are those of degree 0, which
     every program shows; with ``colors='view'``, tiles have the harmonics, too, for programs that draw them
-    (docs/viewers.md), and are 1.5 times as large with degree 1, 2.5 times with 3."""
+    (docs/viewers.md), and are 1.6 times as large with degree 1, twice with 2."""
     up: tuple[float, float, float] | None = None
     """Direction that points up in the world frame. None: that of the splat files, where they name it, else
     (0, -1, 0)."""

@@ -75,7 +75,7 @@ def with_compression(document: dict[str, Any], chunk: BinaryChunk) -> BinaryChun
         data, stride, mode = packed
         place = small.views[small.view(np.frombuffer(data, np.uint8))]
         count = len(part) if "target" in view else part.nbytes // stride
-        entry = {"buffer": 1, "byteOffset": length, "byteLength": count * stride}
+        entry: dict[str, Any] = {"buffer": 1, "byteOffset": length, "byteLength": count * stride}
         if mode == "ATTRIBUTES" and "target" in view:
             entry["byteStride"] = stride
         entry |= {"target": view["target"]} if "target" in view else {}

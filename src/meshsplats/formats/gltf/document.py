@@ -159,7 +159,7 @@ class GltfDocument:
                 found = decoded_triangles(data, count).astype(f"<u{stride}")
         except (ValueError, IndexError) as error:
             raise self.error(f"compressed buffer view {index} is broken: {error}") from None
-        return memoryview(found.reshape(-1).view(np.uint8))
+        return found.reshape(-1).view(np.uint8).data
 
     def accessor(self, index: object, what: str) -> np.ndarray:
         """(count, columns) array of the stored type, a view into the file's bytes."""

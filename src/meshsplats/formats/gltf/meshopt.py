@@ -177,9 +177,8 @@ def encoded_triangles(faces: np.ndarray) -> bytes:
     rising = np.diff(order, prepend=-1) > 0
     rising &= names == np.arange(len(names))
     numbered = len(rising) if rising.all() else int(rising.argmin())
-    new = np.zeros(corners.size, bool)
-    new[order[:numbered]] = True
-    new = new.reshape(-1, 3)
+    new = np.zeros((count, 3), bool)
+    new.reshape(-1)[order[:numbered]] = True
     beside = np.zeros(count, bool)
     beside[1:] = (corners[1:, 0] == corners[:-1, 0]) & (corners[1:, 1] == corners[:-1, 2])
     turned = ~new[:, 0] & new[:, 1] & new[:, 2]  # that code would mean something else
