@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,13 +51,26 @@ def test_missing_libraries_are_named_as_pip_takes_them(monkeypatch):
     json.dumps(found)
 
 
+def test_what_draws_colours_that_depend_on_the_view_here(monkeypatch):
+    monkeypatch.setattr("meshsplats.installation._version", lambda name: "4.5" if name == "bpy" else None)
+    found = examine()
+    working = [name for name in ("core", "gpu") if found[name]["works"]]
+    assert found["harmonics_drawn_by"] == [*working, "Blender (bpy 4.5), unlit"]
+    # A core that shades wrongly draws wrongly.
+    monkeypatch.setattr("meshsplats.rendering.cpu.shaded", lambda triangles, *_, **__: triangles)
+    assert not examine()["core"]["works"]
+
+
 def test_a_mesh_says_whether_its_colours_depend_on_the_view(tmp_path):
     mesh = fan_mesh(np.random.default_rng(0), degree=2)
     save_mesh(mesh, tmp_path / "m.glb")
     found = describe(tmp_path / "m.glb")
     assert (found["sh_degree"], found["plain_colors"], found["colors_above_white"]) == (2, True, True)
-    assert "others show plain colours" in found["harmonics_drawn_by"]
+    assert "Blender unlit" in found["harmonics_drawn_by"]
+    assert found["others_show"] == "plain colours, the mean of views"
+    save_mesh(replace(mesh, plain_colors=None), tmp_path / "m.glb")
+    assert "degree 0; bake --colors" in describe(tmp_path / "m.glb")["others_show"]
     save_mesh(mesh.of_degree(0), tmp_path / "m.glb")
     found = describe(tmp_path / "m.glb")
     assert (found["sh_degree"], found["plain_colors"], found["colors_above_white"]) == (0, False, False)
-    assert "harmonics_drawn_by" not in found
+    assert not {"harmonics_drawn_by", "others_show"} & found.keys()

@@ -32,6 +32,10 @@ from meshsplats.tiles import is_tileset
 SAMPLE = 4000
 """Number of splats that are converted to estimate the size of the mesh."""
 
+HARMONICS_DRAWN_BY = "meshsplats, its page, Blender unlit; three.js and engines by shaders of docs/viewers.md"
+PLAIN = "plain colours, the mean of views"
+BASE = "the part of degree 0"
+
 
 def describe(path: Path, reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Findings about ``path``, ready for JSON, first its ``kind``. Lengths are in scene units.
@@ -152,7 +156,10 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
         found |= _extent(mesh.vertices, scene_bounds(mesh), mesh.origin)
         found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
     if mesh.sh_degree:
-        found["harmonics_drawn_by"] = "meshsplats; shaders of docs/viewers.md; others show plain colours"
+        found["harmonics_drawn_by"] = HARMONICS_DRAWN_BY
+        found["others_show"] = (
+            f"{BASE}; bake --colors makes means of views" if mesh.plain_colors is None else PLAIN
+        )
     if mesh.binding is not None:
         base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"
         found["bound_to_base_of"] = base
@@ -181,11 +188,14 @@ def _tileset(path: Path) -> dict[str, Any]:
         found["levels"] = max(found["levels"], level)
         found["largest_tile"] = max(found["largest_tile"], tile.triangles)
         found["triangles"] += 0 if tile.children else tile.triangles
-    corners = tileset.root.corners()
+    corners, degree = tileset.root.corners(), tileset.root.load().sh_degree
+    drawing = {"harmonics_drawn_by": HARMONICS_DRAWN_BY, "others_show": BASE} if degree else {}
     return {
         "bytes": sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
         "splats": tileset.splats,
         **found,
+        "sh_degree": degree,
+        **drawing,
         "geometric_error": float(f"{tileset.root.error:.6g}"),
         "lower": _in_world(corners.min(axis=0), tileset.origin),
         "upper": _in_world(corners.max(axis=0), tileset.origin),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import re
 import sys
+from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,19 +19,23 @@ if TYPE_CHECKING:
 
 def examine() -> dict[str, Any]:
     """Findings, ready for JSON: versions, threads, whether the core and the GPU draw a triangle and have its
-    gradient, the libraries of each extra, and the requirements that are missing, in pip's form."""
+    gradient, what draws colours that depend on the view here, the libraries of each extra, and the
+    requirements that are missing, in pip's form."""
     import meshsplats
     from meshsplats._core.library import processors
 
     needed = _requirements()
     libraries = {e: {name: _version(name) for name in names} for e, names in needed.items()}
+    core, gpu, blender = _core(), _gpu(), _version("bpy")
+    drawing = {"core": core["works"], "gpu": gpu["works"], f"Blender (bpy {blender}), unlit": blender}
     return {
         "meshsplats": meshsplats.__version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "threads": processors(),
-        "core": _core(),
-        "gpu": _gpu(),
+        "core": core,
+        "gpu": gpu,
+        "harmonics_drawn_by": [name for name, there in drawing.items() if there],
         "required": libraries.pop("", {}),
         "extras": libraries,
         "to_install": {
@@ -99,11 +104,21 @@ def _has_gradient() -> bool:
 
 
 def _draws(device: Literal["cpu", "gpu"] = "cpu") -> bool:
+    """Whether ``device`` draws a triangle, of one colour and of one that depends on the view."""
     from meshsplats.rendering import render
+    from meshsplats.spherical_harmonics import sh_basis
 
     mesh, camera = _triangle()
-    middle = render(mesh, camera, background=(0, 0, 1), device=device).color[1, 1]
-    return bool(abs(middle - [0.5, 0.25, 0.5]).max() < 1e-5)
+    harmonics = np.array([[[0, 0.2, 0], [-0.4, 0, 0], [0, 0, 0]]], np.float32)
+    shaded = replace(mesh, face_splat=np.zeros(1, np.int32), harmonics=harmonics)
+    away = mesh.vertices - camera.center
+    basis = sh_basis(away / np.linalg.norm(away, axis=1, keepdims=True), 1)[:, 1:]
+    there = np.array([0.25, 0.25, 0.5]) @ basis @ harmonics[0]  # weights of the corners in the middle
+    for part, more in ((mesh, 0), (shaded, there)):
+        middle = render(part, camera, background=(0, 0, 1), device=device).color[1, 1]
+        if abs(middle - (0.5, 0.25, 0.5) - 0.5 * more).max() > 1e-5:
+            return False
+    return True
 
 
 def _requirements() -> dict[str, dict[str, str]]:

@@ -12,11 +12,24 @@ from meshsplats import GaussianCloud, convert, orbit, render
 from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
 from meshsplats.blender.linear import linear_colors
+from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
-from meshsplats.blender.subject import ground_height
+from meshsplats.blender.subject import ground_height, prepare
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import shading_normals
+from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
+
+
+def test_lit_scenes_have_plain_colours():
+    mesh = convert(make_scene(400))
+    rng = np.random.default_rng(0)
+    mesh = replace(mesh, plain_colors=rng.random((len(mesh.vertices), 3)))
+    unlit, lit = (prepare(mesh, [], SceneOptions(light=light), 8)[0] for light in (None, LightOptions()))
+    assert unlit["harmonics"].shape == (len(mesh.vertices), 15, 3)
+    np.testing.assert_array_equal(unlit["colors"], mesh.colors)
+    assert "harmonics" not in lit
+    np.testing.assert_array_equal(lit["display"][:, :3], mesh.plain_colors)
 
 
 def ball_field(count: int = 24, radius: float = 8.0) -> np.ndarray:

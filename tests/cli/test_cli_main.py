@@ -285,6 +285,7 @@ def test_doctor(capsys, monkeypatch):
     out = capsys.readouterr().out
     assert "in use" in out
     assert f"gpu: {found['gpu']['adapter'] or found['gpu']['problem']}" in out
+    assert f"the view: drawn by {', '.join(found['harmonics_drawn_by'])}; other" in out
 
     from meshsplats import installation
 

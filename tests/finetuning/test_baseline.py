@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshsplats import convert, make_config, psnr, render, splat_dataset
+from meshsplats import convert, make_config, orbit, plain_colors_of, psnr, render, splat_dataset
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning.baseline import SizeScores, converted, measure_baseline, partly
@@ -87,3 +87,18 @@ def test_part_of_the_way(cloud):
     np.testing.assert_allclose(half.vertices, start.vertices + 1, atol=1e-6)
     np.testing.assert_allclose(half.colors, start.colors / 2, atol=1e-6)
     assert partly(start, end.take(np.arange(len(end.faces)) > 0), 0.5) is None
+
+
+def test_part_of_the_way_of_plain_colours():
+    """Means over the same views are linear in colours and harmonics, as long as none is held at 0."""
+    start = convert(make_scene(200))
+    assert start.harmonics is not None
+    faint = 0.1 / np.abs(start.harmonics).max()
+    start = replace(start, colors=start.colors.clip(0.4, 0.6), harmonics=faint * start.harmonics)
+    end = replace(start, colors=start.colors + np.array([0.1, -0.1, 0, 0]), harmonics=1.5 * start.harmonics)
+    cameras = orbit(start, 3, width=24, height=24)
+    start, end = (replace(m, plain_colors=plain_colors_of(m, cameras)) for m in (start, end))
+    for share in (0.25, 1.0):
+        part = partly(start, end, share)
+        np.testing.assert_allclose(part.plain_colors, plain_colors_of(part, cameras), atol=1e-5)
+    assert partly(start, replace(end, plain_colors=None), 0.5).plain_colors is None

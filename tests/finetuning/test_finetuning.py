@@ -390,6 +390,17 @@ def test_colors_stay_in_range(scene):
         assert tuned.colors[:, 3].max() <= 1
 
 
+def test_plain_colours_are_those_of_the_result(scene):
+    """Those of the start, which is another mesh, are forgotten; without harmonics there are none."""
+    _, dataset, mesh = scene
+    old = replace(mesh, plain_colors=np.zeros((len(mesh.vertices), 3), np.float32))
+    config = make_config(steps=3)
+    assert same(finetune(old, dataset, config), finetune(mesh, dataset, config))
+    flat = replace(mesh.of_degree(0), plain_colors=old.plain_colors)
+    for more in ({}, {"blending": "linear"}, {"steps": 16, "opacity": "cutoff", "soft_share": 0.1}):
+        assert finetune(flat, dataset, config, **more).plain_colors is None
+
+
 def test_masked_pixels_have_no_say(scene):
     _, dataset, mesh = scene
     view = dataset.train[0]

@@ -5,12 +5,13 @@ import io
 import json
 import struct
 import tracemalloc
+import warnings
 import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from _meshes import random_mesh
+from _meshes import fan_mesh, random_mesh
 from conftest import make_link
 from test_mesh_foreign import TRIANGLE, edit_glb, gltf
 
@@ -270,6 +271,9 @@ def broken_gltf(tmp_path, change, match):
     refused(path, match)
 
 
+PACKED = {"buffer": 0, "byteLength": 36, "byteStride": 12, "count": 3, "mode": "ATTRIBUTES"}
+
+
 def put(*keys):
     """A change that sets the last of ``keys`` as the value under the others."""
 
@@ -311,7 +315,18 @@ def put(*keys):
         (put("bufferViews", 0, "byteOffset", 2**60), "needs a whole number 'byteOffset'"),
         (put("bufferViews", 0, "byteStride", 2), "byteStride of buffer view 0 must be 4 to 252"),
         (put("bufferViews", 0, "buffer", 1), "refers to index 1 of 1 buffers"),
-        (put("bufferViews", 0, "extensions", {"EXT_meshopt_compression": {}}), "gltf-transform"),
+        (put("bufferViews", 0, "extensions", {"KHR_meshopt_compression": {}}), "gltf-transform"),
+        (put("bufferViews", 0, "extensions", {"EXT_meshopt_compression": {}}), "whole number 'buffer'"),
+        (put("bufferViews", 0, "extensions", {"EXT_meshopt_compression": PACKED}), "gltf-transform"),
+        *(
+            (put("bufferViews", 0, "extensions", {"EXT_meshopt_compression": PACKED | more}), match)
+            for more, match in (
+                ({"filter": "OCTAHEDRAL"}, "gltf-transform"),
+                ({"mode": "INDICES"}, "gltf-transform"),
+                ({"byteLength": 1000}, "ends at byte 1,000"),
+                ({"count": -1}, "needs a whole number 'count'"),
+            )
+        ),
         (put("buffers", 0, "byteLength", 1000), "should have 1,000 bytes, has 44"),
         (put("buffers", 0, "uri", "data:;base64,!"), "data URI of buffer 0 is broken|should have"),
         (put("buffers", 0, "uri", "data:,abc"), "not base64"),
@@ -468,3 +483,30 @@ def test_base64_that_is_long_is_fine(tmp_path):
     assert len(base64.b64decode(document["buffers"][0]["uri"].partition(",")[2])) == 360_000
     (tmp_path / "m.gltf").write_text(json.dumps(document))
     np.testing.assert_array_equal(load_mesh(tmp_path / "m.gltf").vertices, positions)
+
+
+def test_spoilt_compressed_glb(tmp_path):
+    """Each ends in a mesh or in one error."""
+    save_mesh(fan_mesh(np.random.default_rng(0), degree=1), tmp_path / "m.glb", compression="meshopt")
+    whole = (tmp_path / "m.glb").read_bytes()
+    start = 28 + int.from_bytes(whole[12:16], "little")
+    rng, errors = np.random.default_rng(1), 0
+    for _ in range(150):
+        spoilt = bytearray(whole)
+        spoilt[rng.integers(start, len(whole))] = rng.integers(256)
+        (tmp_path / "m.glb").write_bytes(spoilt)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                load_mesh(tmp_path / "m.glb")
+            except FileFormatError:
+                errors += 1
+    assert errors > 5
+
+
+@pytest.mark.parametrize("change", [{"count": 10**15}, {"count": 3 * 10**9, "byteStride": 4}])
+def test_compressed_views_that_claim_much(tmp_path, change):
+    save_mesh(fan_mesh(np.random.default_rng(0)), tmp_path / "m.glb", compression="meshopt")
+    extension = "EXT_meshopt_compression"
+    edit_glb(tmp_path / "m.glb", lambda d: d["bufferViews"][0]["extensions"][extension].update(change))
+    refused(tmp_path / "m.glb", "m.glb")

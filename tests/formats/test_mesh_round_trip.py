@@ -22,7 +22,7 @@ from meshsplats import (
 )
 from meshsplats.binding import ArrayField, Binding
 from meshsplats.formats import meshes, npz
-from meshsplats.formats.gltf import binary_chunk, reader
+from meshsplats.formats.gltf import binary_chunk, own, reader
 from meshsplats.formats.ply import header
 from meshsplats.formats.sniff import identify
 
@@ -58,7 +58,8 @@ class Shining(SplatMesh):
 @pytest.mark.parametrize("suffix", [".npz", ".glb"])
 def test_an_array_of_splats_that_is_declared_comes_back(tmp_path, monkeypatch, suffix):
     monkeypatch.setattr(npz, "SplatMesh", Shining)
-    monkeypatch.setattr(reader, "SplatMesh", Shining)
+    for module in (reader, own):
+        monkeypatch.setattr(module, "SplatMesh", Shining)
     monkeypatch.setitem(npz._NAMES, "shine", "shine")
     mesh = random_mesh(np.random.default_rng(7))
     rows = np.random.default_rng(8).random((mesh.splat_count, 2))

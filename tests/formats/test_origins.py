@@ -37,7 +37,6 @@ from meshsplats._origin import choose_origin, in_words
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import save_gaussian_blocks
-from meshsplats.formats.gltf.compressed import moved_scene
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.meshes import save_mesh_blocks
@@ -541,12 +540,3 @@ def test_npz_has_an_array(tmp_path):
         np.testing.assert_array_equal(arrays["origin"], mesh.origin)
         np.testing.assert_array_equal(arrays["vertices"], mesh.vertices)
     assert "origin.npy" in zipfile.ZipFile(tmp_path / "a.npz").namelist()
-
-
-def test_the_scene_of_a_packed_glb_is_moved(tmp_path):
-    """gltfpack rounds transforms to float32, so the origin is put above what it writes."""
-    mesh = replace(our_mesh(extras=False), up=(0, 1, 0))
-    save_mesh(replace(mesh, origin=np.zeros(3)), tmp_path / "a.glb")
-    (tmp_path / "b.glb").write_bytes(moved_scene((tmp_path / "a.glb").read_bytes(), mesh.origin))
-    found = load_mesh(tmp_path / "b.glb")
-    np.testing.assert_allclose(places(found), places(mesh), atol=1e-6)

@@ -16,9 +16,10 @@ from test_mesh_foreign import edit_glb
 from meshsplats import (
     DataWarning,
     FileFormatError,
-    MissingDependencyError,
     drawing_order,
     load_mesh,
+    orbit,
+    render,
     save_mesh,
 )
 from meshsplats.colors import linear_to_srgb
@@ -129,13 +130,16 @@ def test_usd_passes_the_validators_of_usd(tmp_path):
     ] == []
 
 
-def test_compression_says_what_it_leaves_out(tmp_path, monkeypatch):
-    monkeypatch.setenv("MESHSPLATS_GLTFPACK", str(tmp_path / "none"))
-    with (
-        pytest.warns(DataWarning, match="harmonics are left out, compression has no place for them"),
-        pytest.raises(MissingDependencyError),
-    ):
-        save_mesh(mesh_of(1), tmp_path / "m.glb", compression="meshopt")
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("packing", ["attributes", "texcoords"])
+def test_compressed_files_have_the_same_colours(tmp_path, degree, plain, packing):
+    mesh = mesh_of(degree, plain=plain)
+    for name, compression in (("a.glb", None), ("b.glb", "meshopt")):
+        save_mesh(mesh, tmp_path / name, harmonics=packing, compression=compression)
+    whole, packed = (load_mesh(tmp_path / name) for name in ("a.glb", "b.glb"))
+    for name in ("colors", "harmonics", "plain_colors"):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(whole, name))
 
 
 def accessor_of(path, name):
@@ -232,6 +236,21 @@ def test_solid_and_translucent_triangles_have_theirs(tmp_path):
     primitives = document["meshes"][0]["primitives"]
     assert len(primitives) == 2
     assert all("_SH_BLUE_1" in primitive["attributes"] for primitive in primitives)
+    for change in ({}, {"plain_colors": None}):
+        part = replace(mesh, **change)
+        save_mesh(part, tmp_path / "m.glb", alpha="hybrid")
+        got = load_mesh(tmp_path / "m.glb")
+        assert got.splat_count == mesh.splat_count
+        assert (got.plain_colors is None) == (part.plain_colors is None)
+        for camera in orbit(mesh, 3, width=32, height=32):
+            shown, wanted = (render(m, camera).color for m in (got, part))
+            np.testing.assert_allclose(shown, wanted, atol=0.02)
+            assert np.abs(render(part.of_degree(0), camera).color - wanted).max() > 0.1
+    edit_glb(tmp_path / "m.glb", lambda d: note_of(d)["splats"].update(crc32=1))
+    with pytest.warns(DataWarning, match="left out: harmonics"):
+        assert load_mesh(tmp_path / "m.glb").harmonics is None
+    save_mesh(mesh.of_degree(0), tmp_path / "m.glb", alpha="hybrid")
+    assert load_mesh(tmp_path / "m.glb").face_splat is None
     save_mesh(mesh, tmp_path / "cut.glb", alpha="opaque")
     cut = load_mesh(tmp_path / "cut.glb")
     assert cut.sh_degree == 2

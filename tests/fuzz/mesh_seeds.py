@@ -20,11 +20,11 @@ from fuzz.seeds import Change, Seed
 from meshsplats import load_mesh, save_mesh
 
 
-def _saved(name: str, suffix: str, origin=(0, 0, 0), **more) -> Seed:
+def _saved(name: str, suffix: str, origin=(0, 0, 0), compression=None, **more) -> Seed:
     mesh = replace(random_mesh(np.random.default_rng(0), 6, 5), origin=origin)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"m{suffix}"
-        save_mesh(mesh, path)
+        save_mesh(mesh, path, compression=compression)
         return Seed(name, {path.name: path.read_bytes()}, path.name, load=load_mesh, **more)
 
 
@@ -139,6 +139,7 @@ MESH_SEEDS = [
     _binary_polygons(),
     Seed("mesh-ply-ascii", {"m.ply": _ASCII_PLY}, "m.ply", load=load_mesh),
     _saved("glb", ".glb", inside=_in_json),
+    _saved("glb-meshopt", ".glb", compression="meshopt"),
     _gltf(),
     Seed("gltf-skinned", {"m.gltf": json.dumps(skinned()).encode()}, "m.gltf", load=load_mesh),
     Seed("gltf-instanced", {"m.gltf": json.dumps(_INSTANCED).encode()}, "m.gltf", load=load_mesh),

@@ -159,7 +159,7 @@ class Convert(Command):
     cutoff: tyro.conf.Fixed[float | None] = None
     """--alpha opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
     compression: Literal["none", "meshopt"] = "none"
-    """.glb: meshopt: about a fifth of the size, for viewers; needs the program gltfpack."""
+    """.glb: meshopt: a quarter to a third of the size, for viewers that can unpack it."""
     as_splats: bool = False
     """Write splats, not a mesh, as .ply, .glb or .usdc, too: all of them, or those that --crop, --max-splats
     and min_opacity leave."""

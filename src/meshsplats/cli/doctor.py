@@ -45,6 +45,8 @@ def _text(findings: dict[str, Any]) -> str:
     gpu = findings["gpu"]
     state = "renders and differentiates correctly" if gpu["works"] else gpu["problem"]
     lines.append("gpu: " + "; ".join(filter(None, (gpu["adapter"], state))))
+    drawing = ", ".join(findings["harmonics_drawn_by"]) or "nothing"
+    lines.append(f"colours that depend on the view: drawn by {drawing}; other programs show plain ones")
     lines.append("libraries: " + _listed(findings["required"]))
     for extra, libraries in findings["extras"].items():
         missing = findings["to_install"].get(extra)

@@ -64,6 +64,11 @@ class Tiles(Command):
     area."""
     min_opacity: Number = None
     """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
+    colors: Literal["base", "view"] = "base"
+    """base: one colour for each splat, which every program shows. view: also the harmonics of colours that
+    depend on the view, for this program's images and for shaders; 1.6 to 2 times as large."""
+    color_degree: Count = None
+    """With --colors view: harmonics up to this degree, 1 to 3. Default: all that the splats have."""
     crop: Box = None
     """Only splats with their centre in this box, in the coordinates of the file."""
     up: Text = None
@@ -141,7 +146,8 @@ class Tiles(Command):
             raise UsageError(f"-o must name a folder, got {self.output.name!r}")
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
-        conversion = ConversionOptions(look=self.look, min_opacity=self.min_opacity, crop=self.crop)
+        names = ("look", "min_opacity", "crop", "colors", "color_degree")
+        conversion = ConversionOptions(**{name: getattr(self, name) for name in names})
         up = None
         if self.up is not None:
             x, y, z = (float(u) for u in parse_up(self.up))

@@ -39,6 +39,8 @@ class Survey(SceneSample):
     """(3,) float64 least coordinates of the centres that are kept."""
     high: np.ndarray
     """(3,) float64 greatest ones."""
+    sh_degree: int
+    """Greatest degree of the splats. The sample has degree 0."""
 
 
 def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Survey:
@@ -46,12 +48,13 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
 
     Raises ValueError if no splat is left to convert.
     """
-    read = kept = 0
+    read = kept = degree = 0
     kernels: set[Kernel] = set()
     low, high, most, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0, 0.0
     for block in source:
         read += len(block)
         kernels.add(block.kernel)
+        degree = max(degree, block.sh_degree)
         most = max(most, float(block.opacities.max(initial=0)))
         rows = worth_drawing(block, options)
         if len(rows):
@@ -77,7 +80,8 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
         raise ValueError(f"the splats changed while they were read: {kept:,} before, {passed:,} now")
     sample = GaussianCloud.joined(samples)
     warn_of_strays(sample, low, high, largest)
-    return Survey(kept, kernel, sample, step, origin_of(np.concatenate(near_origin)), low, high)
+    origin = origin_of(np.concatenate(near_origin))
+    return Survey(kept, kernel, sample, step, origin, low, high, degree)
 
 
 def convert_blocks(

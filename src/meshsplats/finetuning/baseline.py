@@ -119,8 +119,8 @@ def without_cameras(options: ConversionOptions) -> ConversionOptions:
 
 
 def partly(start: SplatMesh, tuned: SplatMesh, share: float) -> SplatMesh | None:
-    """``start`` moved by this ``share`` of the way to ``tuned``, in positions and colours; None if they
-    differ in their triangles or in the degree of their colours."""
+    """``start`` moved by this ``share`` of the way to ``tuned``, in positions and colours, plain ones too
+    where ``tuned`` has some; None if they differ in their triangles or in the degree of their colours."""
     alike = start.colors.shape == tuned.colors.shape and start.sh_degree == tuned.sh_degree
     if not alike or not np.array_equal(start.faces, tuned.faces):
         return None
@@ -128,14 +128,17 @@ def partly(start: SplatMesh, tuned: SplatMesh, share: float) -> SplatMesh | None
     def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return one + np.float32(share) * (other - one)
 
-    harmonics = None
+    harmonics = plain = None
     if start.harmonics is not None and tuned.harmonics is not None:
         harmonics = between(start.harmonics, tuned.harmonics)
+    if tuned.plain_colors is not None:
+        plain = between(start.plain.colors[:, :3], tuned.plain_colors)
     return replace(
         tuned,
         vertices=between(start.vertices, tuned.vertices),
         colors=between(start.colors, tuned.colors),
         harmonics=harmonics,
+        plain_colors=plain,
     )
 
 

@@ -60,7 +60,8 @@ def with_soft_splats(
     colors = soft.colors.copy()
     colors[:, 3] = np.minimum(colors[:, 3], MAX_OPACITY)
     rest = core.take(~chosen[core.face_splat])
-    return SplatMesh.joined([rest, replace(soft, colors=colors)], same_splats=True)
+    # The plain colours of ``start`` are not those of the end of the run.
+    return SplatMesh.joined([rest, replace(soft, colors=colors, plain_colors=None)], same_splats=True)
 
 
 def softness(

@@ -34,6 +34,7 @@ from meshsplats.finetuning.pace import (
     worthwhile_steps,
 )
 from meshsplats.finetuning.phases.listed import check_for_file_order
+from meshsplats.finetuning.plain import with_plain_means
 from meshsplats.finetuning.reports import SCORED_VIEWS, held_out_scores, scored_count
 from meshsplats.finetuning.run import RunOptions, finetune
 from meshsplats.finetuning.setup import Display, Setup
@@ -192,11 +193,14 @@ class SplatTuning:
         sizes = baseline.compare(tuned, config, run.threads, order)
         if not sizes.loses:
             return Tuned(tuned, order, sizes)
+        start = self.mesh
+        if self._begins_converted and tuned.plain_colors is not None:
+            start = with_plain_means(start, self.dataset, threads=run.threads)
         for share in SHARES if self._begins_converted else ():
             late = self._setup.spent + baseline.seconds + self._saving - (self._setup.seconds or np.inf)
             if late > OVERTIME:
                 break
-            less = partly(self.mesh, tuned, share)
+            less = partly(start, tuned, share)
             if less is not None and not (found := baseline.compare(less, config, run.threads, order)).loses:
                 log_scores(run.folder, less, self.dataset, config, run.threads, order)
                 return Tuned(less, order, found)

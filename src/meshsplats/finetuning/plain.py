@@ -28,6 +28,14 @@ def most_images(steps: int) -> int:
     return min(MOST_VIEWS + MOST_STEPS, 1 + steps // 5)
 
 
+def with_plain_means(
+    mesh: SplatMesh, dataset: Dataset, views: int = MOST_VIEWS, *, threads: int | None = None
+) -> SplatMesh:
+    """``mesh`` with ``plain_colors`` that are means over so many training ``views`` of ``dataset``."""
+    cameras = [view.camera for view in subsample(dataset.train, views)]
+    return replace(mesh, plain_colors=plain_colors_of(mesh, cameras, threads=threads))
+
+
 def with_plain_colors(
     mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, images: int, *, threads: int | None = None
 ) -> SplatMesh:
@@ -37,8 +45,7 @@ def with_plain_colors(
     ``images``: how many may be drawn in all, at least 1; each takes about as long as a step.
     """
     views = min(max(1, round(VIEWS_SHARE * images)), MOST_VIEWS)
-    cameras = [view.camera for view in subsample(dataset.train, views)]
-    mesh = replace(mesh, plain_colors=plain_colors_of(mesh, cameras, threads=threads))
+    mesh = with_plain_means(mesh, dataset, views, threads=threads)
     steps = min(images - views, MOST_STEPS)
     if steps <= 0:
         return mesh

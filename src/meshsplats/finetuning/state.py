@@ -135,7 +135,8 @@ class State:
         """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
         mesh = replace(mesh, order=order_of(mesh, config))
         engine(device, threads).check(mesh=mesh)
-        mesh = replace(mesh, normals=None)  # positions change, normals would not
+        # Positions and colours change, these would not.
+        mesh = replace(mesh, normals=None, plain_colors=None)
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
         if config.blending == "linear" and mesh.blending == "display":

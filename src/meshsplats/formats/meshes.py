@@ -18,7 +18,7 @@ from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
-from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
+from meshsplats.formats.gltf.compressed import Compression
 from meshsplats.formats.gltf.reader import read_gltf
 from meshsplats.formats.gltf.view_colors import Harmonics, stored_bytes
 from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
@@ -151,9 +151,9 @@ def save_mesh(
     again, the origin and the coordinates relative to it come back exactly, but for the last digits in `.obj`.
 
     All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning. All but `.obj`, and
-    `.glb` with 'hybrid' or compression, keep ``filter_px2``, but other programs render without a low-pass
-    filter: writing a mesh with one as `.glb`, USD or `.obj` gives a DataWarning; ``bake_filter`` makes the
-    filter part of the triangles.
+    `.glb` with 'hybrid', keep ``filter_px2``, but other programs render without a low-pass filter: writing a
+    mesh with one as `.glb`, USD or `.obj` gives a DataWarning; ``bake_filter`` makes the filter part of the
+    triangles.
 
     An older file at ``path`` is replaced at the end; an error leaves it as it was.
 
@@ -170,10 +170,9 @@ def save_mesh(
             those with three opaque corners form an opaque primitive, and all others, the lowest first, a
             blended one. Splat indices, attributes and binding are left out.
         cutoff: (with 'opaque' and 'mask'; default 0.2) least opacity that is drawn, 0 to 1.
-        compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
-            gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
-            order of triangles changes a little; splat indices, attributes and harmonics are left out. Such
-            files are for viewers; ``load_mesh`` does not read them.
+        compression: (`.glb`) 'meshopt' makes files a quarter to a third as large. Each coordinate moves by at
+            most 1/131070 of the longest side of the bounding box, and the corners of a triangle may be listed
+            from another one on; all else is kept. Viewers need a decoder of EXT_meshopt_compression.
         order: (`.glb`) that of ``drawing_order``, for web viewers and engines, which blend triangles as they
             are listed: each is written twice, with both windings and a single-sided material, in this order.
             Not for ray tracers, Blender and CesiumJS, which do not cull translucent triangles and draw both.
@@ -183,7 +182,7 @@ def save_mesh(
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh.
-        MissingDependencyError: a package or program is missing.
+        MissingDependencyError: a package is missing.
         OSError: the file cannot be written.
     """
     need(
@@ -213,7 +212,7 @@ def save_mesh(
         if suffix not in _OPTION_SUFFIXES[name] and options[name] != "opaque":
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
-    unbound = suffix not in BOUND_SUFFIXES or "compression" in options or alpha in ("opaque", "hybrid")
+    unbound = suffix not in BOUND_SUFFIXES or alpha in ("opaque", "hybrid")
     if mesh.binding is not None and unbound:
         warnings.warn(
             f"{target.name}: the binding to a base mesh is left out; later poses need .npz or .glb",
@@ -242,18 +241,13 @@ def save_mesh(
             DataWarning,
             stacklevel=2,
         )
-    if mesh.harmonics is not None and (suffix == ".obj" or "compression" in options):
-        what = "compression" if "compression" in options else ".obj"
+    if mesh.harmonics is not None and suffix == ".obj":
         warnings.warn(
-            f"{target.name}: harmonics are left out, {what} has no place for them: colours will be the same"
+            f"{target.name}: harmonics are left out, .obj has no place for them: colours will be the same"
             " from everywhere. bake --colors (plain_colors_of) makes them the mean of what given views show",
             DataWarning,
             stacklevel=2,
         )
-    if "compression" in options:
-        if order is not None:
-            raise ValueError("compression changes the order of triangles: leave out order or compression")
-        writer = write_compressed_glb
     size = expected_bytes(mesh, suffix, compressed="compression" in options, copies=order is not None)
     with atomic_path(target, needs=size) as temporary:
         writer(mesh, temporary, **options)
@@ -304,7 +298,7 @@ def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False, co
     if suffix == ".glb":
         held += stored_bytes(mesh)
         whole = 20 * v + (1 + copies) * (12 if v > 0xFFFF else 6) * f + held
-        return whole // 5 if compressed else whole
+        return 3 * whole // 10 if compressed else whole
     if suffix in _USD:
         return 28 * v + 6 * f + held
     return 28 * v + 12 * f + held

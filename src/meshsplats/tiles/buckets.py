@@ -25,17 +25,6 @@ LEVELS_AT_ONCE = 2
 """Levels that one pass over a cell parts it by: 64 files are open at a time."""
 BUCKET = 1 << 18
 """Splats that are in memory together."""
-RECORD = np.dtype(
-    [
-        ("row", "<i4"),
-        ("means", "<f4", 3),
-        ("quaternions", "<f4", 4),
-        ("scales", "<f4", 3),
-        ("opacities", "<f4"),
-        ("sh", "<f4", 3),
-    ]
-)
-"""A splat of degree 0 with its row in the input."""
 _AT_ONCE = 1 << 16
 
 
@@ -51,34 +40,51 @@ class Cube:
         return morton_codes(means, self.low, self.side, DEPTH)
 
 
-def records_of(cloud: GaussianCloud, rows: np.ndarray) -> np.ndarray:
-    """(n,) records of a cloud of degree 0 or more, of which only degree 0 is kept."""
-    records = np.empty(len(cloud), RECORD)
+def record_type(degree: int) -> np.dtype[np.void]:
+    """A splat with harmonics up to ``degree``, and its row in the input."""
+    return np.dtype(
+        [
+            ("row", "<i4"),
+            ("means", "<f4", 3),
+            ("quaternions", "<f4", 4),
+            ("scales", "<f4", 3),
+            ("opacities", "<f4"),
+            ("sh", "<f4", ((degree + 1) ** 2, 3)),
+        ]
+    )
+
+
+def records_of(cloud: GaussianCloud, rows: np.ndarray, degree: int) -> np.ndarray:
+    """(n,) records of a cloud, with its harmonics up to ``degree``; those that it does not have are 0."""
+    records = np.zeros(len(cloud), record_type(degree))
     records["row"] = rows
     for name in ("means", "quaternions", "scales", "opacities"):
         records[name] = getattr(cloud, name)
-    records["sh"] = cloud.sh[:, 0]
+    sh = cloud.of_degree(degree).sh
+    records["sh"][:, : sh.shape[1]] = sh
     return records
 
 
 def cloud_of(records: np.ndarray, kernel: Kernel) -> GaussianCloud:
-    """The inverse of ``records_of`` for clouds of degree 0."""
-    names = ("means", "quaternions", "scales", "opacities")
+    """The inverse of ``records_of``."""
+    names = ("means", "quaternions", "scales", "opacities", "sh")
     arrays = {name: np.ascontiguousarray(records[name]) for name in names}
-    return GaussianCloud(**arrays, sh=records["sh"][:, None], kernel=kernel)
+    return GaussianCloud(**arrays, kernel=kernel)
 
 
-def read_records(paths: Iterable[Path]) -> np.ndarray:
-    """All records of the files at ``paths``, in the order of their rows."""
-    records = np.concatenate([np.fromfile(path, RECORD) for path in paths])
+def read_records(paths: Iterable[Path], degree: int) -> np.ndarray:
+    """All records of that ``degree`` in the files at ``paths``, in the order of their rows."""
+    records = np.concatenate([np.fromfile(path, record_type(degree)) for path in paths])
     return records[np.argsort(records["row"], kind="stable")]
 
 
 class Buckets:
-    """Files of records in a folder, each the splats of a cell, in the order of their rows."""
+    """Files of records of that ``degree`` in a folder, each the splats of a cell, in the order of their
+    rows."""
 
-    def __init__(self, folder: Path, cube: Cube, journal: Journal, bucket: int) -> None:
+    def __init__(self, folder: Path, cube: Cube, journal: Journal, bucket: int, degree: int = 0) -> None:
         self._folder, self._cube, self._journal, self._bucket = folder, cube, journal, bucket
+        self._type = record_type(degree)
 
     def fill(self, records: Iterable[np.ndarray], count: int) -> None:
         """Sorts ``count`` splats into cells of at most as many as fit into memory. Steps that the journal
@@ -130,8 +136,8 @@ class Buckets:
 
     def _read(self, key: str) -> Iterator[np.ndarray]:
         with open(self._path(key), "rb") as file:
-            while data := file.read(_AT_ONCE * RECORD.itemsize):
-                yield np.frombuffer(data, RECORD)
+            while data := file.read(_AT_ONCE * self._type.itemsize):
+                yield np.frombuffer(data, self._type)
 
     def _part(self, key: str, records: Iterable[np.ndarray], size: int) -> dict[str, int]:
         """Writes the splats of a cell into files of the cells inside; the count of each."""
@@ -155,7 +161,7 @@ class Buckets:
                 os.fsync(file.fileno())
         except OSError as error:
             if error.errno in FULL:
-                needed = (size - passed) * RECORD.itemsize / 1e6
+                needed = (size - passed) * self._type.itemsize / 1e6
                 text = f"no space left for the splats on their way into tiles, at least {needed:.0f} MB more"
                 raise OSError(errno.ENOSPC, text, str(self._folder)) from None
             raise

@@ -35,7 +35,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.buckets import BUCKET, Buckets, Cube, records_of
 from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
-from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, stored_survey
+from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, harmonics_degree, stored_survey
 from meshsplats.tiles.options import TileOptions
 from meshsplats.tiles.tileset import Node, Tileset, tile_path, write_tilesets
 
@@ -80,7 +80,7 @@ def build_tiles(
     Until it is complete the tileset lies in ``FOLDER.partial`` with a journal, so that a run that was ended
     at any moment can be resumed. The result has the same bits with any number of threads and workers, and
     after any number of interruptions. Memory does not grow with the scene; the disk holds 60 bytes a splat
-    besides the tiles.
+    besides the tiles, and 12 for each harmonic.
 
     Args:
         source: the splats.
@@ -172,8 +172,10 @@ class _Build:
     def run(self) -> TilesetSummary:
         self._check_start()
         scene = self._survey()
-        buckets = Buckets(self._work / "splats", Cube(scene.low, scene.high), self.journal, BUCKET)
-        buckets.fill(self._records(), scene.kept)
+        degree = harmonics_degree(scene, self._conversion)
+        cube = Cube(scene.low, scene.high)
+        buckets = Buckets(self._work / "splats", cube, self.journal, BUCKET, degree)
+        buckets.fill(self._records(degree), scene.kept)
         cells = buckets.cells()
         done = {line["key"]: line["splats"] for line in self.journal.steps if line["step"] == "cell"}
         finished = 0
@@ -282,20 +284,20 @@ class _Build:
             found = survey(self._source, self._conversion)
             with atomic_path(path) as temporary:
                 arrays = {
-                    "counts": np.array([found.kept, found.step]),
+                    "counts": np.array([found.kept, found.step, found.sh_degree]),
                     "bounds": np.stack([found.low, found.high, found.origin]),
                     "kernel": np.array(found.kernel),
-                    "sample": records_of(found.sample, np.zeros(len(found.sample), np.int32)),
+                    "sample": records_of(found.sample, np.zeros(len(found.sample), np.int32), 0),
                 }
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]
             self.journal.add("survey", kept=found.kept)
         return stored_survey(path)
 
-    def _records(self) -> Iterator[np.ndarray]:
+    def _records(self, degree: int) -> Iterator[np.ndarray]:
         passed = 0
         for block in self._source:
             rows = worth_drawing(block, self._conversion)
-            yield records_of(block.take(rows), (rows + passed).astype(np.int32))
+            yield records_of(block.take(rows), (rows + passed).astype(np.int32), degree)
             passed += len(block)
             if passed > np.iinfo(np.int32).max:
                 raise ValueError(f"{passed:,} splats are more than tiles can number")

@@ -17,12 +17,13 @@ from meshsplats.conversion.budget import triangles_each
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import SceneViews
 from meshsplats.conversion.merging import FILTER_PX2, merge
+from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.writer import Alpha
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud, Kernel
-from meshsplats.tiles.buckets import DEPTH, RECORD, Cube, cloud_of, read_records, records_of
+from meshsplats.tiles.buckets import DEPTH, Cube, cloud_of, read_records, record_type, records_of
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.options import TileOptions
 from meshsplats.tiles.tileset import Node, tile_frame, tile_path
@@ -33,24 +34,28 @@ ERROR_SHARE = 0.99
 """Share of the mass of an inner tile that its geometric error speaks for."""
 SURVEY = "survey.npz"
 """Beside the journal of an unfinished tileset."""
-_MERGED = np.dtype([*RECORD.descr, ("spread", "<f8")])
-"""A splat of a tile; the variance of the centres of the file's splats around it, square scene units."""
 
 
 def stored_survey(path: Path) -> Survey:
     """The survey that a run has written."""
     with np.load(path) as stored:
-        kept, step = (int(n) for n in stored["counts"])
+        kept, step, degree = (int(n) for n in stored["counts"])
         low, high, origin = stored["bounds"]
         kernel: Kernel = str(stored["kernel"])  # type: ignore[assignment]
-        return Survey(kept, kernel, cloud_of(stored["sample"], kernel), step, origin, low, high)
+        return Survey(kept, kernel, cloud_of(stored["sample"], kernel), step, origin, low, high, degree)
+
+
+def harmonics_degree(scene: Survey, options: ConversionOptions) -> int:
+    """Degree of the harmonics that tiles have, with the resolved ``options``."""
+    return min(scene.sh_degree, options.color_degree or 3) if options.colors == "view" else 0
 
 
 def build_cell(tiles: Shared[TileWriter], cell: tuple[str, list[Path]]) -> int:
     """Writes the tiles of a cell of that key, with the splats of these files; their count."""
     key, files = cell
-    records = read_records(files)
-    tiles.get().keep(key, *tiles.get().subtree(key, records))
+    writer = tiles.get()
+    records = read_records(files, writer.degree)
+    writer.keep(key, *writer.subtree(key, records))
     return len(records)
 
 
@@ -66,6 +71,8 @@ class TileWriter:
         self._frame = tile_frame(up)
         scene = stored_survey(self._work / SURVEY)
         self._kernel = scene.kernel
+        self.degree = harmonics_degree(scene, self._conversion)
+        self._type = _with_spread(record_type(self.degree))
         self._views = SceneViews(scene, self._conversion, None, up)
         # Tiles are relative to the origin of the splats.
         self._driver = Driver(self._conversion, self._views, up, np.zeros(3))
@@ -136,7 +143,7 @@ class TileWriter:
         result = merge(cloud, count, np.sqrt(FILTER_PX2) * pixel.astype(np.float64), threads=self._threads)
         first = np.unique(result.group, return_index=True)[1]
         rows = below["row"][first]
-        merged = _merged_from(records_of(result.cloud, rows))
+        merged = _merged_from(records_of(result.cloud, rows, self.degree))
         weights, totals = _weights(result.group, result.masses)
         away = np.square(cloud.means.astype(np.float64) - result.cloud.means[result.group]).sum(axis=1)
         merged["spread"] = np.bincount(result.group, weights * (below["spread"] + away), len(rows))
@@ -207,7 +214,7 @@ class TileWriter:
             for octant in sorted({cell[len(top)] for cell in cells})
         ]
         if top not in journal.keys("above"):
-            merged = [np.fromfile(self._merged(place), _MERGED) for place in parts]
+            merged = [np.fromfile(self._merged(place), self._type) for place in parts]
             node, own = self._inner(top, [self.root_of(place) for place in parts], merged)
             self.keep(top, [node], own)
             journal.add("above", key=top)
@@ -219,10 +226,16 @@ class TileWriter:
         return Node(**nodes[-1])
 
 
+def _with_spread(record: np.dtype[np.void]) -> np.dtype[np.void]:
+    """A splat of a tile: its ``record``, and the variance of the centres of the file's splats around it,
+    square scene units."""
+    return np.dtype([*record.descr, ("spread", "<f8")])
+
+
 def _merged_from(records: np.ndarray) -> np.ndarray:
     """``records`` with a spread of 0."""
-    merged = np.zeros(len(records), _MERGED)
-    for name in RECORD.names or ():
+    merged = np.zeros(len(records), _with_spread(records.dtype))
+    for name in records.dtype.names or ():
         merged[name] = records[name]
     return merged
 

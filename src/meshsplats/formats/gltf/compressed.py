@@ -1,98 +1,106 @@
-"""Compressed `.glb` for the web by the program gltfpack of the meshoptimizer project (MIT licence).
+"""`.glb` files compressed by meshopt (``meshopt``), which viewers unpack as they load.
 
-The result needs the glTF extensions EXT_meshopt_compression and KHR_mesh_quantization. Web viewers with the
-meshopt decoder, such as three.js, read them; programs without it refuse the file.
+Positions and normals become integers of 16 bits (KHR_mesh_quantization), of which a node makes lengths; all
+other arrays come back to the bit.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-import struct
-import subprocess
-import tempfile
-from dataclasses import replace
-from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._origin import zero_origin
-from meshsplats.errors import MissingDependencyError
-from meshsplats.formats.cutting import CUTOFF
-from meshsplats.formats.gltf.writer import Alpha, ColorType, turned_origin, write_glb
-from meshsplats.mesh import SplatMesh
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk
+from meshsplats.formats.gltf.document import MESHOPT
+from meshsplats.formats.gltf.meshopt import encoded_attributes, encoded_triangles
 
 Compression = Literal["meshopt"]
 
-_BITS = 16
-"""Bits of a coordinate, the most that gltfpack has; its default of 14 moves the vertices of a scene of 100 m
-by up to 3 mm."""
+EXTENSIONS = ["KHR_mesh_quantization", MESHOPT]
+_LARGEST = 65535
+_MOST_BYTES = 256
+"""Of an element."""
 
 
-def write_compressed_glb(
-    mesh: SplatMesh,
-    path: Path,
-    *,
-    compression: Compression,
-    lit: bool = False,
-    color_type: ColorType = "uint16",
-    alpha: Alpha = "blend",
-    cutoff: float = CUTOFF,
-) -> None:
-    """Writes ``mesh`` to ``path`` with positions and colours of 16 bits, compressed.
-
-    Concretely, a coordinate is moved by at most 0.5 / 65535 of the longest side of the bounding box. The
-    arrays that only this project reads are left out, as the order of triangles changes, and harmonics, whose
-    attributes the program drops: colours are plain ones.
-
-    Raises:
-        MissingDependencyError: gltfpack is missing.
-        ValueError: as ``write_glb``, and for ``color_type`` 'float32'.
-        RuntimeError: gltfpack fails.
-    """
+def check_compression(compression: str, color_type: str, *, is_ordered: bool) -> None:
+    """ValueError for an unknown ``compression``, and for what it does not go with."""
     if compression not in get_args(Compression):
-        raise ValueError(
-            f"compression must be one of {', '.join(get_args(Compression))}, got {compression!r}"
-        )
+        known = ", ".join(get_args(Compression))
+        raise ValueError(f"compression must be one of {known}, got {compression!r}")
     if color_type != "uint16":
         raise ValueError(f"compressed colours are of type 'uint16', got {color_type!r}; leave one out")
-    program = shutil.which(os.environ.get("MESHSPLATS_GLTFPACK", "gltfpack"))
-    if program is None:
-        raise MissingDependencyError(
-            "compression needs the program gltfpack: npm install -g gltfpack, or a binary from"
-            " https://github.com/zeux/meshoptimizer/releases on the PATH or named by MESHSPLATS_GLTFPACK"
-        )
-    with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
-        plain, packed = Path(folder) / "plain.glb", Path(folder) / "packed.glb"
-        # The program has float32 for transforms of nodes.
-        local = replace(mesh.plain, origin=zero_origin())
-        write_glb(local, plain, lit=lit, alpha=alpha, cutoff=cutoff, extras=False)
-        precision = ["-vp", str(_BITS), "-vc", "16", "-vn", "12"]
-        done = subprocess.run(
-            [program, "-i", plain, "-o", packed, "-cc", *precision, "-ke", "-km", "-kn"],
-            capture_output=True,
-            text=True,
-            stdin=subprocess.DEVNULL,
-        )
-        if done.returncode or not packed.is_file():
-            raise RuntimeError(f"gltfpack failed with status {done.returncode}: {done.stderr.strip()[-500:]}")
-        content = packed.read_bytes()
-        path.write_bytes(moved_scene(content, turned_origin(mesh)) if mesh.origin.any() else content)
+    if is_ordered:
+        raise ValueError("compression turns the corners of triangles: leave out order or compression")
 
 
-def moved_scene(content: bytes, translation: np.ndarray) -> bytes:
-    """The `.glb` file ``content`` with the nodes of its scene below one that moves them by ``translation``
-    (3,) float64."""
-    length = struct.unpack_from("<I", content, 12)[0]
-    document = json.loads(content[20 : 20 + length])
-    for scene in document["scenes"]:
-        node = {"name": "origin", "translation": translation.tolist(), "children": scene["nodes"]}
-        scene["nodes"] = [len(document["nodes"])]
-        document["nodes"].append(node)
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    rest = content[20 + length :]
-    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    return head + text + rest
+class Grid(NamedTuple):
+    """The points that positions are rounded to: ``offset + scale * k`` for integers k of 16 bits."""
+
+    scale: float
+    offset: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, vertices: np.ndarray) -> Grid:
+        """The finest for (v, 3) ``vertices``, at least one."""
+        low = vertices.min(axis=0).astype(np.float64)
+        longest = float((vertices.max(axis=0) - low).max())
+        return cls(longest / _LARGEST or 1.0, (float(low[0]), float(low[1]), float(low[2])))
+
+    def places(self, vertices: np.ndarray) -> np.ndarray:
+        """(v, 3) uint16 k of the nearest points."""
+        return np.rint((vertices - np.array(self.offset)) / self.scale).clip(0, _LARGEST).astype(np.uint16)
+
+    @property
+    def node(self) -> dict[str, Any]:
+        """Entries of a node that makes positions of them."""
+        return {"translation": list(self.offset), "scale": [self.scale] * 3}
+
+
+def small_normals(normals: np.ndarray) -> np.ndarray:
+    """(v, 3) int16 fractions of 32767."""
+    return np.rint(normals * np.float32(32767)).astype(np.int16)
+
+
+def with_compression(document: dict[str, Any], chunk: BinaryChunk) -> BinaryChunk:
+    """The arrays of ``chunk``, those compressed that can be. Changes ``document`` so that it refers to them.
+
+    The second buffer of the document stands for what they become, and has no data.
+    """
+    small, views, length = BinaryChunk(), [], 0
+    for view, part in zip(chunk.views, chunk.parts, strict=True):
+        packed = _packed(view, part)
+        if packed is None:
+            views.append(small.views[small.view(part)])
+            continue
+        data, stride, mode = packed
+        place = small.views[small.view(np.frombuffer(data, np.uint8))]
+        count = len(part) if "target" in view else part.nbytes // stride
+        entry: dict[str, Any] = {"buffer": 1, "byteOffset": length, "byteLength": count * stride}
+        if mode == "ATTRIBUTES" and "target" in view:
+            entry["byteStride"] = stride
+        entry |= {"target": view["target"]} if "target" in view else {}
+        entry["extensions"] = {MESHOPT: place | {"byteStride": stride, "count": count, "mode": mode}}
+        views.append(entry)
+        length += count * stride + -count * stride % 4
+    document["bufferViews"] = views
+    fallback = {"byteLength": length, "extensions": {MESHOPT: {"fallback": True}}}
+    document["buffers"] = [{"byteLength": small.length}, fallback]
+    document["extensionsUsed"] = document.get("extensionsUsed", []) + EXTENSIONS
+    document["extensionsRequired"] = EXTENSIONS
+    return small
+
+
+def _packed(view: dict[str, Any], part: np.ndarray) -> tuple[bytes, int, str] | None:
+    """The data of an array, the bytes of an element and the mode; None if it stays as it is."""
+    if not len(part):
+        return None
+    if view.get("target") == 34963:
+        return encoded_triangles(part.reshape(-1, 3)), part.itemsize, "TRIANGLES"
+    rows = np.ascontiguousarray(part.reshape(len(part), -1)).view(np.uint8)
+    if "target" in view:  # elements of vertices begin every four bytes
+        rows = np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4)))
+    elif rows.size % 4:
+        return None
+    elif rows.shape[1] % 4 or rows.shape[1] > _MOST_BYTES:
+        rows = rows.reshape(-1, 4)
+    return encoded_attributes(rows), rows.shape[1], "ATTRIBUTES"

@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget
+from meshsplats.formats.gltf.meshopt import decoded_attributes, decoded_triangles
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -28,6 +29,7 @@ _MAX_JSON_TOKENS = 4_000_000
 _READABLE = {
     "KHR_materials_unlit",
     "KHR_mesh_quantization",
+    "EXT_meshopt_compression",
     "KHR_texture_transform",
     "KHR_texture_basisu",
     "EXT_mesh_gpu_instancing",
@@ -37,7 +39,8 @@ _READABLE = {
     "KHR_materials_variants",
     "KHR_xmp_json_ld",
 }
-_COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
+MESHOPT = "EXT_meshopt_compression"
+_COMPRESSED = {"KHR_draco_mesh_compression", "KHR_meshopt_compression"}
 
 
 class GltfDocument:
@@ -62,6 +65,7 @@ class GltfDocument:
             raise self.error(f"not a glTF 2 file: its asset version is {str(version)[:20]!r}, expected '2.0'")
         self._refuse_extensions()
         self._buffers: dict[int, memoryview] = {}
+        self._unpacked: dict[int, memoryview] = {}
         self._unflagged: set[str] = set()
 
     def uses(self, extension: str) -> bool:
@@ -111,9 +115,21 @@ class GltfDocument:
     def view_bytes(self, index: object, what: str) -> tuple[memoryview, int | None]:
         """Bytes of a buffer view and its stride, None where the elements are packed."""
         view = self.item("bufferViews", index, what)
-        extensions = view.get("extensions")
-        if isinstance(extensions, dict) and _COMPRESSED & extensions.keys():
+        extensions = dict_or_empty(view.get("extensions"))
+        if _COMPRESSED & extensions.keys():
             raise self.compressed()
+        stride = view.get("byteStride")
+        if stride is not None and not 4 <= self.whole(view, "byteStride", "a buffer view") <= 252:
+            raise self.error(f"byteStride of buffer view {index} must be 4 to 252, got {stride}")
+        if MESHOPT not in extensions:
+            return self._part(view, index), stride
+        assert isinstance(index, int)
+        if index not in self._unpacked:
+            self._unpacked[index] = self._unpack(dict_or_empty(extensions[MESHOPT]), index)
+        return self._unpacked[index], stride
+
+    def _part(self, view: dict[str, Any], index: object) -> memoryview:
+        """The bytes that a ``view`` names in a buffer."""
         buffer = self._buffer(self.whole(view, "buffer", "a buffer view"))
         offset = self.whole(view, "byteOffset", "a buffer view", 0)
         length = self.whole(view, "byteLength", "a buffer view")
@@ -121,10 +137,29 @@ class GltfDocument:
             raise self.error(
                 f"buffer view {index} ends at byte {offset + length:,} of a buffer of {len(buffer):,}"
             )
-        stride = view.get("byteStride")
-        if stride is not None and not 4 <= self.whole(view, "byteStride", "a buffer view") <= 252:
-            raise self.error(f"byteStride of buffer view {index} must be 4 to 252, got {stride}")
-        return buffer[offset : offset + length], stride
+        return buffer[offset : offset + length]
+
+    def _unpack(self, packed: dict[str, Any], index: int) -> memoryview:
+        """What meshopt has compressed."""
+        data = bytes(self._part(packed, index))
+        count, stride = (self.whole(packed, key, "a compressed view") for key in ("count", "byteStride"))
+        mode, wanted = packed.get("mode"), packed.get("filter", "NONE")
+        known = mode in ("ATTRIBUTES", "TRIANGLES") and wanted == "NONE"
+        if not known or data[:1] not in (b"\xa0", b"\xe1"):
+            raise self.compressed()
+        if mode == "TRIANGLES" and stride not in (2, 4):
+            raise self.error(f"compressed indices must have 2 or 4 bytes, got {stride}")
+        if mode == "ATTRIBUTES" and (stride % 4 or not 4 <= stride <= 256):
+            raise self.error(f"compressed elements must have 4, 8, ... 256 bytes, got {stride}")
+        self.budget.spend(count * stride, "a compressed buffer view")
+        try:
+            if mode == "ATTRIBUTES":
+                found = decoded_attributes(data, count, stride)
+            else:
+                found = decoded_triangles(data, count).astype(f"<u{stride}")
+        except (ValueError, IndexError) as error:
+            raise self.error(f"compressed buffer view {index} is broken: {error}") from None
+        return found.reshape(-1).view(np.uint8).data
 
     def accessor(self, index: object, what: str) -> np.ndarray:
         """(count, columns) array of the stored type, a view into the file's bytes."""
@@ -240,7 +275,7 @@ class GltfDocument:
     def compressed(self) -> FileFormatError:
         """The error for compression that this reader does not support."""
         return self.error(
-            "compressed glTF (Draco or meshopt) is not supported; decompress it first:"
+            "glTF compressed in this way (Draco, meshopt with filters) is not supported; decompress it first:"
             " npx @gltf-transform/cli copy in.glb out.glb"
         )
 
@@ -290,3 +325,7 @@ class GltfDocument:
 
 def _known(extension: str) -> bool:
     return extension in _READABLE or extension.startswith("KHR_materials_")
+
+
+def dict_or_empty(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}

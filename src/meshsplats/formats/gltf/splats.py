@@ -22,8 +22,8 @@ from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z
 from meshsplats.formats.content import Content
-from meshsplats.formats.gltf.document import GltfDocument
-from meshsplats.formats.gltf.reader import dict_or_empty, objects_in
+from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
+from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.opened import Splats

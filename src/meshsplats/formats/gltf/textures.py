@@ -12,10 +12,9 @@ import numpy as np
 
 from meshsplats.base_mesh import Texture, Wrap
 from meshsplats.errors import DataWarning
-from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.reader import (
     POINTS_TO_LINES,
-    dict_or_empty,
     material_of,
     objects_in,
     pbr_of,

@@ -26,8 +26,9 @@ from meshsplats.colors import srgb_to_linear
 from meshsplats.draw_order import DrawOrder
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
-from meshsplats.formats.gltf import copies
+from meshsplats.formats.gltf import compressed, copies
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
+from meshsplats.formats.gltf.compressed import Compression, Grid
 from meshsplats.formats.gltf.view_colors import (
     IN_VIEW_COLORS,
     Harmonics,
@@ -40,7 +41,7 @@ from meshsplats.mesh import SplatMesh, solid_faces
 ColorType = Literal["uint16", "float32"]
 Alpha = Literal["blend", "mask", "opaque", "hybrid"]
 
-_FLOAT, _INT8, _UINT16, _UINT32 = 5126, 5120, 5123, 5125
+_FLOAT, _INT8, _INT16, _UINT16, _UINT32 = 5126, 5120, 5122, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _ROWS = 1 << 15
 
@@ -56,6 +57,7 @@ def write_glb(
     extras: bool = True,
     order: DrawOrder | None = None,
     harmonics: Harmonics = "attributes",
+    compression: Compression | None = None,
 ) -> None:
     """Writes ``mesh`` to ``path``.
 
@@ -73,12 +75,13 @@ def write_glb(
             buffer. 'opaque' is for a mesh of ``cut_mesh``, which is solid: viewers ignore opacity. 'hybrid'
             writes triangles with three opaque corners as an 'opaque' primitive, and all others as a 'blend'
             primitive, the lowest first, as most views look down; without the arrays that only this project
-            reads. docs/viewers.md compares them.
+            reads, but for harmonics and their splats. docs/viewers.md compares them.
         cutoff: least opacity that 'mask' renders.
         extras: False leaves out the arrays that only this project reads.
         order: with 'blend', unlit: every triangle is written twice, with both windings and a single-sided
             material, in this order.
         harmonics: where colours are kept that COLOR_0 cannot hold: see ``view_colors``.
+        compression: see ``compressed``. With colours of 16 bits, without an order.
 
     Raises:
         ValueError: the mesh has no triangles (glTF has no empty arrays), its normals are not of unit
@@ -94,8 +97,15 @@ def write_glb(
     if not len(mesh.faces):
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
     check_attribute_names(mesh)
+    grid = None
+    if compression is not None:
+        compressed.check_compression(compression, color_type, is_ordered=order is not None)
+        grid = Grid.of(mesh.vertices)
     if order is None:
-        document, chunk = _document(mesh, lit, _Colors(mesh, color_type, harmonics), alpha, cutoff, extras)
+        colors = _Colors(mesh, color_type, harmonics)
+        document, chunk = _document(mesh, lit, colors, alpha, cutoff, extras, grid)
+        if grid is not None:
+            chunk = compressed.with_compression(document, chunk)
     elif lit or alpha != "blend":
         raise ValueError("an order of triangles is for alpha='blend' and an unlit material")
     else:
@@ -118,10 +128,18 @@ class _Colors:
 
 
 def _document(
-    mesh: SplatMesh, lit: bool, colors: _Colors, alpha: Alpha, cutoff: float, with_extras: bool
+    mesh: SplatMesh,
+    lit: bool,
+    colors: _Colors,
+    alpha: Alpha,
+    cutoff: float,
+    with_extras: bool,
+    grid: Grid | None,
 ) -> tuple[dict[str, Any], BinaryChunk]:
     """The JSON part, and the binary one."""
     buffer, extras = BinaryChunk(), _note(mesh) | colors.note
+    if grid is not None:
+        extras["grid"] = grid._asdict()
     if alpha == "hybrid":
         with_extras = False
     if mesh.filter_px2 and with_extras:
@@ -141,15 +159,22 @@ def _document(
             (mesh.take(~solid), "blend"),
         )
         parts = [(half, mode) for half, mode in halves if len(half.faces)]
-    primitives = []
+    primitives, splats = [], []
     for k, (part, mode) in enumerate(parts):
-        shown = _lowest_first(part.plain) if alpha == "hybrid" and mode == "blend" else part.plain
-        primitives.append(_primitive(buffer, shown, colors.type, k, colors.tables(part)))
+        tables, shown, own = colors.tables(part), part.plain, part.face_splat
+        if alpha == "hybrid" and mode == "blend":
+            order = _lowest_first(part)
+            shown = replace(shown, face_splat=None, depth_group=None, order="fragment").take(order)
+            own = None if own is None else own[order]
+        primitives.append(_primitive(buffer, shown, colors.type, k, tables, grid))
+        splats += [] if own is None else [own]
+    if alpha == "hybrid" and mesh.harmonics is not None:
+        extras["splats"] = _raw(buffer, np.concatenate(splats))
     if with_extras:
         _add_own_arrays(buffer, mesh, primitives[0]["attributes"], extras)
     meshes = [{"name": "splats", "primitives": primitives, "extras": {"meshsplats": extras}}]
     materials = [_material(mode, lit, cutoff) for _, mode in parts]
-    return _scene(buffer, mesh, meshes, materials), buffer
+    return _scene(buffer, mesh, meshes, materials, grid), buffer
 
 
 def _ordered_document(
@@ -195,7 +220,11 @@ def _note(mesh: SplatMesh) -> dict[str, Any]:
 
 
 def _scene(
-    buffer: BinaryChunk, mesh: SplatMesh, meshes: list[dict[str, Any]], materials: list[dict[str, Any]]
+    buffer: BinaryChunk,
+    mesh: SplatMesh,
+    meshes: list[dict[str, Any]],
+    materials: list[dict[str, Any]],
+    grid: Grid | None = None,
 ) -> dict[str, Any]:
     """The JSON part of a file of ``meshes``, which hold ``mesh``; several are below one node that places
     them."""
@@ -205,7 +234,10 @@ def _scene(
     if mesh.origin.any():
         node["translation"] = turned_origin(mesh).tolist()
     nodes = [node]
-    if len(meshes) == 1:
+    if grid is not None:
+        nodes.append({"name": "grid", "mesh": 0} | grid.node)
+        node["children"] = [1]
+    elif len(meshes) == 1:
         node["mesh"] = 0
     else:
         nodes += [{"name": f"splats {k + 1}", "mesh": k} for k in range(len(meshes))]
@@ -226,11 +258,10 @@ def _scene(
     return document
 
 
-def _lowest_first(mesh: SplatMesh) -> SplatMesh:
-    """``mesh`` with its triangles in the order of their heights."""
+def _lowest_first(mesh: SplatMesh) -> np.ndarray:
+    """(f,) the triangles of ``mesh`` in the order of their heights."""
     heights = (mesh.vertices @ mesh.up)[mesh.faces].sum(axis=1)
-    plain = replace(mesh, face_splat=None, depth_group=None, order="fragment")
-    return plain.take(np.argsort(heights, kind="stable"))
+    return np.argsort(heights, kind="stable")
 
 
 def _primitive(
@@ -239,19 +270,24 @@ def _primitive(
     color_type: ColorType,
     material: int,
     tables: dict[str, np.ndarray],
+    grid: Grid | None = None,
 ) -> dict[str, Any]:
     """A primitive with the triangles of ``mesh``, and further attributes of its vertices."""
+    places = mesh.vertices if grid is None else grid.places(mesh.vertices)
     attributes = {
         "POSITION": buffer.accessor(
-            mesh.vertices,
-            _FLOAT,
+            places,
+            _FLOAT if grid is None else _UINT16,
             _ARRAY_BUFFER,
-            min=[float(x) for x in mesh.vertices.min(axis=0)],
-            max=[float(x) for x in mesh.vertices.max(axis=0)],
+            min=places.min(axis=0).tolist(),
+            max=places.max(axis=0).tolist(),
         ),
     }
-    if mesh.normals is not None:
+    if mesh.normals is not None and grid is None:
         attributes["NORMAL"] = buffer.accessor(mesh.normals, _FLOAT, _ARRAY_BUFFER)
+    elif mesh.normals is not None:
+        normals = compressed.small_normals(mesh.normals)
+        attributes["NORMAL"] = buffer.accessor(normals, _INT16, _ARRAY_BUFFER, normalized=True)
     colors = linear_colors(mesh, color_type)
     if color_type == "uint16":
         attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
