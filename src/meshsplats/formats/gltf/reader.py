@@ -20,6 +20,7 @@ from meshsplats.formats._validation import checked, straight_colors, warn_of_los
 from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, Skinning, placed_meshes, rotation_matrix
+from meshsplats.formats.gltf.scene_parts import is_splats, shown_meshes
 from meshsplats.formats.gltf.view_colors import IN_VIEW_COLORS, Stored, put_back, stored_colors
 from meshsplats.formats.gltf.writer import camel_case, up_quaternion
 from meshsplats.mesh import Blending, SplatMesh
@@ -81,7 +82,7 @@ def listed_nodes(path: Path) -> int:
 
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     path = document.path
-    placed = list(placed_meshes(document))
+    placed = shown_meshes(document)
     pieces, skipped, textured = [], 0, 0
     note = _our_note(placed[0].mesh) if placed else {}
     if len(placed) != max(1, copies.counts(note.get("copies"))):
@@ -425,7 +426,7 @@ def pbr_of(material: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
-    if any("gaussian_splatting" in name for name in dict_or_empty(primitive.get("extensions"))):
+    if is_splats(primitive):
         raise document.error("holds Gaussian splats, not a mesh; read it with load_gaussians")
 
 

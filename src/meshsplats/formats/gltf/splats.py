@@ -84,9 +84,14 @@ def placed_clouds(document: GltfDocument, *, strict: bool) -> list[tuple[Gaussia
     ]
 
 
-def turn_of(up: np.ndarray | None) -> list[float]:
-    """Unit quaternion x, y, z, w of the node of our own files, for a cloud with this ``up``."""
-    return up_quaternion(HALF_TURN_Z @ (np.array([0.0, -1.0, 0.0]) if up is None else up))
+def turn_of(up: np.ndarray | None, *, beside_meshes: bool = False) -> list[float]:
+    """Unit quaternion x, y, z, w of the node of our own files, for a cloud with this ``up``;
+    ``beside_meshes``: one that leads to where the node of a mesh of the same world leads."""
+    up = np.array([0.0, -1.0, 0.0]) if up is None else up
+    if beside_meshes:
+        x, y, z, w = up_quaternion(up)
+        return [y, -x, w, -z]  # after the half turn about z, the quaternion k
+    return up_quaternion(HALF_TURN_Z @ up)
 
 
 def _own(document: GltfDocument, cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud | None:
@@ -99,7 +104,8 @@ def _own(document: GltfDocument, cloud: GaussianCloud, matrix: np.ndarray) -> Ga
     direction, place = (HALF_TURN_Z @ v.astype(np.float64) for v in vectors)
     if kernel not in get_args(Kernel) or (up is not None and not direction.any()):
         return None
-    x, y, z, w = turn_of(None if up is None else HALF_TURN_Z @ direction)
+    beside = note.get("besideMeshes") is True
+    x, y, z, w = turn_of(None if up is None else HALF_TURN_Z @ direction, beside_meshes=beside)
     turn = np.array(list(rotation_rows(w, x, y, z)))
     reach = max(1e-6, 1e-12 * float(np.abs(place).max()))
     moved = np.abs(matrix[:3, :3] - turn).max() > 1e-6 or np.abs(matrix[:3, 3] - turn @ place).max() > reach

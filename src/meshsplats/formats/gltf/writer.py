@@ -20,6 +20,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from meshsplats._geometry import rotation_rows, vertex_normals
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.draw_order import DrawOrder
@@ -101,6 +102,14 @@ def write_glb(
         document, chunk = _ordered_document(mesh, order, _Colors(mesh, color_type, harmonics))
     advice = "; save it as .npz or .ply, or split it"
     write_binary(path, document, chunk, what="the mesh", advice=advice)
+
+
+def mesh_part(mesh: SplatMesh, *, lit: bool) -> tuple[dict[str, Any], BinaryChunk]:
+    """The document of ``mesh`` and its chunk, blended or, where it is all opaque, solid; errors as
+    ``write_glb``."""
+    check_attribute_names(mesh)
+    alpha: Alpha = "opaque" if bool((mesh.colors[:, 3] == 1).all()) else "blend"
+    return _document(mesh, lit, _Colors(mesh, "uint16", "attributes"), alpha, CUTOFF, True)
 
 
 class _Colors:
@@ -372,7 +381,7 @@ def up_quaternion(up: np.ndarray) -> list[float]:
     return [float(c) + 0.0 for c in q / np.linalg.norm(q)]  # no negative zeros
 
 
-def turned_origin(mesh: SplatMesh) -> np.ndarray:
+def turned_origin(mesh: SplatMesh | BaseMesh) -> np.ndarray:
     """(3,) float64 place of the mesh's origin in a frame whose +y is its ``up``."""
     x, y, z, w = up_quaternion(mesh.up)
     return np.array(list(rotation_rows(w, x, y, z))) @ mesh.origin + 0.0
