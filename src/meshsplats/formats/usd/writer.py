@@ -35,7 +35,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         import pxr  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
-    if not mesh_stage(mesh, lit=lit).GetRootLayer().Export(str(path)):
+    stage = mesh_stage(mesh, lit=lit)  # its layer does not outlive it
+    if not stage.GetRootLayer().Export(str(path)):
         raise OSError(f"usd-core could not write {path}")
 
 
