@@ -1,7 +1,7 @@
 """Sizes, losses and times of splats in every format that is written, beside those of splat-transform.
 
     python benchmarks/splat_formats.py --data DATA --node NODE_FOLDER
-    python benchmarks/splat_formats.py SPLATS ... --count 1000000 --formats spz sog
+    python benchmarks/splat_formats.py SPLATS ... --divide 9 --count 1000000 --formats 'spz 3' sog
 
 NODE_FOLDER: where 'npm install @playcanvas/splat-transform' was run. Both programs convert the same float
 .ply, one right after the other, as processes of their own: reading and the start of Python or node are in
@@ -44,6 +44,7 @@ def main() -> None:
     parser.add_argument("splats", nargs="*", type=Path, help="files; by default the scenes of DATA")
     parser.add_argument("--node", type=Path, help="folder with splat-transform")
     parser.add_argument("--count", type=int, help="only so many splats of each file, evenly spread")
+    parser.add_argument("--divide", type=int, help="each splat into so many that lie one after the other")
     parser.add_argument("--formats", nargs="+", choices=[*WRITERS], default=[*WRITERS])
     parser.add_argument("--views", type=int, default=3, help="0: no images")
     options = parser.parse_args()
@@ -52,6 +53,8 @@ def main() -> None:
     with Report(options) as report, tempfile.TemporaryDirectory() as folder:
         for name, path in scenes.items():
             cloud = ms.load_gaussians(path)
+            if options.divide:
+                cloud = divided(cloud, options.divide)
             if options.count:
                 cloud = cloud.take(np.linspace(0, len(cloud) - 1, options.count).astype(np.int64))
             report.say(f"{name}, {len(cloud):,} splats of degree {cloud.sh_degree}:")
@@ -66,6 +69,14 @@ def main() -> None:
             for format_ in options.formats:
                 report.row(format_, *row(format_, source, len(cloud), cameras, truths, options.node))
             report.say()
+
+
+def divided(cloud: ms.GaussianCloud, parts: int) -> ms.GaussianCloud:
+    """``cloud`` as some programs thicken splats: ``parts`` of each in place of one, one after the other, with
+    its rotation, scale and colour, and half as far from its centre as it is wide."""
+    many = cloud.take(np.repeat(np.arange(len(cloud)), parts))
+    steps = np.random.default_rng(0).normal(scale=0.5, size=(len(many), 3)) * many.scales
+    return replace(many, means=many.means + np.einsum("nij,nj->ni", many.rotations, steps))
 
 
 def row(

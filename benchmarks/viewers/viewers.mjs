@@ -1,10 +1,11 @@
 // Draws .glb files with three.js and Babylon.js in a headless Chromium, from given cameras.
 //
-//   node viewers.mjs jobs.json      jobs: [{viewer, glb, cameras, out, hash, sorted, antialias, near, far}, ...]
+//   node viewers.mjs jobs.json      jobs: [{viewer, glb, cameras, out, hash, sorted, antialias, passes, near, far}, ...]
 //
 // Runs in a folder where `npm install three babylonjs babylonjs-loaders puppeteer-core` was run; CHROMIUM names
 // the browser. `out` receives one PNG per camera. `sorted` (three.js): triangles are sorted by their centres for each
-// camera, far to near; `antialias`: MSAA. See viewers.py and tuned.py.
+// camera, far to near; `passes` (Babylon.js): useOrderIndependentTransparency with so many, each of which peels a
+// layer from either side; `antialias`: MSAA. See viewers.py, passes.py and tuned.py.
 
 import fs from 'fs';
 import http from 'http';
@@ -53,7 +54,7 @@ function sortTriangles(geometry, order, view) {
   sorted.forEach((t, i) => { for (let k = 0; k < 3; k++) index[3 * i + k] = order[3 * t + k]; });
   geometry.setIndex(new THREE.BufferAttribute(index, 1));
 }
-window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
+window.draw = async (url, cameras, near, far, hash, sorted, antialias, passes) => {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias, preserveDrawingBuffer: true });
   const gltf = await new GLTFLoader().loadAsync(url);
   const scene = new THREE.Scene();
@@ -93,7 +94,7 @@ const BABYLON_PAGE = `<!doctype html><link rel="icon" href="data:,"><canvas id="
 <script>
 ${MATRICES}
 const canvas = document.getElementById('c');
-window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
+window.draw = async (url, cameras, near, far, hash, sorted, antialias, passes) => {
   canvas.width = cameras[0].width; canvas.height = cameras[0].height;
   const engine = new BABYLON.Engine(canvas, antialias, { preserveDrawingBuffer: true, useHighPrecisionMatrix: true, useExactSrgbConversions: true });
   const scene = new BABYLON.Scene(engine);
@@ -104,6 +105,10 @@ window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
   const meshes = scene.meshes.filter(m => m.getTotalVertices() > 0);
   for (const m of meshes) m.alwaysSelectAsActiveMesh = true;
   const mesh = meshes[0];
+  if (passes) {
+    scene.useOrderIndependentTransparency = true;
+    scene.depthPeelingRenderer.passCount = passes;
+  }
   await scene.whenReadyAsync();
   const back = mesh.computeWorldMatrix(true).clone().invert();
   const images = [];
@@ -155,7 +160,7 @@ for (const [i, job] of jobs.entries()) {
   console.log(job.viewer + '=' + await page.evaluate('window.version'));
   const cameras = JSON.parse(fs.readFileSync(job.cameras));
   const images = await page.evaluate(
-    (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash, Boolean(job.sorted), Boolean(job.antialias));
+    (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash, Boolean(job.sorted), Boolean(job.antialias), job.passes ?? 0);
   fs.mkdirSync(job.out, { recursive: true });
   images.forEach((p, n) => fs.writeFileSync(
     path.join(job.out, n + '.png'), Buffer.from(p.split(',')[1], 'base64')));

@@ -43,6 +43,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.formats.cutting import cut_mesh
     from meshsplats.formats.gaussians import load_gaussians, save_gaussian_blocks, save_gaussians
     from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
+    from meshsplats.formats.scenes import save_scene
     from meshsplats.formats.streaming import SplatStream, stream_gaussians
     from meshsplats.formats.tensors import gaussians_from_tensors, gaussians_to_tensors
     from meshsplats.gaussians import GaussianCloud
@@ -94,6 +95,7 @@ _HOME = {
     "meshsplats.formats.base_meshes": ("load_base", "save_base"),
     "meshsplats.formats.cutting": ("cut_mesh",),
     "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussian_blocks", "save_gaussians"),
+    "meshsplats.formats.scenes": ("save_scene",),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
     "meshsplats.formats.streaming": ("SplatStream", "stream_gaussians"),
     "meshsplats.formats.tensors": ("gaussians_from_tensors", "gaussians_to_tensors"),
@@ -195,6 +197,7 @@ __all__ = [
     "save_image",
     "save_mesh",
     "save_mesh_blocks",
+    "save_scene",
     "simplify",
     "splat_dataset",
     "ssim",

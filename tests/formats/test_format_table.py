@@ -195,7 +195,7 @@ def test_the_documents_say_what_is_in_memory():
     told = {name.strip(): text for names, text in rows.items() for name in names.split(", ")}
     shown = {"ply": "gzipped)", "compressed.ply": "compressed `.ply`", "splat": "`.splat`", "gltf": "glTF"}
     shown |= {"spz": "SPZ", "sog": "SOG", "streamed sog": "streamed SOG", "usd": "USD"}
-    shown |= {"ksplat": "`.ksplat`", "lcc": "LCC"}
+    shown |= {"ksplat": "`.ksplat`", "lcc": "LCC", "3d tiles": "3D Tiles"}
     assert {kind.name: told[shown[kind.name]] for kind in FORMATS} == {k.name: k.in_memory for k in FORMATS}
 
 

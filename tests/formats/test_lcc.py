@@ -12,6 +12,7 @@ from _splat_files import expected_cloud, random_splats
 from _splats import refused
 
 import meshsplats as ms
+from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import format_of
 
 
@@ -105,3 +106,9 @@ def test_splat_transform_reads_the_same(tmp_path, node_package):
     )
     np.testing.assert_allclose(ours.scales, theirs.scales, atol=1e-6)
     np.testing.assert_allclose(ours.sh[:, 0], theirs.sh[:, 0], atol=1e-5)
+
+
+def test_a_folder_of_lcc2_is_refused_with_the_command_that_converts_it(tmp_path):
+    (tmp_path / "scene.lcc2").write_text('{"version": "0.0.3", "root": {}}')
+    with pytest.raises(FileFormatError, match=r"splat-transform scene\.lcc2 scene\.ply"):
+        ms.load_gaussians(tmp_path)

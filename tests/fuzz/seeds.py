@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import importlib.util
 import io
+import json
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -117,6 +118,25 @@ _GLB = encode.gltf(encode.splat_accessors(_VALUES), nodes=[{"mesh": 0, "scale": 
 _STREAMED = encode.streamed_sog(
     {"a": _VALUES}, [{0: ("a", 0, 4)}, {0: ("a", 5, 4)}], environment="a/meta.json"
 )
+_BOX = {"boundingVolume": {"box": [0, 0, 0, 9, 0, 0, 0, 9, 0, 0, 0, 9]}, "geometricError": 1}
+_TILES = {
+    "asset": {"version": "1.1"},
+    "root": _BOX
+    | {
+        "refine": "ADD",
+        "content": {"uri": "a.glb"},
+        "transform": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1],
+    }
+    | {"children": [_BOX | {"content": {"uri": "in/sub.json"}}]},
+}
+_TILESET = {
+    "tileset.json": json.dumps(_TILES).encode(),
+    "a.glb": _GLB,
+    "in/sub.json": json.dumps(
+        {"asset": {"version": "1.0"}, "root": _BOX | {"contents": [{"uri": "b.glb"}]}}
+    ).encode(),
+    "in/b.glb": encode.gltf(spz_data=_SPZ[3]),
+}
 
 SEEDS = [
     _ply("ply", "binary_little_endian", 1, False),
@@ -140,6 +160,7 @@ SEEDS = [
     Seed("lcc", encode.lcc(random_splats(9, degree=3)), "meta.lcc"),
     Seed("splat-glb", {"a.glb": _GLB}, "a.glb"),
     Seed("splat-gltf", {"a.gltf": encode.gltf(encode.splat_accessors(_VALUES), kind="gltf")}, "a.gltf"),
+    Seed("splat-tileset", _TILESET, "."),
     Seed("spz-glb", {"a.glb": encode.gltf(spz_data=_SPZ[3])}, "a.glb"),
     *_usd_seeds(),
 ]

@@ -64,7 +64,17 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
 from meshsplats.formats.meshes import MESH_SUFFIXES
-from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats, scaled, splat_options
+from meshsplats.formats.outputs import (
+    CONFIGURATION,
+    Ending,
+    beside,
+    check_outputs,
+    means_splats,
+    scaled,
+    splat_options,
+)
+from meshsplats.formats.scenes import SUFFIXES as SCENE_SUFFIXES
+from meshsplats.formats.scenes import save_scene
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
@@ -77,7 +87,7 @@ _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 _FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
     *("conversion", "reading", "origin", "json", "force", "skip_existing", "spz_version", "linear"),
-    *("up", "scale"),
+    *("up", "scale", "with_mesh", "collider"),
 )
 """Options of the command that have one."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
@@ -167,6 +177,10 @@ class Convert(Command):
     """.spz: version. 4 is read by newer programs only. Default: 3."""
     linear: tyro.conf.Fixed[bool | None] = None
     """Splats as .usdc, .usda, .usdz: linear colours, for renderers that take all colours so."""
+    with_mesh: File = None
+    """Splats as .glb or USD: a mesh to put into the file, too, such as one converted of them."""
+    collider: File = None
+    """Splats as .glb or USD: a mesh that physics engines collide with and nobody draws, in the file."""
     fidelity: Count = None
     """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
     stream: bool = False
@@ -242,6 +256,8 @@ class Convert(Command):
         if self.as_splats:
             self._check_splat_options(kinds)
             return
+        if self.with_mesh is not None or self.collider is not None:
+            raise UsageError("--with-mesh and --collider go beside splats: --as-splats")
         if self.spz_version is not None or self.linear is not None:
             raise UsageError("--set spz_version and linear are for splats: --as-splats")
         glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
@@ -283,6 +299,10 @@ class Convert(Command):
     def _check_splat_options(self, kinds: Sequence[str]) -> None:
         check_splat_endings(*kinds)
         splat_options(kinds, spz_version=self.spz_version, linear=self.linear)
+        if meshes := [path for path in (self.with_mesh, self.collider) if path is not None]:
+            if not all(f".{kind}" in SCENE_SUFFIXES for kind in kinds) or self.linear is not None:
+                raise UsageError("--with-mesh and --collider are for .glb and USD, with display colours")
+            check_outputs([self.output], True, inputs=meshes)
         standard = {f.name: f.default for f in fields(self) if f.name not in _FOR_SPLATS}
         idle = [name for name, value in standard.items() if getattr(self, name) != value]
         explicit = asdict(self.conversion)
@@ -581,11 +601,26 @@ class Convert(Command):
             kinds = [written_ending(path.name) for path in job.outputs]
             taken = splat_options(kinds, spz_version=self.spz_version, linear=self.linear)
             for path, own in zip(job.outputs, taken, strict=True):
-                save_gaussians(result, path, **own)
+                if self.with_mesh is None and self.collider is None:
+                    save_gaussians(result, path, **own)
+                else:
+                    mesh, collider = self._part(self.with_mesh), self._part(self.collider)
+                    save_scene(path, splats=result, mesh=mesh, collider=collider)
         seconds = time.perf_counter() - start
         if job.preview:
             draw_preview(kept, job.preview)
         return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
+
+    def _part(self, path: Path | None) -> SplatMesh | None:
+        """A mesh to write beside the splats, as they are."""
+        if path is None:
+            return None
+        from meshsplats.formats.meshes import load_mesh
+
+        mesh = load_mesh(path)
+        if self.up is not None:
+            mesh = replace(mesh, up=unit_up(parse_up(self.up)))
+        return written(scaled(mesh, self.scale), self.origin)
 
     def _print_result(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> None:
         """Prints the result of a single input."""

@@ -39,12 +39,13 @@ def load_gaussians(
 
     The content decides the format, not the name: `.ply` (float or PlayCanvas compressed, also gzipped),
     `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json), streamed SOG (folder or its lod-meta.json),
-    glTF and GLB with KHR_gaussian_splatting. Of the first three, also the only one in a zip archive.
+    3D Tiles of splats (folder or its tileset.json), glTF and GLB with KHR_gaussian_splatting, USD. Of the
+    first three, also the only one in a zip archive.
 
     A folder is a model of the 3D Gaussian Splatting code, read from the highest iteration of
     ``point_cloud/iteration_*/point_cloud.ply``, or an unpacked SOG file. A streamed SOG scene is read at the
     finest level of detail of each of its nodes; its coarser levels are folders inside it that can be read by
-    themselves.
+    themselves. Likewise the finest tiles of a tileset; one on the globe has up away from the ground.
 
     The cloud has y down and z forward, as float .ply files have. Splats with values that are not finite after
     activation (an infinite opacity logit gives 0 or 1, which is finite) or with a zero quaternion are left

@@ -30,6 +30,7 @@ def open_splats(content: Content, kind: SplatFormat, file: BinaryIO, reading: Re
 
 def to_y_down(kind: SplatFormat, axes: Axes, stored: np.ndarray | None = None) -> np.ndarray:
     """(3, 3) from the axes of a file to y down and z forward; ``stored``: what the file says itself."""
+    stored = kind.reader.to_y_down if stored is None else stored
     if axes == "auto" and stored is not None:
         return stored
     if axes == "y-down" or (axes == "auto" and not kind.y_up):

@@ -94,3 +94,5 @@ class FormatReader:
     """(3,) direction that points up in the axes of the file, where it says so, without reading the splats."""
     motion: Callable[[Content], tuple[str, float, float] | None] = _nothing
     """Name of the layout, first and last time of splats that move in time."""
+    to_y_down: np.ndarray | None = None
+    """(3, 3) map from the axes of all its files to x right, y down, z forward; None: as the table says."""

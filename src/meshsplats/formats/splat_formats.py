@@ -148,6 +148,14 @@ FORMATS: tuple[SplatFormat, ...] = (
         folder_file="meta.lcc",
     ),
     SplatFormat(
+        "3d tiles",
+        (),
+        "gltf.splat_tilesets",
+        "3D Tiles of splats (`tileset.json`, the finest tiles)",
+        "one tile at a time",
+        folder_file="tileset.json",
+    ),
+    SplatFormat(
         "gltf",
         (".glb", ".gltf"),
         "gltf.splats",

@@ -55,6 +55,8 @@ def splat_file(path: Path) -> Path:
     for name in folder_files():
         if (path / name).is_file():
             return path / name
+    if scenes := files_named(path, (".lcc2",)):  # whose refusal says how to convert them
+        return scenes[0]
     for folder in (path / "point_cloud", path):
         iterations = [
             (int(match[1]), found)
@@ -66,8 +68,6 @@ def splat_file(path: Path) -> Path:
             return max(iterations)[1]
         if found := _model_file(folder):
             return found
-    if (path / "tileset.json").is_file():
-        raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
     photographs = [name for name in _OF_PHOTOGRAPHS if (path / name).exists()]
     if photographs:
         raise FileFormatError(

@@ -28,6 +28,7 @@ from meshsplats.formats.gltf.own import (
     warn,
 )
 from meshsplats.formats.gltf.scene import Placed, Skinning, placed_meshes
+from meshsplats.formats.gltf.scene_parts import is_splats, shown_meshes
 from meshsplats.formats.gltf.view_colors import Stored, put_back, stored_colors
 from meshsplats.mesh import SplatMesh
 from meshsplats.spherical_harmonics import moved_harmonics
@@ -89,7 +90,7 @@ def listed_nodes(path: Path) -> int:
 
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     path = document.path
-    placed = list(placed_meshes(document))
+    placed = shown_meshes(document)
     pieces, skipped, textured = [], 0, 0
     note = our_note(placed[0].mesh) if placed else {}
     if len(placed) != max(1, copies.counts(note.get("copies"))):
@@ -272,7 +273,7 @@ def pbr_of(material: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
-    if any("gaussian_splatting" in name for name in dict_or_empty(primitive.get("extensions"))):
+    if is_splats(primitive):
         raise document.error("holds Gaussian splats, not a mesh; read it with load_gaussians")
 
 

@@ -2,7 +2,7 @@
 
 A primitive of points is a cloud of splats; its attributes are already activated, and nodes place it. glTF
 scenes have x to the left, y up and z forward. Drafts of the extension stored log scales, recognised by
-negative values.
+negative values, and SPZ in the axes of the glTF file.
 """
 
 from __future__ import annotations
@@ -45,12 +45,8 @@ _EXTENSIONS = frozenset({EXTENSION, *_COMPRESSED})
 def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = None) -> GaussianCloud:
     """The splats of all nodes of a glTF scene, in its frame, relative to ``origin``, by default one that
     suits them; errors as ``load_gaussians``."""
-    document = GltfDocument(path, also_known=_EXTENSIONS)
-    placed = [
-        (_cloud(document, primitive, strict=strict), place.matrix)
-        for place in placed_meshes(document)
-        for primitive in _splat_primitives(document, place.mesh)
-    ]
+    document = splat_document(path)
+    placed = placed_clouds(document, strict=strict)
     if not placed:
         raise document.error(
             f"a glTF file without splats (no primitive has {EXTENSION}); load_mesh reads meshes"
@@ -69,9 +65,33 @@ def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = Non
     return joined_within(clouds, document.budget)
 
 
-def turn_of(up: np.ndarray | None) -> list[float]:
-    """Unit quaternion x, y, z, w of the node of our own files, for a cloud with this ``up``."""
-    return up_quaternion(HALF_TURN_Z @ (np.array([0.0, -1.0, 0.0]) if up is None else up))
+def splat_document(path: Path) -> GltfDocument:
+    """The glTF file ``path``, in which extensions of splats may be required."""
+    return GltfDocument(path, also_known=_EXTENSIONS)
+
+
+def names_splats(document: GltfDocument) -> bool:
+    """Whether a file names the extension."""
+    return any(document.uses(name) for name in _EXTENSIONS)
+
+
+def placed_clouds(document: GltfDocument, *, strict: bool) -> list[tuple[GaussianCloud, np.ndarray]]:
+    """The splats of each primitive, in the frame of its node, and (4, 4) from there to the scene's."""
+    return [
+        (_cloud(document, primitive, strict=strict), place.matrix)
+        for place in placed_meshes(document)
+        for primitive in _splat_primitives(document, place.mesh)
+    ]
+
+
+def turn_of(up: np.ndarray | None, *, beside_meshes: bool = False) -> list[float]:
+    """Unit quaternion x, y, z, w of the node of our own files, for a cloud with this ``up``;
+    ``beside_meshes``: one that leads to where the node of a mesh of the same world leads."""
+    up = np.array([0.0, -1.0, 0.0]) if up is None else up
+    if beside_meshes:
+        x, y, z, w = up_quaternion(up)
+        return [y, -x, w, -z]  # after the half turn about z, the quaternion k
+    return up_quaternion(HALF_TURN_Z @ up)
 
 
 def _own(document: GltfDocument, cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud | None:
@@ -84,7 +104,8 @@ def _own(document: GltfDocument, cloud: GaussianCloud, matrix: np.ndarray) -> Ga
     direction, place = (HALF_TURN_Z @ v.astype(np.float64) for v in vectors)
     if kernel not in get_args(Kernel) or (up is not None and not direction.any()):
         return None
-    x, y, z, w = turn_of(None if up is None else HALF_TURN_Z @ direction)
+    beside = note.get("besideMeshes") is True
+    x, y, z, w = turn_of(None if up is None else HALF_TURN_Z @ direction, beside_meshes=beside)
     turn = np.array(list(rotation_rows(w, x, y, z)))
     reach = max(1e-6, 1e-12 * float(np.abs(place).max()))
     moved = np.abs(matrix[:3, :3] - turn).max() > 1e-6 or np.abs(matrix[:3, 3] - turn @ place).max() > reach
@@ -130,8 +151,7 @@ def _matches(content: Content) -> bool:
 
 def _has_splats(content: Content) -> bool:
     """Whether a glTF file names the extension; a broken file raises FileFormatError."""
-    document = GltfDocument(content.path, also_known=_EXTENSIONS)
-    return any(document.uses(name) for name in _EXTENSIONS)
+    return names_splats(splat_document(content.path))
 
 
 def _splat_primitives(document: GltfDocument, mesh: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -151,6 +171,8 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
             spz = spz_in_memory(data, document.path, document.budget)
             assert spz.to_y_down is not None  # every SPZ file has axes
             cloud = spz.read(strict=strict, origin=zero_origin())
+            if not _ratified(splatting):
+                return cloud
             return cloud.transformed(HALF_TURN_Z @ spz.to_y_down)
     if (shape := splatting.get("kernel", "ellipse")) != "ellipse":
         warnings.warn(
@@ -189,6 +211,15 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
         return cloud
     say_converted(document.path)
     return display_cloud(cloud)
+
+
+def _ratified(splatting: dict[str, Any]) -> bool:
+    """Whether an extension object has what KHR_gaussian_splatting as ratified requires.
+
+    Its drafts had neither property. Files of their time, such as Cesium ion's, hold SPZ in the axes of the
+    glTF file, as CesiumJS reads it; the draft of the SPZ extension says that it is in SPZ's own.
+    """
+    return "kernel" in splatting or "colorSpace" in splatting
 
 
 def _attribute(

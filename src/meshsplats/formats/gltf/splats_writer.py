@@ -28,6 +28,14 @@ _ARRAY_BUFFER = 34962
 
 def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud``; see ``save_gaussians``. ValueError for more than the 4 GiB that a file can hold."""
+    document, chunk = splats_part(cloud)
+    advice = ": write .ply, or .sog, which is a twentieth of it"
+    write_binary(path, document, chunk, what=f"{writing.where}: the splats", advice=advice)
+
+
+def splats_part(cloud: GaussianCloud, *, beside_meshes: bool = False) -> tuple[dict[str, Any], BinaryChunk]:
+    """The document of ``cloud`` and its chunk. ``beside_meshes``: its node turns it to where our writer of
+    meshes puts those of the same world, whose axes have no half turn about the vertical."""
     from meshsplats import __version__
 
     turned = cloud.transformed(HALF_TURN_Z)
@@ -46,14 +54,13 @@ def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "splats", "mesh": 0, **_place(cloud)}],
-        "meshes": [{"name": "splats", "primitives": [primitive], **_note(cloud)}],
+        "nodes": [{"name": "splats", "mesh": 0, **_place(cloud, beside_meshes)}],
+        "meshes": [{"name": "splats", "primitives": [primitive], **_note(cloud, beside_meshes)}],
         "accessors": chunk.accessors,
         "bufferViews": chunk.views,
         "buffers": [{"byteLength": chunk.length}],
     }
-    advice = ": write .ply, or .sog, which is a twentieth of it"
-    write_binary(path, document, chunk, what=f"{writing.where}: the splats", advice=advice)
+    return document, chunk
 
 
 def _attributes(cloud: GaussianCloud) -> dict[str, np.ndarray]:
@@ -72,9 +79,9 @@ def _attributes(cloud: GaussianCloud) -> dict[str, np.ndarray]:
     return found
 
 
-def _place(cloud: GaussianCloud) -> dict[str, Any]:
+def _place(cloud: GaussianCloud, beside_meshes: bool) -> dict[str, Any]:
     """Of the node."""
-    x, y, z, w = turn_of(cloud.up)
+    x, y, z, w = turn_of(cloud.up, beside_meshes=beside_meshes)
     place = {} if w == 1 else {"rotation": [x, y, z, w]}
     if cloud.origin.any():
         turn = np.array(list(rotation_rows(w, x, y, z))) @ HALF_TURN_Z
@@ -82,9 +89,9 @@ def _place(cloud: GaussianCloud) -> dict[str, Any]:
     return place
 
 
-def _note(cloud: GaussianCloud) -> dict[str, Any]:
+def _note(cloud: GaussianCloud, beside_meshes: bool) -> dict[str, Any]:
     """What only this project reads of a mesh."""
-    note: dict[str, Any] = {"version": 1}
+    note: dict[str, Any] = {"version": 1} | ({"besideMeshes": True} if beside_meshes else {})
     if cloud.up is not None:
         note["up"] = cloud.up.astype(np.float64).tolist()
     if cloud.origin.any():

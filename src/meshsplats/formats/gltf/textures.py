@@ -20,7 +20,7 @@ from meshsplats.formats.gltf.reader import (
     pbr_of,
     primitive_faces,
 )
-from meshsplats.formats.gltf.scene import placed_meshes
+from meshsplats.formats.gltf.scene_parts import shown_meshes
 
 _WRAPS: dict[object, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _SOURCES = ("EXT_texture_webp",)
@@ -38,7 +38,7 @@ def gltf_textures(
     document = GltfDocument(path)
     found = _Textures(document, read)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
-    for place in placed_meshes(document):
+    for place in shown_meshes(document):
         for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
             if primitive.get("mode", 4) in POINTS_TO_LINES:
                 continue

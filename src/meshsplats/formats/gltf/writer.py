@@ -114,6 +114,14 @@ def write_glb(
     write_binary(path, document, chunk, what="the mesh", advice=advice)
 
 
+def mesh_part(mesh: SplatMesh, *, lit: bool) -> tuple[dict[str, Any], BinaryChunk]:
+    """The document of ``mesh`` and its chunk, blended or, where it is all opaque, solid; errors as
+    ``write_glb``."""
+    check_attribute_names(mesh)
+    alpha: Alpha = "opaque" if bool((mesh.colors[:, 3] == 1).all()) else "blend"
+    return _document(mesh, lit, _Colors(mesh, "uint16", "attributes"), alpha, CUTOFF, True, None)
+
+
 class _Colors:
     """How the colours of ``mesh``, and of parts of it, are stored."""
 

@@ -30,6 +30,14 @@ def sorted_in_space(points: np.ndarray) -> np.ndarray:
     return np.argsort(morton_codes(logs, low, side, 16), kind="stable")
 
 
+def order_for_streams(points: np.ndarray, shapes: np.ndarray) -> np.ndarray | slice:
+    """In which order to write splats whose attributes are compressed as streams: sorted in space, or as they
+    are where one in four has the very shape (n, k) of the one before. A cloud made by dividing splats repeats
+    itself so, and compressors find it; sorting would scatter it."""
+    repeats = (shapes[1:] == shapes[:-1]).all(axis=1)
+    return slice(None) if 4 * int(repeats.sum()) > len(shapes) else sorted_in_space(points)
+
+
 def nearest_axes(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same ellipsoids by their smallest rotations: (n, 4) quaternions, (n, 3) scales.
 

@@ -81,8 +81,7 @@ def _open(content: Content, file: BinaryIO, _: Reading) -> SplatReader:
         where,
         chunks,
         positions,
-        up=np.array([0.0, 0.0, 1.0]),
-        to_y_down=_FROM_Z_UP,
+        up=_up(content),
         close_files=close,
     )
 
@@ -213,4 +212,8 @@ def _between(ends: tuple[np.ndarray, np.ndarray], shares: np.ndarray) -> np.ndar
     return ends[0] * (1 - shares) + ends[1] * shares
 
 
-READER = FormatReader(_matches, _open)
+def _up(_: Content) -> np.ndarray:
+    return np.array([0.0, 0.0, 1.0])
+
+
+READER = FormatReader(_matches, _open, up=_up, to_y_down=_FROM_Z_UP)

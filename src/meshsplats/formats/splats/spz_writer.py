@@ -1,7 +1,7 @@
 """Writes SPZ: version 3, one gzip stream, or 4, a Zstandard stream for each attribute (extra ``formats``).
 
-Splats are sorted in space, and named by their smallest rotations, so that streams compress well. Harmonics
-keep 5 bits at degree 1 and 4 bits beyond, as those of other writers.
+Splats are sorted in space, unless they repeat each other as they are, and named by their smallest rotations,
+so that streams compress well. Harmonics keep 5 bits at degree 1 and 4 bits beyond, as those of other writers.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 from meshsplats.errors import DataWarning
 from meshsplats.formats._activation import log_scales
 from meshsplats.formats._orientation import HALF_TURN_X
-from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, sorted_in_space
+from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, order_for_streams
 from meshsplats.formats.splats._spz_layout import ANTIALIASED, COLOR_SCALE, MAGIC, REST, zstandard_modules
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
 from meshsplats.gaussians import GaussianCloud
 
 _FEWEST_BITS, _MOST_BITS = 12, 22
-_STEPS = 12
+_STEPS = 8
 """Steps of positions, at least, in the deviation that most splats exceed along their second axis."""
 _FIRST_BUCKET, _BUCKET = 8, 16
 """Steps of 1/128 in a step of harmonics of degree 1 and beyond."""
@@ -86,7 +86,7 @@ def _fraction_bits(cloud: GaussianCloud, where: object) -> int:
 
 def _streams(cloud: GaussianCloud, bits: int) -> list[bytes]:
     """The attributes in file order, in the axes of the format; none of harmonics of degree 0."""
-    cloud = cloud.take(sorted_in_space(cloud.means)).transformed(HALF_TURN_X)
+    cloud = cloud.take(order_for_streams(cloud.means, cloud.quaternions)).transformed(HALF_TURN_X)
     quaternions, scales = nearest_axes(cloud.quaternions, cloud.scales)
     limit = 2**23 - 1
     fixed = np.clip(np.rint(cloud.means.astype(np.float64) * 2.0**bits), -limit, limit).astype("<i4")

@@ -38,28 +38,37 @@ _EXTENT = 3.0
 def write_usd_splats(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud``; see ``save_gaussians``. MissingDependencyError without usd-core."""
     try:
-        from pxr import UsdUtils
+        import pxr  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
             f"{writing.where}: writing USD needs the extra 'usd': pip install usd-core"
         ) from error
-    stage = _stage(linear_cloud(cloud) if writing.linear else cloud, linear=bool(writing.linear))
+    stage = splats_stage(linear_cloud(cloud) if writing.linear else cloud, linear=bool(writing.linear))
     if writing.where.suffix.lower() != ".usdz":
-        _export(stage, path)
+        export(stage, path)
         return
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".meshsplats-") as folder:
         inner = Path(folder) / "splats.usdc"
-        _export(stage, inner)
-        if not UsdUtils.CreateNewUsdzPackage(str(inner), str(path)):
-            raise OSError(f"usd-core could not write {path}")
+        export(stage, inner)
+        packed(inner, path)
 
 
-def _export(stage: Any, path: Path) -> None:
+def packed(layer: Path, path: Path) -> None:
+    """Writes a .usdz package of a ``layer`` and what it refers to."""
+    from pxr import UsdUtils
+
+    if not UsdUtils.CreateNewUsdzPackage(str(layer), str(path)):
+        raise OSError(f"usd-core could not write {path}")
+
+
+def export(stage: Any, path: Path) -> None:
+    """Writes a stage to the file ``path``."""
     if not stage.GetRootLayer().Export(str(path)):
         raise OSError(f"usd-core could not write {path}")
 
 
-def _stage(cloud: GaussianCloud, *, linear: bool) -> Any:
+def splats_stage(cloud: GaussianCloud, *, linear: bool) -> Any:
+    """A stage of ``cloud``; ``linear``: its colours are. Needs usd-core."""
     from pxr import Gf, Sdf, UsdGeom, Vt
 
     stage, root = new_stage()

@@ -32,9 +32,18 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     MissingDependencyError without usd-core.
     """
     try:
-        from pxr import Gf, Sdf, Tf, UsdGeom, Vt
+        import pxr  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
+    stage = mesh_stage(mesh, lit=lit)  # its layer does not outlive it
+    if not stage.GetRootLayer().Export(str(path)):
+        raise OSError(f"usd-core could not write {path}")
+
+
+def mesh_stage(mesh: SplatMesh, *, lit: bool) -> Any:
+    """The stage that ``write_usd`` writes. Needs usd-core."""
+    from pxr import Gf, Sdf, Tf, UsdGeom, Vt
+
     check_attribute_names(mesh)
     stage, root = new_stage()
     x, y, z, w = up_quaternion(mesh.up)
@@ -112,8 +121,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         note |= {"attributes": Vt.StringArray(names), "primvars": Vt.StringArray(plain_names)}
         note["columns"] = Vt.IntArray(widths)  # -1: one number per vertex, not a table of one column
     shape.GetPrim().SetCustomData({"meshsplats": note})
-    if not stage.GetRootLayer().Export(str(path)):
-        raise OSError(f"usd-core could not write {path}")
+    return stage
 
 
 def _add_material(stage: Any, shape: Any, lit: bool, *, opaque: bool) -> None:

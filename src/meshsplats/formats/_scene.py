@@ -1,0 +1,19 @@
+"""What a file of several parts holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+
+@dataclass(frozen=True)
+class SceneParts:
+    """What a file holds, relative to any origins of one world, with one ``up``."""
+
+    splats: GaussianCloud | None
+    mesh: SplatMesh | None
+    surface: BaseMesh | None
+    collider: BaseMesh | None

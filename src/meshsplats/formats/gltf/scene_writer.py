@@ -1,0 +1,217 @@
+"""Writes several parts of a scene as one binary glTF file: each as its own writer makes it, joined here.
+
+Splats lie in the axes of other splat files; their node turns them to where meshes of the same world are. The
+collider is a mesh that no viewer draws, as its material lets nothing of it pass the alpha test.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.colors import srgb_to_linear
+from meshsplats.errors import MissingDependencyError
+from meshsplats.formats._scene import SceneParts
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
+from meshsplats.formats.gltf.splats_writer import splats_part
+from meshsplats.formats.gltf.writer import mesh_part, turned_origin, up_quaternion
+
+COLLIDER = "collider-colonly"
+"""Godot's suffix for a mesh that becomes a collider and is not drawn."""
+_FLOAT, _UINT32 = 5126, 5125
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
+_REFERS = {
+    "bufferView": "bufferViews",
+    "indices": "accessors",
+    "mesh": "meshes",
+    "material": "materials",
+    "index": "textures",
+    "source": "images",
+    "sampler": "samplers",
+}
+"""Keys of numbers that are indices, and of what."""
+_LISTS = ("nodes", "accessors", "bufferViews", "meshes", "materials", "textures", "images", "samplers")
+
+Part = tuple[dict[str, Any], BinaryChunk]
+
+
+def write_scene_glb(parts: SceneParts, path: Path, *, lit: bool) -> None:
+    """Writes ``parts``; see ``save_scene``. ValueError for more than the 4 GiB that a file can hold."""
+    made: list[Part] = []
+    if parts.splats is not None:
+        made.append(splats_part(parts.splats, beside_meshes=True))
+    if parts.mesh is not None:
+        made.append(mesh_part(parts.mesh, lit=lit))
+    if parts.surface is not None:
+        made.append(_surface_part(parts.surface, lit))
+    if parts.collider is not None:
+        made.append(_collider_part(parts.collider))
+    document, chunk = _joined(made)
+    write_binary(path, document, chunk, what="the scene", advice="; write its parts apart")
+
+
+def _joined(parts: list[Part]) -> Part:
+    """One file of all parts: indices in the later ones are moved behind those of the earlier ones."""
+    whole: dict[str, list[Any]] = {name: [] for name in _LISTS}
+    chunk = BinaryChunk()
+    roots: list[int] = []
+    used: set[str] = set()
+    for document, own in parts:
+        first = {name: len(entries) for name, entries in whole.items()}
+        for view in own.views:
+            view["byteOffset"] += chunk.length
+        for name in _LISTS:
+            whole[name] += [_moved(entry, first) for entry in document.get(name, [])]
+        roots += [root + first["nodes"] for root in document["scenes"][0]["nodes"]]
+        used |= set(document.get("extensionsUsed", []))
+        chunk.parts += own.parts
+        chunk.length += own.length
+    joined = {"asset": parts[0][0]["asset"], "scene": 0, "scenes": [{"nodes": roots}]}
+    joined |= {name: entries for name, entries in whole.items() if entries}
+    if used:
+        joined["extensionsUsed"] = sorted(used)
+    return joined | {"buffers": [{"byteLength": chunk.length}]}, chunk
+
+
+def _moved(value: Any, first: dict[str, int]) -> Any:
+    """``value`` of a document with its indices moved."""
+    if isinstance(value, list):
+        return [_moved(entry, first) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    found: dict[str, Any] = {}
+    for key, entry in value.items():
+        if key in _REFERS and isinstance(entry, int):
+            found[key] = entry + first[_REFERS[key]]
+        elif key == "attributes" and isinstance(entry, dict):
+            found[key] = {name: index + first["accessors"] for name, index in entry.items()}
+        elif key == "children":
+            found[key] = [index + first["nodes"] for index in entry]
+        else:
+            found[key] = _moved(entry, first)
+    return found
+
+
+def _collider_part(collider: BaseMesh) -> Part:
+    chunk = BinaryChunk()
+    primitive = _triangles(chunk, collider.vertices, collider.faces)
+    invisible = {"baseColorFactor": [1, 1, 1, 0]}
+    material = {"name": "invisible", "alphaMode": "MASK", "pbrMetallicRoughness": invisible}
+    note = {"meshsplats": {"version": 1, "collider": True}}
+    meshes = [{"name": COLLIDER, "primitives": [primitive], "extras": note}]
+    return _document(chunk, COLLIDER, collider, meshes, [material])
+
+
+def _surface_part(base: BaseMesh, lit: bool) -> Part:
+    """A primitive for the faces of each texture, and one for those without."""
+    chunk = BinaryChunk()
+    of_face = np.full(len(base.faces), -1) if base.face_texture is None else base.face_texture
+    primitives, samplers = [], []
+    materials: list[dict[str, Any]] = []
+    images: list[dict[str, Any]] = []
+    for texture in np.unique(of_face):
+        chosen = of_face == texture
+        corners, factor = base.faces[chosen].reshape(-1), None
+        if texture < 0 or base.uv is None:
+            used, faces = np.unique(corners, return_inverse=True)
+            extra = {}
+        else:
+            rows = np.concatenate([corners[:, None], base.uv[chosen].reshape(-1, 2)], axis=1)
+            rows, faces = np.unique(rows, axis=0, return_inverse=True)
+            used, extra = rows[:, 0].astype(np.int64), {"TEXCOORD_0": rows[:, 1:].astype(np.float32)}
+        if texture < 0 and base.colors is not None:
+            linear = base.colors[used].copy()
+            linear[:, :3] = srgb_to_linear(linear[:, :3])
+            extra["COLOR_0"] = linear
+        if texture >= 0:
+            source = base.textures[texture]
+            factor = {"baseColorFactor": list(source.factor), "baseColorTexture": {"index": len(images)}}
+            images.append({"mimeType": "image/png", "bufferView": _image(chunk, source.pixels)})
+            samplers.append({"wrapS": _WRAPS[source.wrap[0]], "wrapT": _WRAPS[source.wrap[1]]})
+        primitive = _triangles(chunk, base.vertices[used], faces.reshape(-1, 3).astype(np.int32), extra)
+        primitives.append(primitive | {"material": len(materials)})
+        mode = "OPAQUE" if texture < 0 else alpha_mode(base.textures[texture])
+        materials.append(_material(factor or {}, mode, lit))
+    meshes = [{"name": "surface", "primitives": primitives}]
+    document, chunk = _document(chunk, "surface", base, meshes, materials)
+    if images:
+        listed = [{"source": i, "sampler": i} for i in range(len(images))]
+        document |= {"images": images, "samplers": samplers, "textures": listed}
+    if not lit:
+        document["extensionsUsed"] = ["KHR_materials_unlit"]
+    return document, chunk
+
+
+def alpha_mode(texture: Texture) -> str:
+    """That of glTF: BLEND where any pixel is translucent."""
+    opacities = texture.pixels[..., 3]
+    if texture.factor[3] < 1 or bool(((opacities > 0) & (opacities < 255)).any()):
+        return "BLEND"
+    return "MASK" if bool((opacities == 0).any()) else "OPAQUE"
+
+
+def _material(base: dict[str, Any], alpha_mode: str, lit: bool) -> dict[str, Any]:
+    material: dict[str, Any] = {
+        "name": "surface",
+        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1, **base},
+        "doubleSided": True,
+        "alphaMode": alpha_mode,
+    }
+    return material if lit else material | {"extensions": {"KHR_materials_unlit": {}}}
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """The image (h, w, 4) uint8 as PNG; without alpha where all is opaque. MissingDependencyError without
+    Pillow."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingDependencyError("textures need the package pillow: pip install pillow") from error
+    opaque = (pixels[..., 3] == 255).all()
+    out = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels[..., :3] if opaque else pixels)).save(out, "PNG")
+    return out.getvalue()
+
+
+def _image(chunk: BinaryChunk, pixels: np.ndarray) -> int:
+    return chunk.view(np.frombuffer(png_of(pixels), np.uint8))
+
+
+def _triangles(
+    chunk: BinaryChunk, vertices: np.ndarray, faces: np.ndarray, extra: dict[str, np.ndarray] | None = None
+) -> dict[str, Any]:
+    corners = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    attributes = {"POSITION": chunk.accessor(vertices, _FLOAT, _ARRAY_BUFFER, **corners)}
+    for name, array in (extra or {}).items():
+        attributes[name] = chunk.accessor(array, _FLOAT, _ARRAY_BUFFER)
+    indices = chunk.accessor(faces.reshape(-1).view(np.uint32), _UINT32, _ELEMENT_ARRAY_BUFFER)
+    return {"attributes": attributes, "indices": indices, "material": 0}
+
+
+def _document(
+    chunk: BinaryChunk,
+    name: str,
+    base: BaseMesh,
+    meshes: list[dict[str, Any]],
+    materials: list[dict[str, Any]],
+) -> Part:
+    from meshsplats import __version__
+
+    node: dict[str, Any] = {"name": name, "mesh": 0, "rotation": up_quaternion(base.up)}
+    if base.origin.any():
+        node["translation"] = turned_origin(base).tolist()
+    document = {
+        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": meshes,
+        "materials": materials,
+        "accessors": chunk.accessors,
+        "bufferViews": chunk.views,
+    }
+    return document, chunk
