@@ -14,7 +14,8 @@ import pytest
 from _meshes import assert_same, random_mesh
 
 from meshsplats import SplatMesh, load_mesh, save_mesh
-from meshsplats.formats.gltf.writer import computed_normals, up_quaternion
+from meshsplats.formats._orientation import up_quaternion
+from meshsplats.formats.gltf.writer import computed_normals
 
 SQUARE = SplatMesh(
     vertices=[[0, 0, 2], [1, 0, 2], [1, 1, 2], [0, 1, 2]],

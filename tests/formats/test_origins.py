@@ -36,9 +36,9 @@ from meshsplats import (
 from meshsplats._origin import choose_origin, in_words
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats.gaussians import save_gaussian_blocks
 from meshsplats.formats.gltf.scene import rotation_matrix
-from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.meshes import save_mesh_blocks
 from meshsplats.formats.tensors import gaussians_from_tensors
 

@@ -24,8 +24,8 @@ from meshsplats._json import read_json
 from meshsplats._kinds import need_path
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats.gltf.scene import rotation_matrix
-from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import NAME

@@ -11,13 +11,14 @@ import numpy as np
 
 from meshsplats.binding import Binding
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats._validation import checked
 from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.compressed import Grid
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.view_colors import IN_VIEW_COLORS
-from meshsplats.formats.gltf.writer import camel_case, up_quaternion
+from meshsplats.formats.gltf.writer import camel_case
 from meshsplats.mesh import Blending, SplatMesh
 
 

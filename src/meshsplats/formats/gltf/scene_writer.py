@@ -15,10 +15,11 @@ import numpy as np
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
 from meshsplats.formats.gltf.splats_writer import splats_part
-from meshsplats.formats.gltf.writer import mesh_part, turned_origin, up_quaternion
+from meshsplats.formats.gltf.writer import mesh_part
 
 COLLIDER = "collider-colonly"
 """Godot's suffix for a mesh that becomes a collider and is not drawn."""

@@ -20,12 +20,11 @@ from meshsplats._geometry import rotation_rows
 from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
-from meshsplats.formats._orientation import HALF_TURN_Z
+from meshsplats.formats._orientation import HALF_TURN_Z, up_quaternion
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
-from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within

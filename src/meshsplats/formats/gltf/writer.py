@@ -19,11 +19,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows, vertex_normals
-from meshsplats.base_mesh import BaseMesh
+from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.draw_order import DrawOrder
+from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf import compressed, copies
@@ -400,27 +400,6 @@ def _semantic(name: str, taken: dict[str, int]) -> str:
     while candidate in taken:
         candidate, number = f"{plain}_{number}", number + 1
     return candidate
-
-
-def up_quaternion(up: np.ndarray) -> list[float]:
-    """Unit quaternion x, y, z, w of a rotation that takes the unit vector ``up`` to +y: the shortest one, for
-    directions below the horizon after a half turn about x.
-
-    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is that half turn: x stays
-    right, and a camera that looked along +z looks along -z, as glTF's do. Directions near -y differ little
-    from it, where the shortest rotation could have any axis.
-    """
-    x, y, z = (float(u) for u in np.asarray(up, np.float64) / np.linalg.norm(np.asarray(up, np.float64)))
-    # up x (0, 1, 0) = (-z, 0, x); half-angle form of the shortest rotation between unit vectors. After the
-    # half turn, (x, y, z) is (x, -y, -z), and (a, b, c, w) (1, 0, 0, 0) = (w, c, -b, -a).
-    q = np.array([-z, 0.0, x, 1 + y]) if y >= 0 else np.array([1 - y, x, 0.0, -z])
-    return [float(c) + 0.0 for c in q / np.linalg.norm(q)]  # no negative zeros
-
-
-def turned_origin(mesh: SplatMesh | BaseMesh) -> np.ndarray:
-    """(3,) float64 place of the mesh's origin in a frame whose +y is its ``up``."""
-    x, y, z, w = up_quaternion(mesh.up)
-    return np.array(list(rotation_rows(w, x, y, z))) @ mesh.origin + 0.0
 
 
 def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:

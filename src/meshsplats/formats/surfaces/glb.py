@@ -9,8 +9,8 @@ import numpy as np
 
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
+from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
-from meshsplats.formats.gltf.writer import turned_origin, up_quaternion
 from meshsplats.formats.surfaces.corners import corners_of, texture_file
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125

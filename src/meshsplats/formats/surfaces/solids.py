@@ -9,7 +9,7 @@ import numpy as np
 
 from meshsplats._geometry import rotation_rows
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats._orientation import up_quaternion
 
 _Y_TO_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 _TYPES = (

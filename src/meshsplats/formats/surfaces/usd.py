@@ -12,7 +12,7 @@ from meshsplats._files.atomic import write_bytes
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats.gltf.writer import turned_origin, up_quaternion
+from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats.surfaces.corners import smooth_normals, texture_file
 from meshsplats.formats.usd.stage import new_stage
 

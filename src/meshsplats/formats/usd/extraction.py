@@ -22,8 +22,8 @@ from meshsplats._arrays import joined_rows
 from meshsplats._origin import choose_origin, lost_detail, sampled, zero_origin
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.spherical_harmonics import TERMS, moved_harmonics

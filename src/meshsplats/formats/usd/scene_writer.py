@@ -15,9 +15,9 @@ import numpy as np
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.scene_writer import alpha_mode, png_of
-from meshsplats.formats.gltf.writer import turned_origin, up_quaternion
 from meshsplats.formats.usd.splats_writer import export, packed, splats_stage
 from meshsplats.formats.usd.stage import new_stage
 from meshsplats.formats.usd.writer import mesh_stage

@@ -21,8 +21,7 @@ import numpy as np
 from meshsplats._geometry import rotation_rows
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._display import linear_cloud
-from meshsplats.formats._orientation import HALF_TURN_X
-from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats._orientation import HALF_TURN_X, up_quaternion
 from meshsplats.formats.usd.stage import new_stage
 from meshsplats.formats.writing import FormatWriter, Writing
 from meshsplats.gaussians import GaussianCloud

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._validation import check_attribute_names
-from meshsplats.formats.gltf.writer import computed_normals, linear_colors, turned_origin, up_quaternion
+from meshsplats.formats.gltf.writer import computed_normals, linear_colors
 from meshsplats.formats.usd.stage import new_stage
 from meshsplats.mesh import SplatMesh
 
