@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -71,7 +71,9 @@ class Surface(Command):
     """Camera file: from where images are made, in place of --views."""
     unlit: bool = False
     """A material that shows the texture as it is, without lights."""
-    image: TextureImage | None = None
+    image: Annotated[
+        TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")
+    ] = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     scale: Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
