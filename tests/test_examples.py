@@ -11,8 +11,8 @@ import pytest
 from meshsplats import demo_scene
 from meshsplats.errors import MissingDependencyError
 
-ARGUMENTS = {"08_photographs": ["12", "64", "20"]}
-"""Fewer and smaller photographs, and fewer steps, run the same lines."""
+ARGUMENTS = {"08_photographs": ["12", "64", "20"], "10_surface": ["64"]}
+"""Fewer and smaller images, and fewer steps, run the same lines."""
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
 
 

@@ -41,9 +41,14 @@ def _without_flaps(faces: np.ndarray) -> np.ndarray:
 def _cut(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with a vertex of its own for each sheet in the middle of every edge where several meet."""
     whole, points = faces.tolist(), [*vertices]
+    most = len(faces)
     for _ in range(_ROUNDS):
-        at_start, places = np.array(whole), np.array(points)
+        at_start, places = _without_flaps(np.array(whole)), np.array(points)
+        whole = at_start.tolist()
         _, groups = _edges(at_start)
+        if not 0 < len(groups) < most:  # done, or no longer getting better
+            break
+        most = len(groups)
         touched: set[int] = set()
         for halves in groups:
             pairs = _paired(places, at_start, halves) // 3
@@ -61,9 +66,8 @@ def _cut(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
                     a, b, c = (whole[index][(tail + k) % 3] for k in range(3))
                     whole[index] = [a, len(points) - 1, c]
                     whole.append([len(points) - 1, b, c])
-        if not groups:
-            break
-    return np.array(points), np.array(whole, faces.dtype)
+    used, index = np.unique(np.array(whole), return_inverse=True)
+    return np.array(points)[used], index.reshape(-1, 3).astype(faces.dtype)
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
