@@ -317,17 +317,33 @@ def joined(parts) -> tuple[np.ndarray, np.ndarray]:
 def test_solids_that_touch_at_an_edge_are_two():
     points, faces = joined([box((0, 0, 0)), box((1, 1, 0))])
     assert uses_of_edges(faces) == [2, 4]
-    split, apart = split_pinches(points, faces)
+    split, apart, _ = split_pinches(points, faces)
     assert uses_of_edges(apart) == [2]
     assert len(split) == 16, "the inside of each cube stays together"
     np.testing.assert_array_equal(split[apart], points[faces])
     # A ring of cubes that closes at an edge: its sheets meet at both ends of that edge, too.
     ring = [(0, 0, 0), (1, 1, 0), (0, 0, 1), (1, 1, 1), (0, 1, 2)]
     points, faces = joined([box(low) for low in ring])
-    split, apart = split_pinches(points, faces)
+    split, apart, _ = split_pinches(points, faces)
     assert uses_of_edges(apart) == [2]
     assert open_edges(apart) == 0
     assert volume(split, apart) == pytest.approx(5)
+
+
+@needs_extra
+def test_a_sheet_without_thickness_stays():
+    # Two triangles and their backs: a square without thickness, between two cubes that it touches.
+    square = np.array([(0, 0, 5), (1, 0, 5), (1, 1, 5), (0, 1, 5)], float)
+    both = np.array([(0, 1, 2), (0, 2, 3), (0, 2, 1), (0, 3, 2)], np.int32)
+    points, faces = joined([(square, both), box((0, 0, 4)), box((3, 0, 0))])
+    uv = np.random.default_rng(0).random((len(faces), 3, 2))
+    split, apart, corners = split_pinches(points, faces, uv)
+    assert uses_of_edges(apart) == [2]
+    assert open_edges(apart) == 0
+    assert len(apart) == len(faces)
+    before = np.concatenate([points[faces], uv], axis=2).reshape(len(faces), -1)
+    after = np.concatenate([split[apart], corners], axis=2).reshape(len(faces), -1)
+    assert sorted(map(tuple, before.tolist())) == sorted(map(tuple, after.tolist()))
 
 
 @needs_extra
@@ -340,7 +356,7 @@ def test_collapsed_surfaces_become_manifold(seed):
         sides = np.moveaxis(field, axis, 0)
         sides[0] = sides[-1] = 0.5
     vertices, faces = isosurface(field.astype(np.float32), 300)
-    split, apart = split_pinches(vertices, faces)
+    split, apart, _ = split_pinches(vertices, faces)
     assert uses_of_edges(apart) == [2]
     assert open_edges(apart) == 0
     assert volume(split, apart) == pytest.approx(volume(vertices, faces), abs=1e-6)

@@ -71,9 +71,9 @@ class Surface(Command):
     """Camera file: from where images are made, in place of --views."""
     unlit: bool = False
     """A material that shows the texture as it is, without lights."""
-    image: Annotated[
-        TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")
-    ] = None
+    image: Annotated[TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")] = (
+        None
+    )
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     scale: Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""

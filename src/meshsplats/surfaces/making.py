@@ -99,6 +99,10 @@ def make_surface(
     surface = Surface(vertices, faces, *_blank_texture(vertices, faces, chosen.texture))
     if chosen.texture or chosen.rounds:
         surface = _fitted(surface, sources, chosen, threads, said)
+    if sources.closed:
+        sheets = split_pinches(surface.vertices, faces, surface.uv)
+        faces = sheets.faces
+        surface = surface._replace(vertices=sheets.vertices, uv=sheets.corners.astype(np.float32))
     base = BaseMesh(surface.vertices.astype(np.float32), faces, up=guess_up(scene), origin=scene.origin)
     if not chosen.texture:
         return replace(base, colors=_vertex_colors(base, sources.views, threads))
@@ -151,7 +155,8 @@ def _fused(
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
-    vertices, faces = (split_pinches if sources.closed else close_holes)(vertices, faces)
+    if not sources.closed:
+        vertices, faces = close_holes(vertices, faces)
     return grid.low + grid.voxel * vertices, faces
 
 

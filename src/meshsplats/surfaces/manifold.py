@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 _ROUNDS = 20
 """Most passes over edges that are cut; one is enough where none share a triangle."""
 
 
-def split_pinches(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A closed mesh, (n, 3) vertices and (m, 3) triangles, as one whose edges belong to two triangles each.
+class Sheets(NamedTuple):
+    """A mesh whose edges belong to two triangles each."""
+
+    vertices: np.ndarray
+    """(n, 3)."""
+    faces: np.ndarray
+    """(m, 3)."""
+    corners: np.ndarray
+    """(m, 3, k) values of the corners of the triangles, such as texture coordinates."""
+
+
+def split_pinches(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | None = None) -> Sheets:
+    """A closed mesh, (n, 3) vertices and (m, 3) triangles with values ``corners`` (m, 3, k), as one whose
+    edges belong to two triangles each.
 
     Edge collapses pinch a surface: four triangles or more meet at an edge. They are paired around it so that
     the inside lies between the triangles of a pair, and every sheet gets vertices of its own. Sheets that
-    also meet at both ends of the edge are cut there in its middle. Triangles that lie back to back on the
-    same corners are removed. No point of the surface moves.
+    also meet at both ends of the edge are cut there in its middle. Triangles that lie back to back, of a
+    sheet without thickness, become a pair of their own. No point of the surface moves.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    faces = _without_flaps(faces)
+    values = np.empty((len(faces), 3, 0)) if corners is None else corners
+    back_to_back = _back_to_back(faces)
+    thin = _apart(vertices, faces, values, back_to_back)
+    solid = np.ones(len(faces), bool)
+    solid[back_to_back.ravel()] = False
+    faces, values = faces[solid], values[solid]
     one, other = _pairs(vertices, faces).T  # half edges: 3 * face + corner of the tail
     tails = faces.ravel()
     after = np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, axis=1).ravel()
@@ -29,29 +48,66 @@ def split_pinches(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     links = coo_matrix((np.ones(len(first), bool), (first, second)), (3 * len(faces), 3 * len(faces)))
     sheets = connected_components(links, directed=False)[1]
     _, place, index = np.unique(sheets, return_index=True, return_inverse=True)
-    return _cut(vertices[faces.ravel()[place]], index.reshape(-1, 3).astype(faces.dtype))
+    parts = _cut(vertices[faces.ravel()[place]], index.reshape(-1, 3).astype(faces.dtype), values)
+    return _joined([*parts, thin])
 
 
-def _without_flaps(faces: np.ndarray) -> np.ndarray:
-    """The triangles without pairs that have the same corners, so nothing between them."""
+def _joined(parts: list[Sheets]) -> Sheets:
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return Sheets(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]).astype(
+            parts[0].faces.dtype
+        ),
+        np.concatenate([part.corners for part in parts]),
+    )
+
+
+def _back_to_back(faces: np.ndarray) -> np.ndarray:
+    """(k, 2) pairs of triangles that have the same corners and face opposite ways."""
+    if not len(faces):
+        return np.empty((0, 2), np.int64)
     _, index, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return faces[count[index.reshape(-1)] % 2 == 1]
+    order = np.argsort(index.reshape(-1), kind="stable")
+    starts = np.cumsum(count) - count
+    pairs = np.stack([order[starts[count == 2]], order[starts[count == 2] + 1]], axis=1)
+    first = np.argmin(faces[pairs], axis=2)[..., None]  # the turn from the least corner tells the winding
+    ahead = np.take_along_axis(faces[pairs], (first + 1) % 3, axis=2)[..., 0]
+    return pairs[ahead[:, 0] != ahead[:, 1]]
 
 
-def _cut(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with a vertex of its own for each sheet in the middle of every edge where several meet."""
-    whole, points = faces.tolist(), [*vertices]
-    most = len(faces)
+def _apart(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, pairs: np.ndarray) -> Sheets:
+    """The triangles of ``pairs``, each pair with three vertices of its own."""
+    chosen = faces[pairs]
+    rank = np.argsort(np.argsort(chosen, axis=2), axis=2)
+    return Sheets(
+        vertices[np.sort(chosen[:, 0], axis=1).ravel()],
+        (rank + 3 * np.arange(len(pairs))[:, None, None]).reshape(-1, 3).astype(faces.dtype),
+        values[pairs].reshape(2 * len(pairs), *values.shape[1:]),
+    )
+
+
+def _cut(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> list[Sheets]:
+    """The mesh with a vertex of its own for each sheet in the middle of every edge where several meet, and
+    the triangles that then lie back to back."""
+    whole, points, corners = faces.tolist(), [*vertices], [*values]
+    thin, most = [], len(faces)
     for _ in range(_ROUNDS):
-        at_start, places = _without_flaps(np.array(whole)), np.array(points)
-        whole = at_start.tolist()
-        _, groups = _edges(at_start)
+        now, places, held = np.array(whole, faces.dtype).reshape(-1, 3), np.array(points), np.array(corners)
+        back_to_back = _back_to_back(now)
+        if len(back_to_back):
+            thin.append(_apart(places, now, held, back_to_back))
+            kept = np.ones(len(now), bool)
+            kept[back_to_back.ravel()] = False
+            now, held = now[kept], held[kept]
+            whole, corners = now.tolist(), [*held]
+        _, groups = _edges(now)
         if not 0 < len(groups) < most:  # done, or no longer getting better
             break
         most = len(groups)
         touched: set[int] = set()
         for halves in groups:
-            pairs = _paired(places, at_start, halves) // 3
+            pairs = _paired(places, now, halves) // 3
             if touched & set(pairs.ravel().tolist()):
                 continue  # in the next round
             touched |= set(pairs.ravel().tolist())
@@ -64,10 +120,16 @@ def _cut(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
                         k for k in range(3) if whole[index][k] in ends and whole[index][k - 2] in ends
                     )
                     a, b, c = (whole[index][(tail + k) % 3] for k in range(3))
-                    whole[index] = [a, len(points) - 1, c]
+                    at_a, at_b, at_c = (corners[index][(tail + k) % 3] for k in range(3))
+                    middle = (at_a + at_b) / 2
+                    whole[index], corners[index] = [a, len(points) - 1, c], np.stack([at_a, middle, at_c])
                     whole.append([len(points) - 1, b, c])
-    used, index = np.unique(np.array(whole), return_inverse=True)
-    return np.array(points)[used], index.reshape(-1, 3).astype(faces.dtype)
+                    corners.append(np.stack([middle, at_b, at_c]))
+    now = np.array(whole, faces.dtype).reshape(-1, 3)
+    used, index = np.unique(now, return_inverse=True)
+    rest = np.array(corners).reshape(len(now), *values.shape[1:])
+    cut = Sheets(np.array(points)[used], index.reshape(-1, 3).astype(faces.dtype), rest)
+    return [cut, *thin]
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
