@@ -118,3 +118,10 @@ def write_page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
         return path.as_uri()
 
     return write
+
+
+def pytest_runtest_teardown() -> None:
+    """tyro 0.9.16 keeps the options that a command does not know, and prints them again for the next command
+    in the same process."""
+    if (module := sys.modules.get("tyro._argparse_formatter")) is not None:
+        module.global_unrecognized_arg_and_prog = []
