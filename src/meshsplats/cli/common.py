@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from meshsplats.evaluation.viewers import AlphaChoice
     from meshsplats.formats.streaming import SplatStream
     from meshsplats.tiles.tileset import Tileset
+    from meshsplats.viewpoints.finding import FoundCameras
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
@@ -436,8 +437,13 @@ def views_of_a_place(
     found = find_cameras(scene, count, **lens)
     if found.kind == "object":
         return None
-    say(f"{found.in_words()}: seen from views that were found")
+    say_found(found)
     return list(found.cameras)
+
+
+def say_found(found: FoundCameras) -> None:
+    """Says what kind of place ``find_cameras`` found, whose views are used."""
+    say(f"{found.in_words()}: seen from views that were found")
 
 
 def optional_color(text: str | None) -> tuple[float, float, float] | None:

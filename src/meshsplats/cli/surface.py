@@ -25,6 +25,7 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     load_scene,
+    say_found,
     size_of,
     views_of_a_place,
     written,
@@ -38,6 +39,10 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.surfaces.options import SurfaceOptions
 
 if TYPE_CHECKING:
+    from meshsplats.camera import Camera
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.surfaces.views import Sources
+
     Options = SurfaceOptions
 else:
     Options = as_cli_options(
@@ -92,8 +97,10 @@ class Surface(Command):
         from meshsplats.cameras.files import load_cameras
         from meshsplats.datasets.folder import load_dataset
         from meshsplats.images.writing import save_image
-        from meshsplats.rendering.previews import preview_camera
-        from meshsplats.surfaces import draw_surface, make_surface
+        from meshsplats.surfaces import draw_surface
+        from meshsplats.surfaces.fusion import libraries
+        from meshsplats.surfaces.making import surface_from
+        from meshsplats.surfaces.views import sources_of
 
         start = time.perf_counter()
         options = self._checked()
@@ -103,25 +110,20 @@ class Surface(Command):
         check_outputs(outputs, self.force, inputs=[self.input])
         scene = load_scene(self.input, self.reading)
         origin = scene.origin
+        libraries()  # fails early
+        data = None if self.data is None else load_dataset(self.data, missing=self.missing, origin=origin)
+        cameras = None if self.cameras is None else load_cameras(self.cameras, origin=origin)
+        sources = sources_of(scene, data, cameras, options, self.threads)
         with _progress() as progress:
-            base = make_surface(
-                scene,
-                None if self.data is None else load_dataset(self.data, missing=self.missing, origin=origin),
-                options,
-                cameras=None if self.cameras is None else load_cameras(self.cameras, origin=origin),
-                threads=self.threads,
-                progress=progress,
-            )
+            base = surface_from(scene, sources, options, threads=self.threads, progress=progress)
         factor = 1.0 if self.scale is None else self.scale
         placed = replace(base, vertices=base.vertices * np.float32(factor), origin=base.origin * factor)
         with together():
             save_base(written(placed, self.origin), self.output, unlit=self.unlit, image=self.image)
             write_configuration(config, "surface", self)
             if not self.no_preview:
-                camera = preview_camera(scene)
-                lens = {"width": camera.width, "height": camera.height, "up": None}
-                found = views_of_a_place(scene, 1, lens) if options.shape != "closed" else None
-                save_image(preview, draw_surface(base, found[0] if found else camera, threads=self.threads))
+                camera = _preview_camera(scene, sources)
+                save_image(preview, draw_surface(base, camera, threads=self.threads))
         seconds, count = time.perf_counter() - start, len(base.faces)
         if self.json:
             result = {"mesh": str(self.output), "triangles": count, "bytes": self.output.stat().st_size}
@@ -154,6 +156,22 @@ class Surface(Command):
             raise UsageError(f"--scale must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}
         return SurfaceOptions(**given).checked()
+
+
+def _preview_camera(scene: GaussianCloud | SplatMesh, sources: Sources) -> Camera:
+    """In front of an object, and of a place where it is well seen."""
+    from meshsplats.rendering.previews import preview_camera
+
+    camera = preview_camera(scene)
+    if sources.closed:
+        return camera
+    if sources.found is None:
+        lens = {"width": camera.width, "height": camera.height, "up": None}
+        return (views_of_a_place(scene, 1, lens) or [camera])[0]
+    if sources.found.kind == "object":
+        return camera
+    say_found(sources.found)
+    return sources.found.cameras[0].scaled(camera.width / sources.found.cameras[0].width)
 
 
 @contextmanager

@@ -91,10 +91,22 @@ def make_surface(
     need_all(Camera, cameras=cameras, optional=True)
     chosen = replace(options or SurfaceOptions(), **changes).checked()
     libraries()  # fails early
-    said = progress or (lambda *_: None)
     if data is not None:
         data = data.relative_to(scene.origin)
     sources = sources_of(scene, data, cameras, chosen, threads)
+    return surface_from(scene, sources, chosen, threads=threads, progress=progress)
+
+
+def surface_from(
+    scene: GaussianCloud | SplatMesh,
+    sources: Sources,
+    chosen: SurfaceOptions,
+    *,
+    threads: int | None = None,
+    progress: ProgressOf | None = None,
+) -> BaseMesh:
+    """``make_surface`` from these cameras and images."""
+    said = progress or (lambda *_: None)
     vertices, faces = _fused(scene, sources, chosen, threads, said)
     surface = Surface(vertices, faces, *_blank_texture(vertices, faces, chosen.texture))
     if chosen.texture or chosen.rounds:

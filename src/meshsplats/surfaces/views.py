@@ -12,14 +12,14 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.placing import has_surroundings
 from meshsplats.cameras.trajectories import dome
-from meshsplats.datasets.splat_targets import splat_dataset, splat_views
+from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.surfaces.images import SAMPLES
 from meshsplats.surfaces.options import SurfaceOptions
-from meshsplats.viewpoints.finding import find_cameras
+from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class Sources:
     """Images to be fitted to."""
     closed: bool
     """Whether the surface is a solid."""
+    found: FoundCameras | None
+    """What ``find_cameras`` found, where it was asked."""
 
 
 def sources_of(
@@ -46,26 +48,27 @@ def sources_of(
 
     Raises ValueError for too few cameras.
     """
-    side, shape = options.size, options.shape
-    given = None if cameras is None else [fitted(camera, side) for camera in cameras]
+    side, shape, own = options.size, options.shape, cameras is None and data is None
+    given = None if cameras is None else [camera.within(side) for camera in cameras]
     photos = None if data is None else [reduced(view, side) for view in data.train]
     if [] in (given, photos):
         raise ValueError("a surface needs at least one camera")
-    closed = shape == "closed" or (shape == "auto" and _is_object(scene, options, threads))
+    found, surrounded = None, False
+    if isinstance(scene, GaussianCloud):
+        surrounded = has_surroundings(scene)
+        if (shape == "auto" and not surrounded) or (shape != "closed" and own):
+            count = HELD_OUT + options.views if own else 1
+            found = find_cameras(scene, count, width=side, height=side, threads=threads)
+    is_object = not surrounded and (found is None or found.kind == "object")
+    closed = shape == "closed" or (shape == "auto" and is_object)
     if photos is None:
-        photos = _drawn(scene, given, closed, options, threads)
+        seen = given
+        if own and found is not None and found.kind != "object":
+            seen = list(found.cameras[HELD_OUT:])
+        photos = _drawn(scene, seen, surrounded and not closed, options, threads)
     if given is None:
         given = _around(scene, options) if closed else [view.camera for view in photos]
-    return Sources(tuple(given), tuple(photos), closed)
-
-
-def _is_object(scene: GaussianCloud | SplatMesh, options: SurfaceOptions, threads: int | None) -> bool:
-    """Whether a scene can be seen from all around, against nothing."""
-    if isinstance(scene, SplatMesh):
-        return True
-    if has_surroundings(scene):
-        return False
-    return find_cameras(scene, 1, width=options.size, height=options.size, threads=threads).kind == "object"
+    return Sources(tuple(given), tuple(photos), closed, found)
 
 
 def _around(scene: GaussianCloud | SplatMesh, options: SurfaceOptions) -> list[Camera]:
@@ -77,11 +80,11 @@ def _around(scene: GaussianCloud | SplatMesh, options: SurfaceOptions) -> list[C
 def _drawn(
     scene: GaussianCloud | SplatMesh,
     cameras: list[Camera] | None,
-    closed: bool,
+    surrounded: bool,
     options: SurfaceOptions,
     threads: int | None,
 ) -> list[View]:
-    """Images of the scene from ``cameras``, by default from where it is well seen."""
+    """Images of the scene from ``cameras``, by default from all around."""
     if isinstance(scene, SplatMesh):
         cameras = _around(scene, options) if cameras is None else cameras
         return [_image_of(scene, camera, threads) for camera in cameras]
@@ -90,7 +93,7 @@ def _drawn(
         return list(splat_views(scene, cameras, **look))
     data = splat_dataset(
         scene,
-        placement="object" if closed else "auto",
+        placement="surrounded" if surrounded else "object",
         train=options.views,
         test=0,
         width=options.size,
@@ -105,11 +108,6 @@ def _image_of(mesh: SplatMesh, camera: Camera, threads: int | None) -> View:
     drawn = render(mesh, camera, background=(0, 0, 0), samples=SAMPLES, threads=threads)
     color = np.clip(drawn.color, 0, 1).astype(np.float16)
     return View(camera, ViewImage(color, drawn.alpha.astype(np.float16)))
-
-
-def fitted(camera: Camera, side: int) -> Camera:
-    """``camera`` with an image at most ``side`` pixels wide and high."""
-    return camera.scaled(min(1.0, side / max(camera.width, camera.height)))
 
 
 def reduced(view: View, side: int) -> View:
