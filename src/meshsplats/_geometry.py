@@ -94,6 +94,19 @@ def vertex_normals(
     return (sums / np.where(length > 0, length, 1)[:, None])[place]
 
 
+def edge_groups(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The half edges of triangles (m, 3), from corner i of a triangle to its next corner, sorted by the edge
+    on which they lie.
+
+    Returns:
+        (3 m,) int64 half edges, 3 * triangle + i; (k + 1,) int64 where those of each edge begin.
+    """
+    tails, heads = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
+    keys = np.minimum(tails, heads) * (int(faces.max(initial=0)) + 1) + np.maximum(tails, heads)
+    order = np.argsort(keys, kind="stable")
+    return order, np.concatenate([[0], np.flatnonzero(np.diff(keys[order])) + 1, [len(keys)]])
+
+
 def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
     """(n,) float32 spacing of ``points`` (n, 3) around each of them, in their units.
 

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from meshsplats.evaluation.viewers import AlphaChoice
     from meshsplats.formats.streaming import SplatStream
     from meshsplats.tiles.tileset import Tileset
-    from meshsplats.viewpoints.finding import FoundCameras
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
@@ -266,8 +265,7 @@ class ViewOptions:
                 if self.data is None
                 else "give --downscale or --width"
             )
-        if self.missing != "error" and self.data is None:
-            raise UsageError("--missing has no effect without --data")
+        check_data(self.data, self.missing)
         modes = [
             name
             for name in ("orbit", "dome", "look_around", "cameras", "data")
@@ -437,18 +435,21 @@ def views_of_a_place(
     found = find_cameras(scene, count, **lens)
     if found.kind == "object":
         return None
-    say_found(found)
-    return list(found.cameras)
-
-
-def say_found(found: FoundCameras) -> None:
-    """Says what kind of place ``find_cameras`` found, whose views are used."""
     say(f"{found.in_words()}: seen from views that were found")
+    return list(found.cameras)
 
 
 def optional_color(text: str | None) -> tuple[float, float, float] | None:
     """``parse_color`` of an option that may not be given."""
     return None if text is None else parse_color(text)
+
+
+def check_data(data: Path | None, missing: Missing, cameras: Path | None = None) -> None:
+    """UsageError for --missing without --data, and for --cameras with it."""
+    if cameras is not None and data is not None:
+        raise UsageError("give --cameras or --data, not both")
+    if missing != "error" and data is None:
+        raise UsageError("--missing has no effect without --data")
 
 
 def check_mesh_suffix(path: Path) -> None:

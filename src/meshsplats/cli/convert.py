@@ -32,6 +32,7 @@ from meshsplats.cli.common import (
     Text,
     alpha_in_words,
     alpha_record,
+    check_data,
     check_mesh_suffix,
     check_splat_endings,
     draw_preview,
@@ -63,7 +64,7 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
-from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.meshes import MESH_SUFFIXES, load_mesh
 from meshsplats.formats.outputs import (
     CONFIGURATION,
     Ending,
@@ -280,10 +281,7 @@ class Convert(Command):
             raise UsageError("--alpha ordered goes with neither --lit nor --compression")
         if self.nodes is not None:
             check_nodes(self.nodes)
-        if self.data is not None and self.cameras is not None:
-            raise UsageError("give --cameras or --data, not both")
-        if self.missing != "error" and self.data is None:
-            raise UsageError("--missing has no effect without --data")
+        check_data(self.data, self.missing, self.cameras)
         self._resolved(sources(self.input))  # checks the values before the work
 
     def resolved(self) -> dict[str, Any]:
@@ -558,8 +556,6 @@ class Convert(Command):
 
     def _save_again(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The mesh of ``job`` in another format."""
-        from meshsplats.formats.meshes import load_mesh
-
         views = () if self.alpha == "ordered" else ("cameras", "data")
         idle = [name for name in (*views, "fidelity") if getattr(self, name) is not None]
         idle += ["preset"] if self.preset != "default" else []
@@ -615,8 +611,6 @@ class Convert(Command):
         """A mesh to write beside the splats, as they are."""
         if path is None:
             return None
-        from meshsplats.formats.meshes import load_mesh
-
         mesh = load_mesh(path)
         if self.up is not None:
             mesh = replace(mesh, up=unit_up(parse_up(self.up)))

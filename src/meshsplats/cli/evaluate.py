@@ -26,6 +26,7 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     Text,
+    check_data,
     load_scene,
     optional_color,
     parse_color,
@@ -217,8 +218,7 @@ class Evaluate(Command):
                 raise UsageError(f"{flag(name)} has no effect with --data")
         if self.data is None and self.downscale is not None:
             raise UsageError("--downscale has no effect without --data")
-        if self.data is None and self.missing != "error":
-            raise UsageError("--missing has no effect without --data")
+        check_data(self.data, self.missing)
 
     def _check_outputs(self, folder: Path) -> None:
         names = (RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION)

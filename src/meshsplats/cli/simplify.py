@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     SplatOptions,
+    check_data,
     check_splat_endings,
     draw_preview,
     size_of,
@@ -121,10 +122,7 @@ class Simplify(Command):
             raise UsageError(f"--count must be at least 1, got {self.count}")
         if self.share is not None and not 0 < self.share <= 1:
             raise UsageError(f"--share must be above 0 and at most 1, got {self.share}")
-        if self.cameras is not None and self.data is not None:
-            raise UsageError("give --cameras or --data, not both")
-        if self.missing != "error" and self.data is None:
-            raise UsageError("--missing has no effect without --data")
+        check_data(self.data, self.missing, self.cameras)
 
     def _cameras(self, origin: np.ndarray) -> list[Camera] | None:
         if self.data is not None:

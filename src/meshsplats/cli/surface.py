@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,25 +22,20 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     SplatOptions,
+    check_data,
     load_scene,
-    say_found,
     size_of,
-    views_of_a_place,
     written,
 )
-from meshsplats.cli.messages import UsageError, command_line
+from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.records import write_configuration
 from meshsplats.cli.training import progress_display
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, PRINTED, TextureImage, companions, save_base
-from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
+from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
 from meshsplats.mesh import SplatMesh
 from meshsplats.surfaces.options import SurfaceOptions
 
 if TYPE_CHECKING:
-    from meshsplats.camera import Camera
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.surfaces.views import Sources
-
     Options = SurfaceOptions
 else:
     Options = as_cli_options(
@@ -50,6 +43,9 @@ else:
         "What is made, and how.",
         defaults=lambda name: f"(default: {getattr(SurfaceOptions(), name)})",
     )
+
+
+Image = Annotated[TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
@@ -76,9 +72,7 @@ class Surface(Command):
     """Camera file: from where images are made, in place of --views."""
     unlit: bool = False
     """A material that shows the texture as it is, without lights."""
-    image: Annotated[TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")] = (
-        None
-    )
+    image: Image = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     scale: Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
@@ -97,10 +91,11 @@ class Surface(Command):
         from meshsplats.cameras.files import load_cameras
         from meshsplats.datasets.folder import load_dataset
         from meshsplats.images.writing import save_image
+        from meshsplats.rendering.previews import preview_camera
         from meshsplats.surfaces import draw_surface
         from meshsplats.surfaces.fusion import libraries
         from meshsplats.surfaces.making import surface_from
-        from meshsplats.surfaces.views import sources_of
+        from meshsplats.surfaces.views import place_of, sources_of
 
         start = time.perf_counter()
         options = self._checked()
@@ -114,20 +109,28 @@ class Surface(Command):
         data = None if self.data is None else load_dataset(self.data, missing=self.missing, origin=origin)
         cameras = None if self.cameras is None else load_cameras(self.cameras, origin=origin)
         sources = sources_of(scene, data, cameras, options, self.threads)
-        with _progress() as progress:
-            base = surface_from(scene, sources, options, threads=self.threads, progress=progress)
-        factor = 1.0 if self.scale is None else self.scale
-        placed = replace(base, vertices=base.vertices * np.float32(factor), origin=base.origin * factor)
+        with progress_display() as display:
+            base = surface_from(
+                scene,
+                sources,
+                options,
+                threads=self.threads,
+                progress=lambda name, done, total: display.phase(name, done / total),
+            )
+        result = written(scaled(base, self.scale), self.origin)
         with together():
-            save_base(written(placed, self.origin), self.output, unlit=self.unlit, image=self.image)
+            save_base(result, self.output, unlit=self.unlit, image=self.image)
             write_configuration(config, "surface", self)
             if not self.no_preview:
-                camera = _preview_camera(scene, sources)
+                camera = preview_camera(scene)
+                if place := place_of(scene, sources):
+                    say(f"{place.in_words()}: seen from views that were found")
+                    camera = place.cameras[0].within(camera.width)
                 save_image(preview, draw_surface(base, camera, threads=self.threads))
         seconds, count = time.perf_counter() - start, len(base.faces)
         if self.json:
-            result = {"mesh": str(self.output), "triangles": count, "bytes": self.output.stat().st_size}
-            print(json.dumps(result | {"seconds": round(seconds, 2)}, indent=1))
+            found = {"mesh": str(self.output), "triangles": count, "bytes": self.output.stat().st_size}
+            print(json.dumps(found | {"seconds": round(seconds, 2)}, indent=1))
             return
         look = f"a texture of {options.texture} texels" if base.textures else "colours of vertices"
         print(f"{self.output} ({count:,} triangles, {look}, {size_of(self.output)}) in {seconds:.1f} s")
@@ -148,33 +151,8 @@ class Surface(Command):
             raise UsageError(f"-o must end in {', '.join(BASE_SUFFIXES)}, got {self.output.name!r}")
         if suffix in PRINTED and self.surface.shape == "open":
             raise UsageError(f"{suffix} is for printing, which wants a solid: --shape closed")
-        if self.cameras is not None and self.data is not None:
-            raise UsageError("give --cameras or --data, not both")
-        if self.missing != "error" and self.data is None:
-            raise UsageError("--missing has no effect without --data")
+        check_data(self.data, self.missing, self.cameras)
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise UsageError(f"--scale must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}
         return SurfaceOptions(**given).checked()
-
-
-def _preview_camera(scene: GaussianCloud | SplatMesh, sources: Sources) -> Camera:
-    """In front of an object, and of a place where it is well seen."""
-    from meshsplats.rendering.previews import preview_camera
-
-    camera = preview_camera(scene)
-    if sources.closed:
-        return camera
-    if sources.found is None:
-        lens = {"width": camera.width, "height": camera.height, "up": None}
-        return (views_of_a_place(scene, 1, lens) or [camera])[0]
-    if sources.found.kind == "object":
-        return camera
-    say_found(sources.found)
-    return sources.found.cameras[0].scaled(camera.width / sources.found.cameras[0].width)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    with progress_display() as display:
-        yield lambda phase, done, total: display.phase(phase, done / total)

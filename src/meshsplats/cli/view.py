@@ -21,6 +21,7 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     Text,
+    check_data,
     load_scene,
     optional_color,
     parse_color,
@@ -120,8 +121,7 @@ class View(Command):
             raise UsageError("--no-open has no effect with -o, which opens nothing")
         if self.output is None and self.force:
             raise UsageError("--force has no effect without -o")
-        if self.missing != "error" and self.data is None:
-            raise UsageError("--missing has no effect without --data")
+        check_data(self.data, self.missing)
         for first, second in self.EXCLUSIVE:
             if getattr(self, first) and getattr(self, second):
                 raise UsageError(f"give --{first} or --{second.replace('_', '-')}, not both")

@@ -29,7 +29,12 @@ def up_quaternion(up: np.ndarray) -> list[float]:
     return [float(c) + 0.0 for c in q / np.linalg.norm(q)]  # no negative zeros
 
 
+def up_rotation(up: np.ndarray) -> np.ndarray:
+    """(3, 3) float64 matrix of ``up_quaternion``."""
+    x, y, z, w = up_quaternion(up)
+    return np.array(list(rotation_rows(w, x, y, z)))
+
+
 def turned_origin(mesh: SplatMesh | BaseMesh) -> np.ndarray:
     """(3,) float64 place of the mesh's origin in a frame whose +y is its ``up``."""
-    x, y, z, w = up_quaternion(mesh.up)
-    return np.array(list(rotation_rows(w, x, y, z))) @ mesh.origin + 0.0
+    return up_rotation(mesh.up) @ mesh.origin + 0.0

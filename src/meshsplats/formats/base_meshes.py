@@ -20,9 +20,10 @@ from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.npz import write_npz
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
+from meshsplats.formats.surfaces.corners import plain_mesh
 from meshsplats.formats.surfaces.glb import write_surface_glb
 from meshsplats.formats.surfaces.solids import write_3mf, write_stl
-from meshsplats.formats.surfaces.text import plain_mesh, write_surface_obj, write_surface_ply
+from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_ply
 from meshsplats.formats.surfaces.usd import write_surface_usd
 from meshsplats.mesh import SplatMesh
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.errors import FileFormatError, OverwritingError
 from meshsplats.formats.meshes import MESH_SUFFIXES
 from meshsplats.formats.splat_formats import format_to_write, taken_by, written_suffixes
@@ -20,7 +21,7 @@ from meshsplats.formats.splat_paths import splat_file
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-Scene = TypeVar("Scene", GaussianCloud, SplatMesh)
+Scene = TypeVar("Scene", GaussianCloud, SplatMesh, BaseMesh)
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
@@ -61,7 +62,7 @@ def scaled(scene: Scene, factor: float | None) -> Scene:
         return scene
     if isinstance(scene, GaussianCloud):
         return scene.transformed(np.eye(3) * factor)
-    if scene.binding is not None:
+    if isinstance(scene, SplatMesh) and scene.binding is not None:
         raise ValueError("a mesh prior has the lengths of its base mesh: scale the base and bind to that")
     return replace(scene, vertices=scene.vertices * np.float32(factor), origin=scene.origin * factor)
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._core import kernels
+from meshsplats._geometry import edge_groups
 from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import render
@@ -43,21 +44,31 @@ def front_faces(
 ) -> FrontFaces:
     """The nearest triangle of at least the opacity ``cutoff`` at the centre of each pixel of ``camera``."""
     count = len(mesh.faces)
-    # Every triangle has corners of its own with its index, in two digits that float32 interpolates exactly.
-    indices = np.repeat(np.arange(count), 3)
     indexed = SplatMesh(
         mesh.vertices[mesh.faces].reshape(-1, 3),
         np.arange(3 * count).reshape(-1, 3),
         mesh.colors[mesh.faces].reshape(-1, 4),
         depth_group=mesh.depth_group,
-        attributes={"index": np.stack([indices % _ROOT, indices // _ROOT], axis=1)},
+        attributes={"index": index_digits(count)},
     )
     image = render(
         indexed, camera, cutoff=cutoff, background=background, attributes=("index",), threads=threads
     )
-    digits = np.rint(image.attributes["index"]).astype(np.int32)
-    found = np.where(image.alpha > 0.5, digits[..., 0] + _ROOT * digits[..., 1], np.int32(-1))
-    return FrontFaces(found, image.color)
+    return FrontFaces(indices_of(image.attributes["index"], image.alpha > 0.5), image.color)
+
+
+def index_digits(count: int) -> np.ndarray:
+    """(3 * count, 2): the index of each of ``count`` triangles at corners of its own, in two digits that
+    float32 interpolates exactly."""
+    indices = np.repeat(np.arange(count), 3)
+    return np.stack([indices % _ROOT, indices // _ROOT], axis=1)
+
+
+def indices_of(digits: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """(h, w) int32 index of the triangle at each sample of an image of ``index_digits`` (h, w, 2), -1 where
+    it is not ``covered`` (h, w)."""
+    whole = np.rint(digits).astype(np.int32)
+    return np.where(covered, whole[..., 0] + _ROOT * whole[..., 1], np.int32(-1))
 
 
 def faces_across(faces: np.ndarray) -> np.ndarray:
@@ -67,13 +78,9 @@ def faces_across(faces: np.ndarray) -> np.ndarray:
     Args:
         faces: (f, 3) int32 vertex indices.
     """
-    tails, heads = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
-    keys = np.minimum(tails, heads) * (int(faces.max(initial=0)) + 1) + np.maximum(tails, heads)
-    order = np.argsort(keys, kind="stable")
-    ends = np.append(np.flatnonzero(np.diff(keys[order])) + 1, len(keys))
-    starts = np.append(0, ends[:-1])
-    first = starts[ends - starts == 2]
-    result = np.full(len(keys), -1, np.int32)
+    order, starts = edge_groups(faces)
+    first = starts[:-1][np.diff(starts) == 2]
+    result = np.full(faces.size, -1, np.int32)
     one, other = order[first], order[first + 1]
     result[one], result[other] = other // 3, one // 3
     return result.reshape(-1, 3)
@@ -105,18 +112,45 @@ def edge_gradients(
     """
     mesh = seen_from(mesh, camera, threads=threads)
     camera = camera.with_near_plane(mesh.vertices)  # not measured again on the triangles of front_faces
-    fine, near = camera.scaled(EDGE_SAMPLES), camera.near_plane(mesh.vertices)
+    fine = camera.scaled(EDGE_SAMPLES)
     front = front_faces(mesh, fine, cutoff, background=background, threads=threads)
-    rotation, offset = fine.world_to_camera[:3, :3], fine.world_to_camera[:3, 3]
-    points = mesh.vertices.astype(np.float64) @ rotation.T + offset
-    depth = points[:, 2]
-    drawn = depth >= near
-    scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [fine.fx, fine.fy]
-    screen = np.column_stack([points[:, :2] * scale + [fine.cx, fine.cy], depth])
     across = faces_across(mesh.faces) if across is None else across
-    image = kernels.OpaqueImage(
-        screen, mesh.faces, mesh.colors, across, front.faces, front.color, near, cutoff
-    )
+    edged = Edged(mesh.vertices.astype(np.float64), mesh.faces, mesh.colors, across)
+    return motion_gradients(edged, fine, front, gradient, cutoff, threads=threads).astype(np.float32)
+
+
+class Edged(NamedTuple):
+    """Opaque triangles, and which lie next to each other."""
+
+    vertices: np.ndarray
+    """(v, 3) float64."""
+    faces: np.ndarray
+    """(f, 3) int32."""
+    colors: np.ndarray
+    """(v, 4) float32, of which the opacities count."""
+    across: np.ndarray
+    """(f, 3) int32: ``faces_across``."""
+
+
+def motion_gradients(
+    triangles: Edged,
+    camera: Camera,
+    front: FrontFaces,
+    gradient: np.ndarray,
+    cutoff: float,
+    *,
+    threads: int | None = None,
+) -> np.ndarray:
+    """(v, 3) float64: ``edge_gradients`` from what ``camera``, which has a near plane, sees in ``front``: an
+    image of samples, the pixels of ``gradient`` times a whole number."""
+    assert camera.near is not None
+    rotation, offset = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    points = triangles.vertices @ rotation.T + offset
+    depth = points[:, 2]
+    drawn = depth >= camera.near
+    scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [camera.fx, camera.fy]
+    screen = np.column_stack([points[:, :2] * scale + [camera.cx, camera.cy], depth])
+    image = kernels.OpaqueImage(screen, *triangles[1:], front.faces, front.color, camera.near, cutoff)
     moved = scale * kernels.edge_gradients(image, gradient, threads)
     along = -(moved * points[:, :2]).sum(axis=1) / np.where(drawn, depth, 1)
-    return (np.column_stack([moved, along]) @ rotation).astype(np.float32)
+    return np.column_stack([moved, along]) @ rotation

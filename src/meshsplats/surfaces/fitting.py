@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats.datasets.views import View
 from meshsplats.errors import MissingDependencyError
+from meshsplats.rendering.edges import faces_across
 from meshsplats.surfaces.atlas import filled
 from meshsplats.surfaces.images import Surface, SurfaceImage
 
@@ -107,6 +108,7 @@ def fit(
     steps = SmoothSteps(surface.vertices, surface.faces, stiffness)
     corners = surface.vertices[surface.faces]
     edge = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    surface = surface._replace(across=faces_across(surface.faces))
     total = rounds * len(views)
     for number, index in enumerate(np.concatenate([rng.permutation(len(views)) for _ in range(rounds)])):
         target, background, counts, solid = target_of(views[index], number)
@@ -128,7 +130,7 @@ def fit(
         surface = surface._replace(vertices=vertices, texels=np.clip(surface.texels - change, 0, 1))
         if progress is not None:
             progress()
-    return surface
+    return surface._replace(across=None)
 
 
 class Target(NamedTuple):

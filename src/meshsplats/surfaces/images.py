@@ -7,19 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._core import kernels
 from meshsplats._core.surfaces import Samples, coordinate_gradients, texel_sums, texture_samples
 from meshsplats._kinds import need
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh, Triangles
+from meshsplats.formats.surfaces.corners import plain_mesh
+from meshsplats.mesh import Triangles
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
-from meshsplats.rendering.edges import faces_across
+from meshsplats.rendering.edges import (
+    Edged,
+    FrontFaces,
+    faces_across,
+    index_digits,
+    indices_of,
+    motion_gradients,
+)
 
 SAMPLES = 2
 """Samples along each side of a pixel."""
-_ROOT = 1024
 
 
 class Surface(NamedTuple):
@@ -33,6 +39,8 @@ class Surface(NamedTuple):
     """(f, 3, 2) float32 texture coordinates of the corners, u to the right, v down."""
     texels: np.ndarray
     """(th, tw, 3) float32 display RGB."""
+    across: np.ndarray | None = None
+    """(f, 3) int32: ``faces_across`` of the faces, precomputed, for gradients."""
 
 
 class SurfaceImage:
@@ -63,14 +71,11 @@ class SurfaceImage:
         self._surface, self._threads = surface, threads
         self._camera = fine = camera.scaled(SAMPLES)
         count = len(surface.faces)
-        # Each triangle has corners of its own with its index, in two digits that float32 keeps exactly.
-        index = np.repeat(np.arange(count), 3)
-        digits = np.stack([index % _ROOT, index // _ROOT], axis=1)
         corners = Triangles(
             surface.vertices[surface.faces].reshape(-1, 3).astype(np.float32),
             np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
             np.tile(np.array([0, 0, 0, 1], np.float32), (3 * count, 1)),
-            values=np.concatenate([surface.uv.reshape(-1, 2), digits], axis=1, dtype=np.float32),
+            values=np.concatenate([surface.uv.reshape(-1, 2), index_digits(count)], axis=1, dtype=np.float32),
         )
         options, tape = TapeOptions(background=(0, 0, 0)), TAPE_BYTES if gradients else None
         self._image = TapedRendering(corners, fine, options, threads=threads, tape_bytes=tape)
@@ -112,28 +117,19 @@ class SurfaceImage:
         return texel_sums(self._samples, self._surface.texels, each, threads=self._threads)
 
     def _edges(self, gradient: np.ndarray) -> np.ndarray:
-        """(v, 3) float64 gradient by the motion of visible edges (``rendering.edges``)."""
-        vertices, faces, camera = self._surface.vertices, self._surface.faces, self._camera
-        assert camera.near is not None
-        rotation, offset = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-        points = vertices @ rotation.T + offset
-        depth = points[:, 2]
-        drawn = depth >= camera.near
-        scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [camera.fx, camera.fy]
-        digits = np.rint(self._image.attributes[..., 2:]).astype(np.int32)
-        image = kernels.OpaqueImage(
-            np.column_stack([points[:, :2] * scale + [camera.cx, camera.cy], depth]),
-            faces,
-            np.ones((len(vertices), 4), np.float32),
-            faces_across(faces),
-            np.where(self._samples.covered, digits[..., 0] + _ROOT * digits[..., 1], np.int32(-1)),
-            self._colors,
-            camera.near,
+        """(v, 3) float64 gradient by the motion of visible edges."""
+        surface = self._surface
+        across = faces_across(surface.faces) if surface.across is None else surface.across
+        opaque = np.ones((len(surface.vertices), 4), np.float32)
+        front = FrontFaces(indices_of(self._image.attributes[..., 2:], self._samples.covered), self._colors)
+        return motion_gradients(
+            Edged(surface.vertices, surface.faces, opaque, across),
+            self._camera,
+            front,
+            np.ascontiguousarray(gradient),
             0.5,
+            threads=self._threads,
         )
-        moved = scale * kernels.edge_gradients(image, np.ascontiguousarray(gradient), self._threads)
-        along = -(moved * points[:, :2]).sum(axis=1) / np.where(drawn, depth, 1)
-        return np.column_stack([moved, along]) @ rotation
 
 
 def draw_surface(
@@ -160,11 +156,7 @@ def draw_surface(
         camera = camera.with_near_plane(base.vertices)
         behind = np.asarray(background, np.float32)
         return SurfaceImage(surface, camera, behind, gradients=False, threads=threads).color
-    colors = base.colors
-    if colors is None:
-        colors = np.tile(np.array([0.5, 0.5, 0.5, 1], np.float32), (len(base.vertices), 1))
-    mesh = SplatMesh(base.vertices, base.faces, colors)
-    return render(mesh, camera, background=background, samples=SAMPLES, threads=threads).color
+    return render(plain_mesh(base), camera, background=background, samples=SAMPLES, threads=threads).color
 
 
 def _pixels(samples: np.ndarray) -> np.ndarray:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._geometry import edge_groups
+
 _ROUNDS = 20
 """Most passes over edges that are cut; one is enough where none share a triangle."""
 
@@ -134,15 +136,11 @@ def _cut(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> list[Sh
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """(k, 2) pairs of half edges at edges of two triangles, and the half edges of each other edge."""
-    tails, heads = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
-    key = np.minimum(tails, heads) * (int(faces.max(initial=0)) + 1) + np.maximum(tails, heads)
-    order = np.argsort(key, kind="stable")
-    ends = np.append(np.flatnonzero(np.diff(key[order])) + 1, len(key))
-    starts = np.append(0, ends[:-1])
-    two = ends - starts == 2
-    pairs = np.stack([order[starts[two]], order[starts[two] + 1]], axis=1)
-    rest = zip(starts[~two].tolist(), ends[~two].tolist(), strict=True)
-    return pairs, [order[start:end] for start, end in rest]
+    order, starts = edge_groups(faces)
+    two = np.diff(starts) == 2
+    pairs = np.stack([order[starts[:-1][two]], order[starts[:-1][two] + 1]], axis=1)
+    rest = np.flatnonzero(~two).tolist()
+    return pairs, [order[starts[k] : starts[k + 1]] for k in rest]
 
 
 def _pairs(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

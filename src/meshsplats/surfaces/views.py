@@ -71,6 +71,14 @@ def sources_of(
     return Sources(tuple(given), tuple(photos), closed, found)
 
 
+def place_of(scene: GaussianCloud | SplatMesh, sources: Sources) -> FoundCameras | None:
+    """What ``find_cameras`` finds in a scene that is no object; None for objects and meshes."""
+    if sources.closed or isinstance(scene, SplatMesh):
+        return None
+    found = find_cameras(scene, 1) if sources.found is None else sources.found
+    return None if found.kind == "object" else found
+
+
 def _around(scene: GaussianCloud | SplatMesh, options: SurfaceOptions) -> list[Camera]:
     """Cameras on all sides of a scene, below it, too."""
     side = options.size

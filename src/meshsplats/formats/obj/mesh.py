@@ -50,17 +50,17 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
         file.write(f"{_UP_COMMENT} {up}\n".encode())
         if mesh.origin.any():
             file.write(f"{_ORIGIN_COMMENT} {in_words(mesh.origin)}\n".encode())
-            _write_rows(file, "v %r %r %r %.9g %.9g %.9g\n", mesh.vertices, rgb, plus=mesh.origin)
+            write_rows(file, "v %r %r %r %.9g %.9g %.9g\n", mesh.vertices, rgb, plus=mesh.origin)
         else:
-            _write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
+            write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
         if mesh.normals is not None:
-            _write_rows(file, "vn %.9g %.9g %.9g\n", mesh.normals)
+            write_rows(file, "vn %.9g %.9g %.9g\n", mesh.normals)
         faces = mesh.faces + 1
         columns = [faces[:, k, None] for k in range(3) for _ in range(corner.count("%"))]
-        _write_rows(file, f"f {corner} {corner} {corner}\n", *columns)
+        write_rows(file, f"f {corner} {corner} {corner}\n", *columns)
 
 
-def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: np.ndarray | None = None) -> None:
+def write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: np.ndarray | None = None) -> None:
     """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``; ``plus``, float64,
     is added to the first of them."""
     for start in range(0, len(columns[0]), _ROWS):

@@ -9,6 +9,7 @@ import numpy as np
 from meshsplats._geometry import vertex_normals
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.images.writing import encode_image
+from meshsplats.mesh import SplatMesh
 
 LARGE_PNG = 1 << 20
 """Textures whose PNG is larger than this, in bytes, are written as JPEG where nothing else is asked for."""
@@ -68,3 +69,12 @@ def texture_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]
             return ".png", content
         suffix = ".jpg"
     return suffix, encode_image(f"a{suffix}", pixels)
+
+
+def plain_mesh(base: BaseMesh) -> SplatMesh:
+    """``base`` as a mesh without texture: with its vertex colours, else grey."""
+    colors = base.colors
+    if colors is None:
+        colors = np.tile(np.array([0.5, 0.5, 0.5, 1], np.float32), (len(base.vertices), 1))
+    normals = smooth_normals(base)
+    return SplatMesh(base.vertices, base.faces, colors, normals=normals, up=base.up, origin=base.origin)

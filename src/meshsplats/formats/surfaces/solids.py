@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.formats._orientation import up_quaternion
+from meshsplats.formats._orientation import up_rotation
 
 _Y_TO_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 _TYPES = (
@@ -35,8 +34,7 @@ _MODEL = (
 
 def upright(base: BaseMesh) -> np.ndarray:
     """(v, 3) float64 vertices with z up, all coordinates from 0 on."""
-    x, y, z, w = up_quaternion(base.up)
-    turned = base.vertices.astype(np.float64) @ (_Y_TO_Z @ np.array(list(rotation_rows(w, x, y, z)))).T
+    turned = base.vertices.astype(np.float64) @ (_Y_TO_Z @ up_rotation(base.up)).T
     return turned - turned.min(axis=0)
 
 

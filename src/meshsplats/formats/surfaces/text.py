@@ -9,12 +9,9 @@ import numpy as np
 from meshsplats._files.atomic import write_bytes
 from meshsplats._origin import in_words
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.formats.obj.mesh import write_obj
+from meshsplats.formats.obj.mesh import write_obj, write_rows
 from meshsplats.formats.ply.mesh import write_mesh_ply
-from meshsplats.formats.surfaces.corners import smooth_normals, texture_file
-from meshsplats.mesh import SplatMesh
-
-_ROWS = 1 << 14
+from meshsplats.formats.surfaces.corners import plain_mesh, smooth_normals, texture_file
 
 
 def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
@@ -36,15 +33,10 @@ def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | Non
     with open(path, "wb") as file:
         file.write(f"# meshsplats up {up}\n# meshsplats origin {in_words(base.origin)}\n".encode())
         file.write(f"mtllib {material.name}\nusemtl surface\n".encode())
-        for line, values in (
-            ("v %r %r %r\n", base.origin + base.vertices),
-            ("vt %.9g %.9g\n", places),
-            ("vn %.6f %.6f %.6f\n", smooth_normals(base)),
-            ("f %d/%d/%d %d/%d/%d %d/%d/%d\n", corner.reshape(-1, 9)),
-        ):
-            for start in range(0, len(values), _ROWS):
-                rows = values[start : start + _ROWS]
-                file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
+        write_rows(file, "v %r %r %r\n", base.vertices, plus=base.origin)
+        write_rows(file, "vt %.9g %.9g\n", places)
+        write_rows(file, "vn %.6f %.6f %.6f\n", smooth_normals(base))
+        write_rows(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", corner.reshape(-1, 9))
 
 
 def write_surface_ply(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
@@ -78,12 +70,3 @@ def write_surface_ply(base: BaseMesh, path: Path, target: Path, image: str | Non
         file.write("\n".join(header).encode())
         file.write(rows.tobytes())
         file.write(faces.tobytes())
-
-
-def plain_mesh(base: BaseMesh) -> SplatMesh:
-    """``base`` as a mesh without texture: with its vertex colours, else grey."""
-    colors = base.colors
-    if colors is None:
-        colors = np.tile(np.array([0.5, 0.5, 0.5, 1], np.float32), (len(base.vertices), 1))
-    normals = smooth_normals(base)
-    return SplatMesh(base.vertices, base.faces, colors, normals=normals, up=base.up, origin=base.origin)
