@@ -15,11 +15,11 @@ import numpy as np
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.scene_writer import alpha_mode, png_of
+from meshsplats.formats.usd.materials import preview_material, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed, splats_stage
-from meshsplats.formats.usd.stage import new_stage
+from meshsplats.formats.usd.stage import new_stage, placed_mesh
 from meshsplats.formats.usd.writer import mesh_stage
 
 
@@ -59,30 +59,10 @@ def write_scene_usd(parts: SceneParts, path: Path, where: Path, *, lit: bool) ->
         packed(inner, path)
 
 
-def _shape_stage(base: BaseMesh) -> tuple[Any, Any]:
-    """A stage with the triangles of ``base``, placed, and its mesh."""
-    from pxr import Gf, UsdGeom, Vt
-
-    stage, root = new_stage()
-    if base.origin.any():
-        root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*turned_origin(base).tolist()))
-    x, y, z, w = up_quaternion(base.up)
-    root.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-    shape = UsdGeom.Mesh.Define(stage, "/Splats/Mesh")
-    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(base.vertices))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(base.faces), 3, np.int32)))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(base.faces.reshape(-1)))
-    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    shape.CreateDoubleSidedAttr(True)
-    corners = np.stack([base.vertices.min(axis=0), base.vertices.max(axis=0)])
-    shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
-    return stage, shape
-
-
 def _collider_stage(collider: BaseMesh) -> Any:
     from pxr import UsdGeom, UsdPhysics
 
-    stage, shape = _shape_stage(collider)
+    stage, shape = placed_mesh(collider)
     shape.CreatePurposeAttr(UsdGeom.Tokens.guide)
     UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
     UsdPhysics.MeshCollisionAPI.Apply(shape.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
@@ -93,7 +73,7 @@ def _surface_stage(base: BaseMesh, lit: bool) -> Any:
     """Faces of each texture are a subset with a material of their own; others have displayColor."""
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
-    stage, shape = _shape_stage(base)
+    stage, shape = placed_mesh(base)
     if base.colors is not None:
         colors = srgb_to_linear(base.colors[:, :3]).astype(np.float32)
         primvar = shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
@@ -117,33 +97,11 @@ def _surface_stage(base: BaseMesh, lit: bool) -> Any:
 
 def _textured(stage: Any, i: int, base: BaseMesh, lit: bool) -> Any:
     """A UsdPreviewSurface that shows texture ``i``."""
-    from pxr import Sdf, UsdShade
+    from pxr import Sdf
 
-    types, texture = Sdf.ValueTypeNames, base.textures[i]
-    at = f"/Splats/Texture_{i}"
-    material = UsdShade.Material.Define(stage, at)
-    reader = UsdShade.Shader.Define(stage, f"{at}/Coordinates")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", types.String).Set("st")
-    image = UsdShade.Shader.Define(stage, f"{at}/Image")
-    image.CreateIdAttr("UsdUVTexture")
-    image.CreateInput("file", types.Asset).Set(f"texture_{i}.png")
-    image.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    types, texture, at = Sdf.ValueTypeNames, base.textures[i], f"/Splats/Texture_{i}"
+    image = texture_reader(stage, at, f"texture_{i}.png", texture.wrap)
     image.CreateInput("scale", types.Float4).Set(tuple(texture.factor))
-    for axis, mode in zip("ST", texture.wrap, strict=True):
-        image.CreateInput(f"wrap{axis}", types.Token).Set(mode)
-    image.CreateInput("st", types.Float2).ConnectToSource(reader.CreateOutput("result", types.Float2))
-    surface = UsdShade.Shader.Define(stage, f"{at}/Surface")
-    surface.CreateIdAttr("UsdPreviewSurface")
-    shown = surface.CreateInput("diffuseColor" if lit else "emissiveColor", types.Color3f)
-    shown.ConnectToSource(image.CreateOutput("rgb", types.Float3))
-    if alpha_mode(texture) != "OPAQUE":
-        opacity = surface.CreateInput("opacity", types.Float)
-        opacity.ConnectToSource(image.CreateOutput("a", types.Float))
-    surface.CreateInput("roughness", types.Float).Set(1.0)
-    if not lit:
-        surface.CreateInput("diffuseColor", types.Color3f).Set((0, 0, 0))
-        surface.CreateInput("useSpecularWorkflow", types.Int).Set(1)
-        surface.CreateInput("specularColor", types.Color3f).Set((0, 0, 0))
-    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
-    return material
+    opacity = None if alpha_mode(texture) == "OPAQUE" else image.CreateOutput("a", types.Float)
+    color = image.CreateOutput("rgb", types.Float3)
+    return preview_material(stage, at, color, lit=lit, opacity=opacity)

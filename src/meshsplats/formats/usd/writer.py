@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.gltf.writer import computed_normals, linear_colors
-from meshsplats.formats.usd.stage import new_stage
+from meshsplats.formats.usd.materials import preview_material, primvar_reader
+from meshsplats.formats.usd.stage import placed_mesh
 from meshsplats.mesh import SplatMesh
 
 
@@ -46,20 +46,7 @@ def mesh_stage(mesh: SplatMesh, *, lit: bool) -> Any:
     from pxr import Gf, Sdf, Tf, UsdGeom, Vt
 
     check_attribute_names(mesh)
-    stage, root = new_stage()
-    x, y, z, w = up_quaternion(mesh.up)
-    if mesh.origin.any():
-        root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*turned_origin(mesh).tolist()))
-    root.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-    shape = UsdGeom.Mesh.Define(stage, "/Splats/Mesh")
-    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.reshape(-1)))
-    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    shape.CreateDoubleSidedAttr(True)
-    if len(mesh.vertices):
-        corners = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
-        shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
+    stage, shape = placed_mesh(mesh)
     normals = computed_normals(mesh) if lit and mesh.normals is None else mesh.normals
     if normals is not None:
         shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
@@ -129,29 +116,8 @@ def _add_material(stage: Any, shape: Any, lit: bool, *, opaque: bool) -> None:
     """A UsdPreviewSurface whose colour and, unless all is opaque, opacity come from the primvars."""
     from pxr import Sdf, UsdShade
 
-    types = Sdf.ValueTypeNames
-    material = UsdShade.Material.Define(stage, "/Splats/Material")
-    surface = UsdShade.Shader.Define(stage, "/Splats/Material/Surface")
-    surface.CreateIdAttr("UsdPreviewSurface")
-
-    def reader(name: str, primvar: str, type_name: str, fallback: Any, result: Any) -> Any:
-        shader = UsdShade.Shader.Define(stage, f"/Splats/Material/{name}")
-        shader.CreateIdAttr(f"UsdPrimvarReader_{type_name}")
-        shader.CreateInput("varname", types.String).Set(primvar)
-        shader.CreateInput("fallback", result).Set(fallback)
-        return shader.CreateOutput("result", result)
-
-    color = reader("Color", "displayColor", "float3", (0.5, 0.5, 0.5), types.Float3)
-    surface.CreateInput("diffuseColor" if lit else "emissiveColor", types.Color3f).ConnectToSource(color)
-    if not lit:
-        surface.CreateInput("diffuseColor", types.Color3f).Set((0, 0, 0))
-    if not opaque:  # renderers sort or trace through a surface with an opacity, whatever it is
-        opacity = reader("Opacity", "displayOpacity", "float", 1.0, types.Float)
-        surface.CreateInput("opacity", types.Float).ConnectToSource(opacity)
-    surface.CreateInput("roughness", types.Float).Set(1.0)
-    # The specular workflow with black has no reflections, which an emissive surface should not show.
-    surface.CreateInput("useSpecularWorkflow", types.Int).Set(0 if lit else 1)
-    if not lit:
-        surface.CreateInput("specularColor", types.Color3f).Set((0, 0, 0))
-    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
+    types, at = Sdf.ValueTypeNames, "/Splats/Material"
+    color = primvar_reader(stage, f"{at}/Color", "displayColor", types.Float3, (0.5, 0.5, 0.5))
+    opacity = None if opaque else primvar_reader(stage, f"{at}/Opacity", "displayOpacity", types.Float, 1.0)
+    material = preview_material(stage, at, color, lit=lit, opacity=opacity)
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
