@@ -14,6 +14,8 @@ from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Need
 from meshsplats.rendering.gpu import CANNOT, RUN_BY_RUN
 from meshsplats.webgpu import frames, gradients, training
+from meshsplats.webgpu.device import CORE_BINDING
+from meshsplats.webgpu.layout import FANS_IN_WORKGROUP, MAX_WORKGROUPS
 
 SOURCE = Path(meshsplats.__file__).parent
 PAGE = SOURCE.parents[1] / "docs" / "webgpu.md"
@@ -53,4 +55,7 @@ def test_what_the_gpu_cannot_do_is_documented():
         assert need in text
     for limit in (frames.MAX_FAN, gradients.MAX_FAN, gradients.MAX_VALENCE):
         assert f"{limit:,}" in text
-    assert f"{training.MAX_PIXELS / 1e6:.1f} million pixels" in text
+    pixels, harmonics = CORE_BINDING // training.DERIVATIVE_BYTES, CORE_BINDING // 12
+    assert f"{pixels / 1e6:.1f} million pixels" in text
+    assert f"{harmonics / 3e6:.1f} million splats of degree 1, {harmonics / 8e6:.1f} million" in text
+    assert f"{MAX_WORKGROUPS * FANS_IN_WORKGROUP / 1e6:.1f} million splats" in text

@@ -78,9 +78,9 @@ class State:
         else:
             unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self._vertices, lr=1.0, scale=unit, eps=position_epsilon)
-        self.harmonics = None if mesh.harmonics is None else mesh.harmonics.copy()
+        self._of_splats = None if mesh.harmonics is None else mesh.harmonics.copy()
         self._harmonics = None
-        if self.harmonics is not None:
+        if self._of_splats is not None:
             self._harmonics = adam(self._flat_harmonics, lr=1.0, eps=color_epsilon)
         brightest = 1 if mesh.harmonics is None else MAX_COLOR
         self._colors = adam(self._rgba, lr=1.0, bounds=(0, brightest), eps=color_epsilon)
@@ -116,10 +116,16 @@ class State:
         return self._rgba
 
     @property
+    def harmonics(self) -> np.ndarray | None:
+        """(s, k, 3) float32; None for a mesh without."""
+        self._fetch()
+        return self._of_splats
+
+    @property
     def _flat_harmonics(self) -> np.ndarray:
         """(s, 3 k) view of ``harmonics``."""
-        assert self.harmonics is not None
-        return self.harmonics.reshape(len(self.harmonics), -1)
+        assert self._of_splats is not None
+        return self._of_splats.reshape(len(self._of_splats), -1)
 
     @classmethod
     def begin(
@@ -284,14 +290,17 @@ class State:
         does."""
         assert self._harmonics is not None
         assert gradients.harmonics is not None
-        config, flat = self.config, gradients.harmonics.reshape(len(gradients.harmonics), -1)
-        rate = config.harmonics_rate * color_rate / config.color_rate
+        flat = gradients.harmonics.reshape(len(gradients.harmonics), -1)
+        rate = self._harmonics_rate(color_rate)
         if rate > 0:
             reached = nonzero_rows(flat)
             if self.frozen is not None:
                 reached &= ~self._frozen_splats
             self._harmonics.lr = rate
             self._harmonics.step(flat, reached)
+
+    def _harmonics_rate(self, color_rate: float) -> float:
+        return self.config.harmonics_rate * color_rate / self.config.color_rate
 
     @cached_property
     def _frozen_splats(self) -> np.ndarray:
@@ -311,7 +320,6 @@ class State:
             "rounding": self._rounds,
             "frozen": self.frozen is not None or self.solid is not None,
             "depth groups": self.mesh.depth_group is not None,
-            "harmonics": self.harmonics is not None,
         }
         return {need for need, there in of_state.items() if there}
 
@@ -330,15 +338,21 @@ class State:
         Returns the sums. If they or the gradients are not finite, nothing has changed.
         """
         config = self.config
-        optimisers = [self._colors, *([self._positions] if rates.positions > 0 else [])]
-        sizes = [optimiser.next_rate(rate) for optimiser, rate in zip(optimisers, rates, strict=False)]
+        moving = (
+            (self._colors, rates.colors),
+            (self._positions, rates.positions),
+            (self._harmonics, self._harmonics_rate(rates.colors)),
+        )
+        sizes = [0.0 if adam is None or rate <= 0 else adam.next_rate(rate) for adam, rate in moving]
         betas = (config.beta1, config.beta2)
-        asked = StepRates(*loss[:3], sizes[0], (*sizes, 0.0)[1], betas, epsilons(config))
+        colors, positions, harmonics = sizes
+        asked = StepRates(*loss[:3], colors, positions, harmonics, betas, epsilons(config))
         sums = steps.step(self._parameters, image.camera, image.options, image.target, image.mask, asked)
         if sums.finite:
             self._ahead = steps
-            for optimiser in optimisers:
-                optimiser.steps += 1
+            for (adam, _), size in zip(moving, sizes, strict=True):
+                if adam is not None and size:
+                    adam.steps += 1
         return sums
 
     @property
@@ -351,6 +365,8 @@ class State:
             Moments(self._colors.mean, self._colors.square),
             self._positions.scale,
             self._boundary,
+            self._of_splats,
+            None if self._harmonics is None else Moments(self._harmonics.mean, self._harmonics.square),
         )
 
     def _fetch(self) -> None:

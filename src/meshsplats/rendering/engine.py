@@ -31,7 +31,6 @@ Need = Literal[
     "frozen",
     "depth groups",
     "loss",
-    "harmonics",
     "file order",
 ]
 """What a run may ask of steps beyond positions and colours that follow the default loss: gradients for a

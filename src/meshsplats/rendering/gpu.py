@@ -18,9 +18,15 @@ from meshsplats.rendering.engine import Drawn, ImageOptions, Need
 from meshsplats.rendering.shading import Shading
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
-from meshsplats.webgpu.gradients import GradientRenderer, WindowLimit, changing_mesh, check_limits
-from meshsplats.webgpu.renderer import MeshRenderer
-from meshsplats.webgpu.training import MAX_PIXELS, Parameters, Rates, Sums, Trainer
+from meshsplats.webgpu.gradients import (
+    GradientRenderer,
+    WindowLimit,
+    changing_mesh,
+    check_limits,
+    harmonics_fit,
+)
+from meshsplats.webgpu.renderer import Images, MeshRenderer
+from meshsplats.webgpu.training import Parameters, Rates, Sums, Trainer, most_pixels
 
 CANNOT: Mapping[Need, str] = {
     "cutoff": "opacity 'cutoff' needs device 'cpu': the GPU has no gradients for a cutoff",
@@ -37,12 +43,11 @@ RUN_BY_RUN: frozenset[Need] = frozenset(
         "frozen",
         "depth groups",
         "loss",
-        "harmonics",
     )
 )
 """What whole steps do not know. Such runs take the rest of each step themselves, with images and gradients
-from here; so do those with images of more than ``MAX_PIXELS`` pixels. Meshes that do not fit are in
-``gradients.check_limits``."""
+from here; so do those with images of more than ``most_pixels`` pixels, or with harmonics that do not fit.
+Meshes that do not fit are in ``gradients.check_limits``."""
 
 
 class GpuEngine:
@@ -77,9 +82,9 @@ class GpuEngine:
             drawn = self.renderer_of(mesh).draw(
                 camera, settings, depth=options.depth, normals=options.normals, values=options.values
             )
-        backdrop = np.asarray(options.background, np.float32)
+        add_background(drawn, np.asarray(options.background, np.float32))
         return Drawn(
-            drawn.color + drawn.transmittance[:, :, None] * backdrop,
+            drawn.color,
             1 - drawn.transmittance,
             drawn.depth,
             drawn.normals,
@@ -157,6 +162,13 @@ class GpuEngine:
             return known
 
 
+def add_background(images: Images, background: np.ndarray) -> None:
+    """Puts a ``background``, float32 RGB (3,) or (h, w, 3), behind the colours of images."""
+    if background.any():
+        for channel in range(3):
+            images.color[..., channel] += images.transmittance * background[..., channel]
+
+
 @functools.lru_cache(maxsize=1)
 def gpu_engine() -> GpuEngine:
     """The engine of this process."""
@@ -220,7 +232,8 @@ class GpuRendering:
             images, self.tape = self._renderer.forward(
                 triangles, camera, settings, pose=options.pose, limit=limit
             )
-        self.color = images.color + images.transmittance[:, :, None] * self._background
+        add_background(images, self._background)
+        self.color = images.color
         self.alpha = 1 - images.transmittance
         self.fragments = images.work.fragments
         none = np.zeros((camera.height, camera.width, 0), np.float32)
@@ -285,8 +298,9 @@ class GpuSession:
         return self._engine.tape(triangles, camera, options, limit=self.limit)
 
     def whole_steps(self, camera: Camera, needs: Collection[Need]) -> GpuSession | None:
-        able = RUN_BY_RUN.isdisjoint(needs) and camera.width * camera.height <= MAX_PIXELS
-        return self if able else None
+        device = open_device()
+        able = RUN_BY_RUN.isdisjoint(needs) and camera.width * camera.height <= most_pixels(device)
+        return self if able and harmonics_fit(device, self._mesh) else None
 
     def step(
         self,

@@ -18,6 +18,8 @@ KINDS = ("DiscreteGPU", "IntegratedGPU", "Unknown", "CPU")
 
 CORE_BINDING = 128 << 20
 """Bytes of a storage buffer that a shader can see, on every device."""
+MOST_BINDING = 2 << 30
+"""Bytes of a buffer that is asked for: where a device has more, nothing needs it."""
 
 CORE_LIMITS = {
     "max-buffer-size": 256 << 20,
@@ -37,12 +39,20 @@ SOFTWARE_BUDGETS = (60_000, 150_000)
 
 
 class Device:
-    """A device with WebGPU's core limits: no features, 8 storage buffers a stage, 128 MiB a binding."""
+    """A device with WebGPU's core limits: no features, 8 storage buffers a stage. Its buffers may be as large
+    as the adapter has them.
+
+    Attributes:
+        binding_limit: most bytes of a buffer, a multiple of 16.
+    """
 
     def __init__(self, adapter: Any) -> None:
         self.info: dict[str, str] = {key: str(value) for key, value in dict(adapter.info).items()}
-        self.device: Any = adapter.request_device_sync(required_limits=CORE_LIMITS)
-        self.binding_limit = CORE_BINDING
+        sizes = ("max-buffer-size", "max-storage-buffer-binding-size")
+        largest = min(MOST_BINDING, *(adapter.limits[name] for name in sizes))
+        self.binding_limit = max(CORE_BINDING, largest // 16 * 16)
+        limits = CORE_LIMITS | {name: max(CORE_LIMITS[name], self.binding_limit) for name in sizes}
+        self.device: Any = adapter.request_device_sync(required_limits=limits)
         self.budgets = SOFTWARE_BUDGETS if self.info["adapter_type"] == "CPU" else (BUDGET,)
         self._pipelines: dict[tuple[Any, ...], Any] = {}
         self._modules: dict[tuple[Any, ...], Any] = {}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -16,6 +17,8 @@ from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET, Device
 from meshsplats.webgpu.layout import (
+    FANS_IN_WORKGROUP,
+    check_count,
     check_fans,
     check_size,
     find_fans,
@@ -126,6 +129,8 @@ class MeshFrames:
         """Room for pairs of a run and a tile."""
         self._program = program
         self._buffers: dict[str, Any] = {}
+        self._staging: Any = None
+        """The buffer that everything is read through: making one takes longer than reading."""
         self._bind_groups: dict[tuple[Any, ...], Any] = {}
         self._runs = runs = find_runs(mesh.faces, mesh.face_splat)
         self._by_splat = False
@@ -147,6 +152,7 @@ class MeshFrames:
         if not len(mesh.faces):
             return
         check_size(device, "vertices", 16 * (len(mesh.vertices) + 2 * self.counts["groups"]))
+        check_count("vertices", len(mesh.vertices), 256)
         check_size(device, "triangles", 4 * sum(map(len, parts)))
         self.upload("vertices", mesh.vertices)
         self._upload_colors(mesh)
@@ -210,9 +216,28 @@ class MeshFrames:
         """Writes an array into a buffer from byte ``offset`` on."""
         self.device.device.queue.write_buffer(self._buffers[name], offset, array)
 
+    @contextlib.contextmanager
+    def reading(self, name: str, size: int) -> Iterator[np.ndarray]:
+        """(size / 4,) uint32: the first bytes of a buffer, in memory that is there as long as the context."""
+        import wgpu
+
+        gpu, known = self.device.device, self._staging
+        if known is None or known.size < size:
+            usage = int(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
+            known = self._staging = gpu.create_buffer(size=size, usage=usage)
+        encoder = gpu.create_command_encoder()
+        encoder.copy_buffer_to_buffer(self._buffers[name], 0, known, 0, size)
+        gpu.queue.submit([encoder.finish()])
+        known.map_sync(wgpu.MapMode.READ, 0, size)
+        try:
+            yield np.frombuffer(known.read_mapped(0, size, copy=False), np.uint32)
+        finally:
+            known.unmap()
+
     def read(self, name: str, size: int) -> np.ndarray:
         """(size / 4,) uint32: the first bytes of a buffer."""
-        return np.frombuffer(self.device.device.queue.read_buffer(self._buffers[name], 0, size), np.uint32)
+        with self.reading(name, size) as words:
+            return words.copy()
 
     def clear(self, name: str) -> None:
         encoder = self.device.device.create_command_encoder()
@@ -241,6 +266,7 @@ class MeshFrames:
         if by_splat:
             check_fans(self.mesh, MAX_FAN, filtered=False)
         if (settings.filter_px2 or by_splat) and "fans" not in self._buffers:
+            check_count("splats", len(self.mesh.splats), FANS_IN_WORKGROUP)
             self.upload("fans", find_fans(self.mesh))
             self.counts["splats"] = len(self.mesh.splats)
         if self._by_splat and not by_splat:
@@ -318,16 +344,18 @@ class MeshFrames:
         )
 
     def counters(self) -> np.ndarray:
-        return self.read("counters", 64).copy()
+        return self.read("counters", 64)
 
-    def read_pixels(self, width: int, height: int, samples: int) -> np.ndarray:
-        """(h, w, 4) float32: the pixels of the last frame."""
+    @contextlib.contextmanager
+    def pixels(self, width: int, height: int, samples: int) -> Iterator[np.ndarray]:
+        """(h, w, 4) float32: the pixels of the last frame, as ``reading`` has them."""
         name = "samples"
         if samples > 1:
             counts = {"columns": width, "rows": height}
             self.run(_RESOLVE_STEPS, "color", counts, DrawSettings())
             name = "pixels"
-        return self.read(name, 16 * width * height).view(np.float32).reshape(height, width, 4)
+        with self.reading(name, 16 * width * height) as words:
+            yield words.view(np.float32).reshape(height, width, 4)
 
     def run(
         self,

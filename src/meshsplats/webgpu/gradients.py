@@ -19,7 +19,15 @@ from meshsplats.order import Order
 from meshsplats.webgpu import frames, kernels
 from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings, MeshFrames, Output, Program, Work
-from meshsplats.webgpu.layout import check_fans, check_size, find_groups, halves
+from meshsplats.webgpu.layout import (
+    FANS_IN_WORKGROUP,
+    MAX_WORKGROUPS,
+    check_count,
+    check_fans,
+    check_size,
+    find_groups,
+    halves,
+)
 from meshsplats.webgpu.renderer import DRAWING, Images, drawing_pipeline, fits
 
 PAIR_BYTES = 100
@@ -27,6 +35,8 @@ PAIR_BYTES = 100
 FRAGMENT_BYTES = 16
 SUM_BYTES = 64
 """Bytes of the sums of a triangle, over one tile or all."""
+MAX_SUMS = 1 << 24
+"""Sums of one window: their indices have 24 bits."""
 MAX_FAN = 4096
 """Most triangles of a splat with a low-pass filter: one invocation goes through all of them nine times."""
 MAX_VALENCE = 16_384
@@ -87,17 +97,26 @@ class WindowLimit:
     samples: int = WINDOW_SAMPLES
 
 
+def harmonics_fit(device: Device, mesh: SplatMesh) -> bool:
+    """Whether whole steps can have the harmonics of ``mesh`` and their moments on the GPU."""
+    if mesh.harmonics is None:
+        return True
+    few = len(mesh.harmonics) <= MAX_WORKGROUPS * FANS_IN_WORKGROUP
+    return few and mesh.harmonics.nbytes <= device.binding_limit
+
+
 def check_limits(device: Device, mesh: SplatMesh) -> None:
     """Checks that gradients of ``mesh`` fit on the GPU.
 
     Raises:
-        MemoryError: a mesh that does not fit into buffers of 128 MiB.
+        MemoryError: a mesh that does not fit into the buffers of the device.
         DeviceError: a vertex with too many triangles, or a splat with too many for the filter.
         ValueError: two splats share a vertex, and there is a filter.
     """
     vertices, faces = len(mesh.vertices), len(mesh.faces)
     groups = 0 if mesh.depth_group is None else len(np.unique(mesh.depth_group[mesh.depth_group >= 0]))
     check_size(device, "vertices", 16 * (2 * vertices + 2 * groups))
+    check_count("vertices", vertices, 256)
     check_size(device, "triangles", SUM_BYTES * faces)
     check_size(device, "triangles", 4 * (vertices + 1 + 3 * faces))
     most = int(np.bincount(mesh.faces.ravel()).max(initial=0))
@@ -170,7 +189,7 @@ class GradientRenderer:
         mesh: the triangles; its positions and colours are not used.
 
     Raises:
-        MemoryError: a mesh that does not fit into buffers of 128 MiB.
+        MemoryError: a mesh that does not fit into the buffers of the device.
         DeviceError: a vertex with too many triangles.
     """
 
@@ -250,8 +269,8 @@ class GradientRenderer:
                 tape.windows.append(window)
                 images.work.add(window.tiles, window.counters)
                 part = np.s_[area[1] : area[1] + area[3], area[0] : area[0] + area[2]]
-                pixels = self.frames.read_pixels(area[2], area[3], settings.samples)
-                images.color[part], images.transmittance[part] = pixels[..., :3], pixels[..., 3]
+                with self.frames.pixels(area[2], area[3], settings.samples) as pixels:
+                    images.color[part], images.transmittance[part] = pixels[..., :3], pixels[..., 3]
                 if images.values is not None:
                     self._render_values(tape, window, images.values[part])
             images.work.bytes = self.frames.bytes
@@ -262,8 +281,8 @@ class GradientRenderer:
         for columns, some in _triples(tape):
             self._load_values(some)
             self.try_mark(tape, window.area, window.settings)
-            pixels = self.frames.read_pixels(window.area[2], window.area[3], window.settings.samples)
-            out[..., columns] = pixels[..., : columns.stop - columns.start]
+            with self.frames.pixels(window.area[2], window.area[3], window.settings.samples) as pixels:
+                out[..., columns] = pixels[..., : columns.stop - columns.start]
         self._load_values(tape.triangles.colors)
 
     def _load(self, tape: Tape) -> None:
@@ -330,7 +349,7 @@ class GradientRenderer:
             counts = self.frames.begin(part, settings, tape.pose)
         fragments, sums = int(counters[13]), int(counters[14])
         limit = self.device.binding_limit
-        if FRAGMENT_BYTES * fragments > limit or SUM_BYTES * sums > limit:
+        if FRAGMENT_BYTES * fragments > limit or SUM_BYTES * sums > limit or sums >= MAX_SUMS:
             return None
         window = Window(area, settings, rounds, fragments, sums, counts["tiles"], counters)
         if area[2:] == (tape.camera.width, tape.camera.height):
@@ -392,7 +411,7 @@ class GradientRenderer:
             counts = self.frames.begin(tape.part(last.area), last.settings, tape.pose)
             self.frames.run(_FILTER_STEPS, "color", counts, last.settings)
         size = 32 * len(tape.triangles.vertices)
-        return self.frames.read("gradients", size).view(np.float32).reshape(-1, 8).copy()
+        return self.frames.read("gradients", size).view(np.float32).reshape(-1, 8)
 
     def _add_window(self, tape: Tape, window: Window, gradient: np.ndarray) -> None:
         """Adds the gradients of a window whose fragments are marked."""

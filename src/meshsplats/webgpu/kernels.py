@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 from meshsplats.order import Order
 
-QUEUE = 16
+QUEUE = 32
 """Default length of the fragment queue of each sample, in the first walk through a tile list."""
 
-LONG_QUEUE = 32
+LONG_QUEUE = 64
 """The same in later walks, of the tiles whose first queues were too short."""
 
 TILE = 8
@@ -40,7 +40,7 @@ OUTPUTS: tuple[Output, ...] = ("color", "depth", "vertex_normals", "face_normals
 
 def lists_source() -> str:
     """WGSL of the kernels that shade and make the tile lists, and of ``resolve``."""
-    names = ("common", "lists", "shading", "sorting", "splat_order")
+    names = ("common", "lists", "harmonics", "shading", "sorting", "splat_order")
     return "".join(_text(f"{name}.wgsl") for name in names)
 
 
@@ -74,7 +74,7 @@ def filter_source() -> str:
 
 def training_source() -> str:
     """WGSL of the loss and of Adam."""
-    return _text("common.wgsl") + _text("training.wgsl")
+    return "".join(_text(f"{name}.wgsl") for name in ("common", "harmonics", "training"))
 
 
 def _raster_source(queue: int, output: Output, groups: bool, order: Order) -> str:
@@ -204,7 +204,7 @@ GRADIENT_KERNELS = ("count_marks", "place_marks", "find_behind", "add_samples", 
 
 TRAINING_KERNELS = (
     *("store_window", "load_window", "judge", "rate", "add_losses", "find_image_gradient"),
-    *("check_gradients", "adam"),
+    *("check_gradients", "adam", "adam_harmonics"),
 )
 """Kernels of ``training_source``."""
 
@@ -309,13 +309,23 @@ def window_steps(rounds: int) -> list[dict[str, Any]]:
 
 
 def adam_steps() -> list[dict[str, Any]]:
-    """From the gradients of vertices to their new positions and colours."""
+    """From the gradients of vertices to their new positions and colours, and to the new harmonics of splats.
+
+    ``base`` has the mesh's colours, ``values`` those of the view.
+    """
     checked = {"0": "frame", "8": "results", "10": "gradients"}
-    own = {"1": "step", "11": "vertices", "12": "values"}
-    own |= {"13": "position_moments", "14": "color_moments", "15": "traits"}
+    common = {"1": "step", "11": "vertices", "16": "values"}
+    own = {"12": "base", "13": "position_moments", "14": "color_moments", "15": "traits"}
+    splats = {"17": "harmonics", "18": "harmonic_means", "19": "harmonic_squares", "20": "splat_vertices"}
     return [
         {"kernel": "check_gradients", "bind": checked, "count": ["vertices", 256]},
-        {"kernel": "adam", "bind": checked | own, "count": ["vertices", 256]},
+        {
+            "kernel": "adam_harmonics",
+            "bind": checked | common | splats,
+            "count": ["harmonic_splats", 64],
+            "if": "harmonic_splats",
+        },
+        {"kernel": "adam", "bind": checked | common | own, "count": ["vertices", 256]},
     ]
 
 

@@ -10,6 +10,11 @@ from meshsplats.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
 
+MAX_WORKGROUPS = 65_535
+"""Of a dispatch, along each dimension."""
+FANS_IN_WORKGROUP = 64
+"""Splats of a workgroup that handles whole splats."""
+
 
 def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
     """(r,) uint32 runs: the first face, and from bit 29 on the count less 1.
@@ -44,6 +49,15 @@ def check_size(device: Device, name: str, size: int) -> None:
         )
 
 
+def check_count(name: str, count: int, in_workgroup: int) -> None:
+    """MemoryError for more of something than one dispatch of workgroups takes."""
+    most = MAX_WORKGROUPS * in_workgroup
+    if count > most:
+        raise MemoryError(
+            f"the mesh has too many {name} for the GPU: {count:,}; it takes {most:,}. Use device='cpu'"
+        )
+
+
 def check_fans(mesh: SplatMesh, most: int, *, filtered: bool) -> None:
     """Checks the splats of a mesh for the order of the splats, or for the low-pass filter.
 
@@ -74,6 +88,16 @@ def find_owners(mesh: SplatMesh) -> np.ndarray:
     owners = np.full(len(mesh.vertices), 0xFFFFFFFF, np.uint32)
     owners[mesh.faces] = mesh.splats.of_face[:, None]
     return owners
+
+
+def find_splat_vertices(mesh: SplatMesh) -> np.ndarray:
+    """(s + 1 + n,) uint32 first vertex of each splat, and their count n; then the vertices of one splat after
+    the other, each in ascending order."""
+    owners = find_owners(mesh)
+    used = np.flatnonzero(owners != 0xFFFFFFFF)
+    listed = used[np.argsort(owners[used], kind="stable")]
+    starts = np.append(0, np.cumsum(np.bincount(owners[used], minlength=len(mesh.splats))))
+    return np.concatenate([starts, listed]).astype(np.uint32)
 
 
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -47,7 +47,10 @@ var<workgroup> constants: array<vec4f, 64>;
 // of the depth group: slopes, 1 / z at the corner of the tile; 1 if there is one
 var<workgroup> planes: array<vec4f, 64>;
 var<workgroup> ranges: array<vec2f, 64>;   // of 1 / z of the depth group
-var<workgroup> boxes: array<u32, 128>;     // the samples in its box, one bit each: two words a slot
+// By column and by row of samples: the slots whose boxes reach it, one bit each in two words. Twice, for
+// batches in turn: those of one are cleared while the other's are in use.
+var<workgroup> columns: array<atomic<u32>, 32>;
+var<workgroup> rows: array<atomic<u32>, 32>;
 var<workgroup> keys: array<f32, 8>;        // of the runs
 var<workgroup> ready: array<atomic<u32>, 2>;
 var<workgroup> open_count: atomic<u32>;
@@ -74,6 +77,14 @@ var<private> limit_face: u32;
 var<private> blended: u32;        // in this walk, visible ones
 var<private> advanced: bool;      // in this walk
 var<private> effort: u32;         // iterations of nested loops in this batch
+var<private> turn: u32;           // of `columns` and `rows`: 0 or 16
+// The triangles that come into the slot in this batch and in those after it. Where one is read depends on what
+// was read of it before. So each batch reads one step of each: none waits for another.
+var<private> next_pair: u32;      // where the last of them is in the list
+var<private> coming_pair: array<vec2u, 4>;
+var<private> coming_face: array<u32, 3>;
+var<private> coming_corners: array<vec3u, 2>;
+var<private> coming_vertices: array<vec4u, 3>;
 // Its queue: a ring, nearest first.
 var<private> head: u32;
 var<private> count: u32;
@@ -150,7 +161,7 @@ fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32, source: u32) {
   let inverse = ends[slot].w;
   var depth = 0.0;  // 1 / z
   if (inverse == 0.0) {
-    depth = at_sample(depths[slot]);
+    if (!BY_SPLAT || OUTPUT == 1u) { depth = at_sample(depths[slot]); }
   } else {
     depth = sum * inverse;
     if (depth > scale.w) { return; }  // nearer than the near plane
@@ -211,6 +222,34 @@ fn facing(n: vec3f, p: vec2f) -> vec3f {
 // Which triangle of its run is in a slot.
 fn face_of_slot(slot: u32) -> u32 { return select(slot % RUN, RUN - 1u - slot % RUN, BY_SPLAT); }
 
+const NO_FACE = 0xffffffffu;
+const NO_RUN = 0xffffffffu;
+
+// Reads on, in a list that ends at `end`.
+fn read_on(slot: u32, end: u32) {
+  if (coming_face[1] != NO_FACE) {
+    let i = coming_corners[1];
+    coming_vertices = array<vec4u, 3>(projected[i.x], projected[i.y], projected[i.z]);
+  }
+  coming_corners[0] = coming_corners[1];
+  let f = 3u * coming_face[2];
+  if (coming_face[2] != NO_FACE) { coming_corners[1] = vec3u(mesh[f], mesh[f + 1u], mesh[f + 2u]); }
+  coming_face[0] = coming_face[1];
+  coming_face[1] = coming_face[2];
+  coming_face[2] = NO_FACE;
+  if (coming_pair[3].y != NO_RUN) {
+    let run = unpack_run(mesh[frame.runs_at + (coming_pair[3].y & 0xffffffu)]);
+    let k = face_of_slot(slot);
+    if (k < run.count) { coming_face[2] = run.first + k; }
+  }
+  coming_pair[0] = coming_pair[1];
+  coming_pair[1] = coming_pair[2];
+  coming_pair[2] = coming_pair[3];
+  coming_pair[3].y = NO_RUN;
+  if (next_pair < end) { coming_pair[3] = pairs[next_pair]; }
+  next_pair += RUN;
+}
+
 fn add_wide(at: u32, value: u32) {  // to a counter of 64 bits
   let old = atomicAdd(&counters[at], value);
   if (old > 0xffffffffu - value) { atomicAdd(&counters[at + 1u], 1u); }
@@ -251,10 +290,18 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
   let was_open = open;
   if (t == 0u) { atomicStore(&broken, 0u); }
   if (t < 4u) { atomicStore(&efforts[t], 0u); }
+  if (t < 16u) { atomicStore(&columns[t], 0u); } else if (t < 32u) { atomicStore(&rows[t - 16u], 0u); }
+  turn = 0u;
 
   var clean = item.y;     // everything before it is blended
   var at = item.y;
   let end = item.z;
+  next_pair = at + t / RUN;
+  coming_face = array<u32, 3>(NO_FACE, NO_FACE, NO_FACE);
+  coming_pair[3].y = NO_RUN;
+  for (var i = 0u; i < 4u; i++) { read_on(t, end); }
+  var nearest = 0u;
+  if (at < end) { nearest = pairs[at].x; }
   var spent = 0u;
   var cut = false;        // the budget is spent
   var ended = false;      // the loop was left by its own exits
@@ -266,7 +313,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
     if (t == 2u) { atomicStore(&open_count, 0u); }
     workgroupBarrier();
     // No fragment to come is nearer than this.
-    let nearest_to_come = unpack_depth(pairs[at].x);
+    let nearest_to_come = unpack_depth(nearest);
     if (open) {
       if (BY_SPLAT) {
         clean = at;
@@ -276,16 +323,16 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
       }
       if (open) { atomicAdd(&open_count, 1u); }
     }
-    let pair_at = at + t / RUN;
-    if (pair_at < end) {
-      let pair = pairs[pair_at];
-      let run = unpack_run(mesh[frame.runs_at + (pair.y & 0xffffffu)]);
-      let k = face_of_slot(t);
-      if (k == 0u) { keys[t / RUN] = unpack_depth(pair.x); }
-      if (k < run.count) {
-        if (set_up(t, run.first + k, o)) { atomicOr(&ready[t / 32u], 1u << (t % 32u)); }
+    if (t % RUN == 0u) { keys[t / RUN] = unpack_depth(coming_pair[0].x); }
+    if (coming_face[0] != NO_FACE) {
+      if (set_up(t, coming_face[0], coming_corners[0], coming_vertices, o)) {
+        atomicOr(&ready[t / 32u], 1u << (t % 32u));
       }
     }
+    if (t >= 32u && t < 48u) { atomicStore(&columns[(16u - turn) + t - 32u], 0u); }
+    if (t >= 48u) { atomicStore(&rows[(16u - turn) + t - 48u], 0u); }
+    read_on(t, end);
+    if (at + RUN < end) { nearest = pairs[at + RUN].x; }
     workgroupBarrier();
     if (t == 0u) {
       decision = vec4u(atomicLoad(&open_count), atomicLoad(&ready[0]), atomicLoad(&ready[1]), most_effort());
@@ -294,23 +341,14 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
     if (now.x == 0u) { ended = true; break; }
     if (spent + now.w > frame.budget) { ended = true; cut = true; break; }
     let triangles = countOneBits(now.y) + countOneBits(now.z);
-    spent += 3u * triangles + K + 8u;
+    spent += 2u * triangles + K + 24u;
     if (open) {
       // Slots whose box holds the sample; those that cover it; then their fragments: lanes differ less so.
-      let word = t / 32u;
-      let bit = t % 32u;
-      var near = vec2u(0u);
-      var rest = now.yz;
-      while (rest.x != 0u) {
-        let slot = firstTrailingBit(rest.x);
-        near.x |= ((boxes[2u * slot + word] >> bit) & 1u) << slot;
-        rest.x &= rest.x - 1u;
-      }
-      while (rest.y != 0u) {
-        let slot = firstTrailingBit(rest.y);
-        near.y |= ((boxes[2u * slot + 64u + word] >> bit) & 1u) << slot;
-        rest.y &= rest.y - 1u;
-      }
+      let column = turn + 2u * (t % TILE);
+      let row = turn + 2u * (t / TILE);
+      var near = vec2u(
+        atomicLoad(&columns[column]) & atomicLoad(&rows[row]),
+        atomicLoad(&columns[column + 1u]) & atomicLoad(&rows[row + 1u]));
       tests += countOneBits(near.x) + countOneBits(near.y);
       effort = 0u;
       var hits = vec2u(0u);
@@ -331,9 +369,10 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
         if (BY_SPLAT) { open = is_open(); }
       }
       atomicAdd(&efforts[t / 16u], effort);
-      whole = whole && (rest.x | rest.y | near.x | near.y) == 0u && ((hits.x | hits.y) == 0u || !open);
+      whole = whole && (near.x | near.y) == 0u && ((hits.x | hits.y) == 0u || !open);
     }
     at += RUN;
+    turn = 16u - turn;
   }
   if (!BY_SPLAT && open && !cut) {
     while (count > 0u && open) { blend_front(); open = is_open(); }

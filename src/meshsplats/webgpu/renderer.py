@@ -158,15 +158,16 @@ class MeshRenderer:
             counts = self._frames.begin(part, settings)
         work.add(counts["tiles"], counters)
         rows, columns = slice(y0, y0 + h), slice(x0, x0 + w)
-        pixels = self._frames.read_pixels(w, h, settings.samples)
-        images.color[rows, columns] = pixels[..., :3]
-        images.transmittance[rows, columns] = pixels[..., 3]
+        with self._frames.pixels(w, h, settings.samples) as pixels:
+            images.color[rows, columns] = pixels[..., :3]
+            images.transmittance[rows, columns] = pixels[..., 3]
         for one in passes:
             if one.vertex_values is not None:
                 self._frames.upload("other_values", one.vertex_values)
             self._frame(one.output, counts, settings, None)
             channels = one.image.shape[2]
-            one.image[rows, columns] = self._frames.read_pixels(w, h, settings.samples)[..., :channels]
+            with self._frames.pixels(w, h, settings.samples) as pixels:
+                one.image[rows, columns] = pixels[..., :channels]
         return True
 
     def _passes(self, images: Images, values: np.ndarray | None) -> Iterator[_Pass]:

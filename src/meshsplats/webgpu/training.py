@@ -14,21 +14,20 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import MAX_COLOR, SplatMesh
 from meshsplats.webgpu import kernels
-from meshsplats.webgpu.device import CORE_BINDING, Device
+from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.frames import DrawSettings, Output
 from meshsplats.webgpu.gradients import GRADIENTS, GradientRenderer, Tape, WindowLimit, gradient_pipeline
-from meshsplats.webgpu.layout import halves
+from meshsplats.webgpu.layout import find_splat_vertices, halves
 
 DERIVATIVE_BYTES = 48
 """Bytes of the derivatives of SSIM in each pixel, the largest buffer of an image."""
-MAX_PIXELS = CORE_BINDING // DERIVATIVE_BYTES
-"""Most pixels of an image."""
 SIDE = 16
 """Pixels along each side of a workgroup that compares images."""
 
 _STORE_STEPS, _LOSS_STEPS = tuple(kernels.store_steps()), tuple(kernels.loss_steps())
+_SHADE_STEPS = tuple(step for step in kernels.list_steps() if step.get("kernel") == "shade")
 _ADAM_STEPS = (*kernels.filter_steps(), *kernels.adam_steps())
 _window_steps = functools.lru_cache(maxsize=64)(kernels.window_steps)
 
@@ -53,6 +52,10 @@ class Parameters(NamedTuple):
     """(v,) float32 factors of the learning rate of positions; None: 1."""
     transparent: np.ndarray | None = None
     """(v,) bool: vertices whose opacity stays 0 once it is 0; None: no vertex."""
+    harmonics: np.ndarray | None = None
+    """(s, k, 3) float32 of each splat; None: colours do not depend on the view."""
+    harmonic_moments: Moments | None = None
+    """Both (s, 3 k) float32."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +69,11 @@ class Rates:
     colors: float
     positions: float
     """Learning rates with Adam's bias corrections; 0: positions are fixed."""
+    harmonics: float
+    """The same of harmonics; 0: they are fixed."""
     betas: tuple[float, float]
     epsilons: tuple[float, float]
-    """Adam's, for colours and for positions."""
+    """Adam's, for colours and harmonics, and for positions."""
 
 
 class Sums(NamedTuple):
@@ -89,6 +94,11 @@ def _pipeline(device: Device, kernel: str, output: Output, settings: DrawSetting
 TRAINING = GRADIENTS._replace(pipeline=_pipeline, uniforms=GRADIENTS.uniforms | {"step"})
 
 
+def most_pixels(device: Device) -> int:
+    """Most pixels of an image of a whole step."""
+    return device.binding_limit // DERIVATIVE_BYTES
+
+
 class Trainer:
     """A mesh whose positions, colours and moments are on a GPU.
 
@@ -99,7 +109,7 @@ class Trainer:
         limit: of windows.
 
     Raises:
-        MemoryError: a mesh that does not fit into buffers of 128 MiB.
+        MemoryError: a mesh that does not fit into the buffers of the device.
         DeviceError: a vertex with too many triangles.
     """
 
@@ -108,10 +118,11 @@ class Trainer:
         self._taping = GradientRenderer(device, mesh, TRAINING)
         self._frames = self._taping.frames
         self._limit = limit
+        self._masked = False
         assert not self._frames.counts["groups"]
         count = len(mesh.vertices)
         self._frames.upload("vertices", start.vertices)
-        self._frames.upload("values", start.colors)
+        self._frames.upload("base", start.colors)
         padded = np.zeros((count, 2, 4), np.float32)
         padded[:, 0, :3], padded[:, 1, :3] = start.position_moments
         self._frames.upload("position_moments", padded)
@@ -120,8 +131,15 @@ class Trainer:
         traits[:, 0] = 1 if start.units is None else start.units
         traits[:, 1] = 0 if start.transparent is None else start.transparent
         self._frames.upload("traits", traits)
+        self._frames.counts["harmonic_splats"] = 0
+        if start.harmonics is not None and start.harmonic_moments is not None:
+            self._frames.counts["harmonic_splats"] = len(start.harmonics)
+            self._frames.upload("harmonics", start.harmonics)
+            self._frames.upload("harmonic_means", start.harmonic_moments.mean)
+            self._frames.upload("harmonic_squares", start.harmonic_moments.square)
+            self._frames.upload("splat_vertices", find_splat_vertices(mesh))
         self._frames.allocate("results", 64)
-        self._frames.allocate("step", 80)
+        self._frames.allocate("step", 96)
 
     def step(
         self,
@@ -135,7 +153,7 @@ class Trainer:
         """Renders the mesh, compares the image with a target, and takes a step of Adam.
 
         Args:
-            camera: of at most ``MAX_PIXELS`` pixels.
+            camera: of at most ``most_pixels`` pixels.
             settings: as in ``GradientRenderer.forward``.
             target: (h, w, 3) float32 RGB.
             mask: (h, w) bool, True where pixels count; None: all do.
@@ -152,6 +170,7 @@ class Trainer:
         with self._frames.lock:
             self._prepare(camera, settings, target, mask)
             tape = Tape(self.mesh.triangles, camera, settings)
+            self._shade(tape)
             waiting = [(0, 0, camera.width, camera.height)]
             while waiting:
                 area = waiting.pop()
@@ -185,12 +204,19 @@ class Trainer:
         """Writes positions, colours and the moments of both into the arrays of ``into``."""
         count = len(self.mesh.vertices)
         vertices = self._read("vertices", 12 * count).reshape(count, 3)
-        colors = self._read("values", 16 * count).reshape(count, 4)
+        colors = self._read("base", 16 * count).reshape(count, 4)
         positions = self._read("position_moments", 32 * count).reshape(count, 2, 4)[..., :3]
         of_colors = self._read("color_moments", 32 * count).reshape(count, 2, 4)
         into.vertices[:], into.colors[:] = vertices, colors
         for known, found in ((into.position_moments, positions), (into.color_moments, of_colors)):
             known.mean[:], known.square[:] = found[:, 0], found[:, 1]
+        if into.harmonics is not None and into.harmonic_moments is not None:
+            for name, array in (
+                ("harmonics", into.harmonics),
+                ("harmonic_means", into.harmonic_moments.mean),
+                ("harmonic_squares", into.harmonic_moments.square),
+            ):
+                array[:] = self._read(name, array.nbytes).reshape(array.shape)
 
     def _read(self, name: str, size: int) -> np.ndarray:
         return self._frames.read(name, size).view(np.float32)
@@ -200,19 +226,28 @@ class Trainer:
     ) -> None:
         """Makes room for an image, and uploads its target."""
         pixels = camera.width * camera.height
-        assert pixels <= MAX_PIXELS
+        assert pixels <= most_pixels(self._frames.device)
         self._frames.prepare(settings)
         self._frames.allocate("image", 16 * pixels)
         self._frames.allocate("image_gradient", 16 * pixels)
         self._frames.allocate("derivatives", DERIVATIVE_BYTES * pixels)
         groups = -(-camera.width // SIDE) * -(-camera.height // SIDE)
         self._frames.allocate("losses", 16 * groups)
-        padded = np.ones((camera.height, camera.width, 4), np.float32)
-        padded[..., :3] = target
+        self._frames.allocate("target", 16 * pixels)
+        self._frames.write("target", np.ascontiguousarray(target, np.float32))
+        self._masked = mask is not None
         if mask is not None:
-            padded[..., 3] = mask
-        self._frames.upload("target", padded)
-        self._frames.copy("values", "projected", self._taping.values_at, 16 * len(self.mesh.vertices))
+            self._frames.write("target", mask.astype(np.float32), 12 * pixels)
+
+    def _shade(self, tape: Tape) -> None:
+        """Finds the colours of a view, and puts them where they are blended from."""
+        size = 16 * len(self.mesh.vertices)
+        if self._frames.counts["harmonics"]:
+            counts = self._frames.begin(tape.part((0, 0, 1, 1)), tape.settings)
+            self._frames.run(_SHADE_STEPS, "color", counts, tape.settings)
+        else:
+            self._frames.copy("base", "values", 0, size)
+        self._frames.copy("values", "projected", self._taping.values_at, size)
 
     @staticmethod
     def _image_counts(camera: Camera) -> dict[str, int]:
@@ -232,11 +267,13 @@ class Trainer:
         rates: Rates,
     ) -> None:
         """Writes the uniform ``Step`` of a window."""
-        data = np.zeros(20, np.float32)
+        data = np.zeros(24, np.float32)
         words = data.view(np.uint32)
         camera = tape.camera
         words[:8] = camera.width, camera.height, *area, tape.settings.samples, tiles
         data[8:12] = *background, rates.epsilons[1]
         data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilons[0]
         data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]
+        data[20:22] = rates.harmonics, MAX_COLOR if self._frames.counts["harmonics"] else 1
+        words[22:24] = self._masked, self._frames.counts["harmonic_splats"]
         self._frames.write("step", data)

@@ -13,12 +13,16 @@ struct Step {
   color_epsilon: f32,                    // Adam's for colours
   color_step: f32, position_step: f32,   // learning rates with bias corrections; 0: positions are fixed
   one_minus_beta1: f32, one_minus_beta2: f32,
+  harmonic_step: f32,                    // learning rate with bias corrections; 0: harmonics are fixed
+  brightest: f32,                        // largest value of RGB
+  masked: u32,                           // 1: behind its RGB, the target says which pixels count
+  harmonic_splats: u32,                  // splats with harmonics
 };
 @group(0) @binding(1) var<uniform> step_of: Step;
 // RGB and transmittance; states; gradients by pixel
 @group(0) @binding(2) var<storage, read_write> samples: array<vec4f>;
 @group(0) @binding(3) var<storage, read_write> image: array<vec4f>;        // RGB over the background
-@group(0) @binding(4) var<storage, read> target_image: array<vec4f>;  // RGB; 1 where a pixel counts, else 0
+@group(0) @binding(4) var<storage, read> target_image: array<f32>;  // RGB; 1 where a pixel counts, else 0
 // three by pixel: of SSIM, for each channel
 @group(0) @binding(5) var<storage, read_write> derivatives: array<vec4f>;
 // of RGB; of the background's share
@@ -31,12 +35,18 @@ struct Step {
 // two by vertex: position in camera axes; RGB and opacity
 @group(0) @binding(10) var<storage, read> gradients: array<vec4f>;
 @group(0) @binding(11) var<storage, read_write> vertices: array<f32>;
-@group(0) @binding(12) var<storage, read_write> values: array<vec4f>;      // RGB and opacity
+@group(0) @binding(12) var<storage, read_write> colors: array<vec4f>;      // RGB and opacity
 // two by vertex: mean, square
 @group(0) @binding(13) var<storage, read_write> position_moments: array<vec4f>;
 @group(0) @binding(14) var<storage, read_write> color_moments: array<vec4f>;
 // unit of the position; 1 where an opacity of 0 stays
 @group(0) @binding(15) var<storage, read> traits: array<vec2f>;
+@group(0) @binding(16) var<storage, read> values: array<vec4f>;            // the colours of the view
+@group(0) @binding(17) var<storage, read_write> harmonics: array<f32>;     // (splats, terms, 3)
+@group(0) @binding(18) var<storage, read_write> harmonic_means: array<f32>;
+@group(0) @binding(19) var<storage, read_write> harmonic_squares: array<f32>;
+// first vertices of splats, their end; then the vertices of one splat after the other
+@group(0) @binding(20) var<storage, read> splat_vertices: array<u32>;
 
 const SIDE = 16u;              // pixels along each side of a workgroup's tile
 const RADIUS = 5u;
@@ -94,9 +104,10 @@ var<workgroup> filtered: array<vec4f, 416>;  // SIDE x WIDE: filtered along rows
 fn pixel_at(x: i32, y: i32, c: u32) -> vec3f {
   if (x < 0 || y < 0 || x >= i32(step_of.width) || y >= i32(step_of.height)) { return vec3f(0.0); }
   let at = u32(y) * step_of.width + u32(x);
-  let other = target_image[at];
-  if (other.w == 0.0) { return vec3f(0.0); }
-  return vec3f(image[at][c], other[c], 1.0);
+  if (step_of.masked == 1u && target_image[3u * step_of.width * step_of.height + at] == 0.0) {
+    return vec3f(0.0);
+  }
+  return vec3f(image[at][c], target_image[3u * at + c], 1.0);
 }
 fn weight_of(k: u32) -> f32 {
   var weights = WEIGHT;
@@ -227,23 +238,33 @@ fn check_gradients(@builtin(global_invocation_id) id: vec3u) {
   if (!is_finite(sum)) { atomicStore(&results[5], 1u); }
 }
 
+fn all_went_well() -> bool { return (atomicLoad(&results[4]) | atomicLoad(&results[5])) == 0u; }
+
+// The gradient of the RGB and opacity of a vertex. Where its colour is held at 0, as harmonics may have it, only
+// one that raises it counts.
+fn color_gradient(i: u32) -> vec4f {
+  let g = gradients[2u * i + 1u];
+  if (frame.terms == 0u) { return g; }
+  return vec4f(select(vec3f(0.0), g.rgb, (values[i].rgb > vec3f(0.0)) | (g.rgb < vec3f(0.0))), g.a);
+}
+
 // Adam (Kingma & Ba 2015) on the vertices with a gradient; nothing changes unless all went well.
 @compute @workgroup_size(256)
 fn adam(@builtin(global_invocation_id) id: vec3u) {
   let i = id.x;
-  if (i >= frame.vertices || (atomicLoad(&results[4]) | atomicLoad(&results[5])) != 0u) { return; }
-  let g = gradients[2u * i + 1u];
+  if (i >= frame.vertices || !all_went_well()) { return; }
+  let g = color_gradient(i);
   if (all(g == vec4f(0.0))) { return; }
-  let value = values[i];
+  let value = colors[i];
   let mean = fma(g - color_moments[2u * i], vec4f(step_of.one_minus_beta1), color_moments[2u * i]);
   let square = fma(g * g - color_moments[2u * i + 1u], vec4f(step_of.one_minus_beta2),
     color_moments[2u * i + 1u]);
   color_moments[2u * i] = mean;
   color_moments[2u * i + 1u] = square;
   var moved = clamp(value - step_of.color_step * (mean / (sqrt(square) + step_of.color_epsilon)), vec4f(0.0),
-    vec4f(1.0));
+    vec4f(vec3f(step_of.brightest), 1.0));
   if (traits[i].y == 1.0 && value.w == 0.0) { moved.w = 0.0; }
-  values[i] = moved;
+  colors[i] = moved;
   if (step_of.position_step == 0.0) { return; }
   let c = gradients[2u * i].xyz;
   let p = c.x * frame.right.xyz + c.y * frame.down.xyz + c.z * frame.forward.xyz;
@@ -256,4 +277,34 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
   position_moments[2u * i + 1u] = vec4f(p_square, 0.0);
   let change = step_of.position_step * traits[i].x * (p_mean / (sqrt(p_square) + step_of.position_epsilon));
   for (var k = 0u; k < 3u; k++) { vertices[3u * i + k] -= change[k]; }
+}
+
+// The same on the harmonics of splats with a gradient, before the vertices move. An invocation a splat.
+@compute @workgroup_size(64)
+fn adam_harmonics(@builtin(global_invocation_id) id: vec3u) {
+  let splat = id.x;
+  if (splat >= step_of.harmonic_splats || step_of.harmonic_step == 0.0 || !all_went_well()) { return; }
+  var sum: array<vec3f, MOST_TERMS>;
+  var reached = false;
+  let list = step_of.harmonic_splats + 1u;
+  for (var n = splat_vertices[splat]; n < splat_vertices[splat + 1u]; n++) {
+    let i = splat_vertices[list + n];
+    let g = color_gradient(i).rgb;
+    if (all(g == vec3f(0.0))) { continue; }
+    reached = true;
+    let basis = basis_of(direction_to(vec3f(vertices[3u * i], vertices[3u * i + 1u], vertices[3u * i + 2u])));
+    for (var k = 0u; k < frame.terms; k++) { sum[k] += basis[k] * g; }
+  }
+  if (!reached) { return; }
+  for (var k = 0u; k < frame.terms; k++) {
+    for (var c = 0u; c < 3u; c++) {
+      let at = 3u * (splat * frame.terms + k) + c;
+      let g = sum[k][c];
+      let mean = fma(g - harmonic_means[at], step_of.one_minus_beta1, harmonic_means[at]);
+      let square = fma(g * g - harmonic_squares[at], step_of.one_minus_beta2, harmonic_squares[at]);
+      harmonic_means[at] = mean;
+      harmonic_squares[at] = square;
+      harmonics[at] -= step_of.harmonic_step * (mean / (sqrt(square) + step_of.color_epsilon));
+    }
+  }
 }

@@ -24,12 +24,13 @@ fn at_sample(f: vec3f) -> f32 {
 }
 
 fn between(a: vec2f, b: vec2f) -> vec2f { return add_pairs(b, -a); }
-// a b - c d
+// a b - c d; exactly 0 for equal products, also where compilers contract.
 fn cross_of(a: vec2f, b: vec2f, c: vec2f, d: vec2f) -> vec2f {
   let p = product_of(a.x, b.x);
   let q = product_of(c.x, d.x);
   let s = sum_of(p.x, -q.x);
-  return sum_of(s.x, s.y + ((p.y - q.y) + ((a.x * b.y + a.y * b.x) - (c.x * d.y + c.y * d.x))));
+  let low = (kept(a.x * b.y) + kept(a.y * b.x)) - (kept(c.x * d.y) + kept(c.y * d.x));
+  return sum_of(s.x, s.y + ((p.y - q.y) + low));
 }
 
 // The coefficients of 1 / z for visible corners; (0, 0, c[0].w) if they are too large. `area` is twice the
@@ -46,8 +47,8 @@ fn depth_plane(c: array<Place, 3>, area: vec2f) -> vec3f {
 }
 
 struct Corner { p: vec4f, rest: vec3f };  // unpack_vertex and unpack_rest
-fn corner_at(vertex: u32) -> Corner {
-  let v = projected[vertex];
+fn corner_at(vertex: u32) -> Corner { return unpack_corner(projected[vertex]); }
+fn unpack_corner(v: vec4u) -> Corner {
   let p = unpack_vertex(v);
   return Corner(p, unpack_rest(v, p));
 }
@@ -79,14 +80,6 @@ fn edges_at(slot: u32, p: vec2f) -> vec3f {
     edge_at(edges[3u * slot], p, c.x), edge_at(edges[3u * slot + 1u], p, c.y),
       edge_at(edges[3u * slot + 2u], p, c.z));
 }
-// Bit 8 y + x for all samples with low <= (x, y) <= high in rows 0 to 3; other rows are left out.
-fn box_bits(low: vec2i, high: vec2i) -> u32 {
-  let y0 = max(low.y, 0);
-  let y1 = min(high.y, 3);
-  if (y0 > y1) { return 0u; }
-  let row = ((2u << u32(high.x - low.x)) - 1u) << u32(low.x);
-  return row * ((0x01010101u << u32(8 * y0)) & (0x01010101u >> u32(8 * (3 - y1))));
-}
 
 fn covers(slot: u32, p: vec2f) -> bool {
   var e = edges_at(slot, p);
@@ -103,14 +96,16 @@ fn covers(slot: u32, p: vec2f) -> bool {
   return all((e > vec3f(0.0)) | ((e == vec3f(0.0)) & owned));
 }
 
-// Sets up a face in a slot, for the tile with the corner o; false if it covers no sample of it.
-fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
-  let i = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
-  let c = array<Corner, 3>(corner_at(i.x), corner_at(i.y), corner_at(i.z));
+// Sets up a face in a slot, for the tile with the corner o; false if it covers no sample of it. `i` are its
+// vertices, `projected_at` what `projected` has of them.
+fn set_up(slot: u32, face: u32, i: vec3u, projected_at: array<vec4u, 3>, o: vec2f) -> bool {
+  let c = array<Corner, 3>(
+    unpack_corner(projected_at[0]), unpack_corner(projected_at[1]), unpack_corner(projected_at[2]));
   let p = array<vec4f, 3>(c[0].p, c[1].p, c[2].p);
   let visible = vec3<bool>(p[0].z > 0.0, p[1].z > 0.0, p[2].z > 0.0);
   if (!any(visible)) { return false; }
-  var box = vec2u(0xffffffffu);
+  var low_sample = vec2u(0u);
+  var high_sample = vec2u(TILE - 1u);
   if (all(visible)) {
     let low = min(min(p[0].xy, p[1].xy), p[2].xy);
     let high = max(max(p[0].xy, p[1].xy), p[2].xy);
@@ -118,17 +113,10 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
     let first = ceil(max(low - o - room, vec2f(0.5)) - 0.5);
     let last = floor(min(high - o + room, vec2f(f32(TILE) - 0.5)) - 0.5);
     if (any(first > last)) { return false; }
-    let a = vec2i(first);
-    let b = vec2i(last);
-    box = vec2u(box_bits(a, b), box_bits(a - vec2i(0, 4), b - vec2i(0, 4)));
+    low_sample = vec2u(first);
+    high_sample = vec2u(last);
   }
-  let v = array<vec4f, 3>(value_of(i.x), value_of(i.y), value_of(i.z));
-  let opacity = max(max(v[0].w, v[1].w), v[2].w);
-  if (frame.cutoff >= 0.0) {
-    if (opacity < frame.cutoff) { return false; }
-  } else if (!(opacity > 0.0) && !TRANSPARENT) {
-    return false;
-  }
+  let v = array<vec4f, 3>(value_of(i.x), value_of(i.y), value_of(i.z));  // used late: reading takes its time
   var e = array<Edge, 3>(edge(c[1], c[2], o), edge(c[2], c[0], o), edge(c[0], c[1], o));
   var flip = 1.0;
   var inverse = 0.0;
@@ -147,7 +135,7 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
       between(places[0].x, places[2].x), between(places[0].y, places[1].y));
     if (!(abs(d.x) > 1e-30)) { return false; }
     if (d.x < 0.0) { flip = -1.0; }
-    depths[slot] = depth_plane(places, d);
+    if (!BY_SPLAT || OUTPUT == 1u) { depths[slot] = depth_plane(places, d); }
   } else {
     var h: array<vec3f, 3>;
     for (var k = 0u; k < 3u; k++) {
@@ -164,6 +152,12 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
       select(1.0, z.x * z.y, visible.x && visible.y));
     farthest = 1.0 / max(max(z.x, z.y), z.z);
     nearest = 1.0 / frame.near;
+  }
+  let opacity = max(max(v[0].w, v[1].w), v[2].w);
+  if (frame.cutoff >= 0.0) {
+    if (opacity < frame.cutoff) { return false; }
+  } else if (!(opacity > 0.0) && !TRANSPARENT) {
+    return false;
   }
   var bits = face;
   var constant = vec4f(0.0);
@@ -194,8 +188,10 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
   scales[slot] = vec4f(scale, nearest);
   least[slot] = farthest;
   ids[slot] = bits;
-  boxes[2u * slot] = box.x;
-  boxes[2u * slot + 1u] = box.y;
+  let bit = 1u << (slot % 32u);
+  let word = turn + slot / 32u;
+  for (var x = low_sample.x; x <= high_sample.x; x++) { atomicOr(&columns[2u * x + word], bit); }
+  for (var y = low_sample.y; y <= high_sample.y; y++) { atomicOr(&rows[2u * y + word], bit); }
   if (OUTPUT == 3u) {  // values are positions
     corners[3u * slot] = vec4f(cross(v[1].xyz - v[0].xyz, v[2].xyz - v[0].xyz), v[0].w);
   }
