@@ -52,7 +52,7 @@ from meshsplats.rendering.devices import Device
 from meshsplats.rendering.gpu import GpuRendering, gpu_engine
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.frames import DrawSettings
+from meshsplats.webgpu.settings import DrawSettings
 
 
 def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.rendering.looks import image_of
 from meshsplats.viewer.page import _read
 from meshsplats.viewer.quantise import quantise_mesh
-from meshsplats.webgpu.frames import DrawSettings, frame_uniform
+from meshsplats.webgpu.settings import DrawSettings, frame_uniform
 
 PATIENCE = 400
 """Seconds for shaders that a busy processor compiles."""

@@ -29,6 +29,7 @@ from meshsplats.rendering.shading import seen_from
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.device import CORE_BINDING, open_device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES
+from meshsplats.webgpu.training import Trainer
 
 GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4
@@ -194,6 +195,20 @@ def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene, monkeypatc
     assert state.whole_steps(camera, ("loss",)) is None
 
 
+@pytest.mark.parametrize("terms", [0, 8])
+def test_nothing_is_fetched_between_steps(scene, monkeypatch, terms):
+    need_gpu()
+    fetched, taken = [], []
+    plain = Trainer.fetch
+    monkeypatch.setattr(Trainer, "fetch", lambda self, into: (fetched.append(len(taken)), plain(self, into)))
+    dataset, mesh = scene
+    mesh = dark_with_harmonics(mesh, terms) if terms else mesh
+    config = make_config(steps=4, prune_epochs=0)
+    run = replace(GPU, report_every=0)
+    finetune(mesh, dataset, config, run=run, on_progress=lambda progress: taken.append(progress.step))
+    assert fetched == [4]
+
+
 def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
     need_gpu()
     from meshsplats.rendering import gpu as module
@@ -313,9 +328,11 @@ def test_a_broken_limit_of_windows_is_refused(scene, value):
         )
 
 
-def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
+@pytest.mark.parametrize("terms", [0, 15])
+def test_a_resumed_run_has_the_same_bits(scene, tmp_path, terms):
     need_gpu()
     dataset, mesh = scene
+    mesh = dark_with_harmonics(mesh, terms) if terms else mesh
     check_resumed(dataset, mesh, make_config(steps=8), tmp_path)
 
 
@@ -338,6 +355,7 @@ def check_resumed(dataset, mesh, config, tmp_path):
     tuned = finetune(mesh, dataset, config, run=replace(run, resume=True))
     assert tuned.vertices.tobytes() == whole.vertices.tobytes()
     assert tuned.colors.tobytes() == whole.colors.tobytes()
+    assert np.array_equal(tuned.harmonics, whole.harmonics)
     assert np.array_equal(tuned.faces, whole.faces)
 
 

@@ -18,8 +18,8 @@ from meshsplats.rendering.engine import Engine, Taped, visible_pixels
 from meshsplats.rendering.gpu import CANNOT, gpu_engine
 from meshsplats.webgpu import gradients, kernels
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.frames import DrawSettings
 from meshsplats.webgpu.gradients import GradientRenderer
+from meshsplats.webgpu.settings import DrawSettings
 
 TOLERANCE = 1e-4
 """Of ||g - g_core|| / ||g_core||, for each array."""

@@ -14,9 +14,9 @@ from meshsplats import Camera, SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.errors import DeviceError
 from meshsplats.rendering.gpu import gpu_engine
 from meshsplats.webgpu import frames, kernels, layout, renderer
-from meshsplats.webgpu.frames import DrawSettings
 from meshsplats.webgpu.layout import find_groups, find_runs
 from meshsplats.webgpu.renderer import MeshRenderer
+from meshsplats.webgpu.settings import DrawSettings
 
 
 @pytest.fixture(autouse=True)

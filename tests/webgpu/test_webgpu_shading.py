@@ -13,8 +13,9 @@ from test_webgpu_render import random_fans
 
 from meshsplats import SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.frames import DrawSettings, MeshFrames
+from meshsplats.webgpu.frames import MeshFrames
 from meshsplats.webgpu.renderer import MeshRenderer
+from meshsplats.webgpu.settings import DrawSettings
 
 
 @pytest.fixture(autouse=True)

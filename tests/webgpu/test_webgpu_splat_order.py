@@ -18,7 +18,7 @@ from test_webgpu_render import crossing_planes, draw, random_fans
 from meshsplats import Camera, SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.errors import DeviceError
 from meshsplats.webgpu import frames, gradients
-from meshsplats.webgpu.frames import DrawSettings
+from meshsplats.webgpu.settings import DrawSettings
 
 BY_SPLAT = DrawSettings(order="splat")
 

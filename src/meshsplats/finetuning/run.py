@@ -363,7 +363,7 @@ class TrainingLoop:
         return self.phase.result(self.state)
 
     def _plan_plain_images(self) -> None:
-        if self.state.harmonics is not None and self.clock.step:
+        if self.state.mesh.harmonics is not None and self.clock.step:
             self.clock.plan_plain_images(most_images(self.clock.step))
 
     def finished(self) -> SplatMesh:

@@ -79,9 +79,8 @@ class State:
             unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self._vertices, lr=1.0, scale=unit, eps=position_epsilon)
         self._of_splats = None if mesh.harmonics is None else mesh.harmonics.copy()
-        self._harmonics = None
-        if self._of_splats is not None:
-            self._harmonics = adam(self._flat_harmonics, lr=1.0, eps=color_epsilon)
+        flat = None if self._of_splats is None else self._flat_harmonics
+        self._harmonics = None if flat is None else adam(flat, lr=1.0, eps=color_epsilon)
         brightest = 1 if mesh.harmonics is None else MAX_COLOR
         self._colors = adam(self._rgba, lr=1.0, bounds=(0, brightest), eps=color_epsilon)
         # Depends on the triangles alone, so that a resumed run finds the same boundary.
@@ -345,8 +344,7 @@ class State:
         )
         sizes = [0.0 if adam is None or rate <= 0 else adam.next_rate(rate) for adam, rate in moving]
         betas = (config.beta1, config.beta2)
-        colors, positions, harmonics = sizes
-        asked = StepRates(*loss[:3], colors, positions, harmonics, betas, epsilons(config))
+        asked = StepRates(*loss[:3], sizes[0], sizes[1], sizes[2], betas, epsilons(config))
         sums = steps.step(self._parameters, image.camera, image.options, image.target, image.mask, asked)
         if sums.finite:
             self._ahead = steps

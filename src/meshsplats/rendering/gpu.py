@@ -17,7 +17,7 @@ from meshsplats.rendering.core_arguments import Pointers, checked_options
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
 from meshsplats.rendering.shading import Shading
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
+from meshsplats.webgpu.frames import WINDOW_SAMPLES
 from meshsplats.webgpu.gradients import (
     GradientRenderer,
     WindowLimit,
@@ -26,6 +26,7 @@ from meshsplats.webgpu.gradients import (
     harmonics_fit,
 )
 from meshsplats.webgpu.renderer import Images, MeshRenderer
+from meshsplats.webgpu.settings import DrawSettings
 from meshsplats.webgpu.training import Parameters, Rates, Sums, Trainer, most_pixels
 
 CANNOT: Mapping[Need, str] = {

@@ -18,7 +18,7 @@ from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.order import Order
 from meshsplats.webgpu import frames, kernels
 from meshsplats.webgpu.device import Device
-from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings, MeshFrames, Output, Program, Work
+from meshsplats.webgpu.frames import WINDOW_SAMPLES, MeshFrames, Output, Program, Work
 from meshsplats.webgpu.layout import (
     FANS_IN_WORKGROUP,
     MAX_WORKGROUPS,
@@ -29,6 +29,7 @@ from meshsplats.webgpu.layout import (
     halves,
 )
 from meshsplats.webgpu.renderer import DRAWING, Images, drawing_pipeline, fits
+from meshsplats.webgpu.settings import DrawSettings
 
 PAIR_BYTES = 100
 """Bytes of the marks of a pair, and of its places on the tape."""

@@ -78,8 +78,8 @@ var<private> blended: u32;        // in this walk, visible ones
 var<private> advanced: bool;      // in this walk
 var<private> effort: u32;         // iterations of nested loops in this batch
 var<private> turn: u32;           // of `columns` and `rows`: 0 or 16
-// The triangles that come into the slot in this batch and in those after it. Where one is read depends on what
-// was read of it before. So each batch reads one step of each: none waits for another.
+// The triangles that come into the slot in this batch and in those after it. Where one is read depends on
+// what was read of it before. So each batch reads one step of each: none waits for another.
 var<private> next_pair: u32;      // where the last of them is in the list
 var<private> coming_pair: array<vec2u, 4>;
 var<private> coming_face: array<u32, 3>;

@@ -14,8 +14,9 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.order import Order
 from meshsplats.webgpu import frames, kernels
 from meshsplats.webgpu.device import Device
-from meshsplats.webgpu.frames import DrawSettings, MeshFrames, Output, Program, Work
+from meshsplats.webgpu.frames import MeshFrames, Output, Program, Work
 from meshsplats.webgpu.layout import halves, tiles_of
+from meshsplats.webgpu.settings import DrawSettings
 
 _LIST_STEPS = {order: tuple(kernels.list_steps(order)) for order in get_args(Order)}
 _RASTER_STEPS = tuple(kernels.raster_steps())

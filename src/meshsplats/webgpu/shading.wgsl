@@ -1,5 +1,5 @@
-// Shading: colours of vertices in a view, where splats have spherical harmonics. On harmonics.wgsl, the bindings of
-// lists.wgsl, and:
+// Shading: colours of vertices in a view, where splats have spherical harmonics. On harmonics.wgsl, the
+// bindings of lists.wgsl, and:
 //
 // A vertex of splat s has the colour max(0, RGB + sum_k b_k(d) h_sk), with the unit vector d from the camera
 // to the vertex, real spherical harmonics b_k of degree 1 and more, and frame.terms coefficients h_sk.

@@ -17,9 +17,10 @@ from meshsplats.errors import DeviceError
 from meshsplats.mesh import MAX_COLOR, SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
-from meshsplats.webgpu.frames import DrawSettings, Output
+from meshsplats.webgpu.frames import Output
 from meshsplats.webgpu.gradients import GRADIENTS, GradientRenderer, Tape, WindowLimit, gradient_pipeline
 from meshsplats.webgpu.layout import find_splat_vertices, halves
+from meshsplats.webgpu.settings import DrawSettings
 
 DERIVATIVE_BYTES = 48
 """Bytes of the derivatives of SSIM in each pixel, the largest buffer of an image."""

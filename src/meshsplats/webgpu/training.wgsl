@@ -240,8 +240,8 @@ fn check_gradients(@builtin(global_invocation_id) id: vec3u) {
 
 fn all_went_well() -> bool { return (atomicLoad(&results[4]) | atomicLoad(&results[5])) == 0u; }
 
-// The gradient of the RGB and opacity of a vertex. Where its colour is held at 0, as harmonics may have it, only
-// one that raises it counts.
+// The gradient of the RGB and opacity of a vertex. Where its colour is held at 0, as harmonics may have it,
+// only one that raises it counts.
 fn color_gradient(i: u32) -> vec4f {
   let g = gradients[2u * i + 1u];
   if (frame.terms == 0u) { return g; }
