@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -205,35 +204,36 @@ def run_benchmark(
 
     score = score or default_score
     factors = {name: downscale or benchmark.scenes[name] for name, _ in found}
-    scene_report = partial(
-        _scene_report, data, factors, benchmark.test_every, load, prepare, score, background, workers.threads
-    )
-    reports = dict(workers.run(scene_report, found))
+    scenes = _Scenes(data, factors, benchmark.test_every, load, prepare, score, background, workers.threads)
+    reports = dict(workers.run(scenes, found))
     return BenchmarkResult(benchmark, factors, tuple(reports[i] for i in range(len(found))))
 
 
-def _scene_report(
-    data: Path,
-    factors: Mapping[str, int],
-    test_every: int,
-    load: Callable[[Path], Scene],
-    prepare: Callable[[Scene, Dataset], Candidates],
-    score: Callable[[str, Dataset, Background, Candidates], Report],
-    background: Sequence[float] | None,
-    threads: int | None,
-    found: tuple[str, Path],
-) -> Report:
-    """Scores one scene: its name, and its mesh, splats or model folder."""
-    name, source = found
-    scene = load(source)
-    dataset = load_dataset(data / name, downscale=factors[name], test_every=test_every, origin=scene.origin)
-    judge = "splats" if isinstance(scene, GaussianCloud) else "mesh"
-    chosen = find_background(
-        dataset, {judge: scene}, given=background, named=model_background(source), threads=threads
-    )
-    warn_of_other_worlds(chosen)
-    dataset = dataset.over(chosen.color)
-    return score(name, dataset, chosen, prepare(scene, dataset))
+@dataclass(frozen=True)
+class _Scenes:
+    """What scores the scenes of a benchmark, one by one, in any process; see ``run_benchmark``."""
+
+    data: Path
+    factors: Mapping[str, int]
+    test_every: int
+    load: Callable[[Path], Scene]
+    prepare: Callable[[Scene, Dataset], Candidates]
+    score: Callable[[str, Dataset, Background, Candidates], Report]
+    background: Sequence[float] | None
+    threads: int | None
+
+    def __call__(self, found: tuple[str, Path]) -> Report:
+        """Scores one scene: its name, and its mesh, splats or model folder."""
+        name, source = found
+        scene = self.load(source)
+        folder, downscale = self.data / name, self.factors[name]
+        dataset = load_dataset(folder, downscale=downscale, test_every=self.test_every, origin=scene.origin)
+        judged = {"splats" if isinstance(scene, GaussianCloud) else "mesh": scene}
+        named = model_background(source)
+        chosen = find_background(dataset, judged, given=self.background, named=named, threads=self.threads)
+        warn_of_other_worlds(chosen)
+        dataset = dataset.over(chosen.color)
+        return self.score(name, dataset, chosen, self.prepare(scene, dataset))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, SupportsFloat
+from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
@@ -215,20 +215,17 @@ def evaluate(
     if not views:
         raise ValueError("the data set has no view to evaluate on")
     found: dict[str, list[ViewScores]] = {name: [] for name in methods}
+    measures = _Measures(lpips, fit_exposure, threads)
     for view in views:
-        target = np.clip(view.image, 0, 1)
-        mask, empty = view.mask, _empty(view)
-        if mask is not None and not mask.any():
-            raise ValueError(f"view {view.name!r}: its mask leaves no pixel to score")
+        truth = _GroundTruth.of(view)
         drawn = {}
         for name, image_at in methods.items():
             color, alpha = image_at(view.camera, view.background)
             drawn[name] = np.clip(color, 0, 1)
-            found[name].append(
-                _scores(view.name, drawn[name], alpha, target, mask, empty, lpips, fit_exposure, threads)
-            )
+            found[name].append(measures.of(drawn[name], alpha, truth))
         if on_view is not None:
-            on_view(ScoredView(view, target, drawn, {name: scores[-1] for name, scores in found.items()}))
+            latest = {name: scores[-1] for name, scores in found.items()}
+            on_view(ScoredView(view, truth.image, drawn, latest))
     counts = {name: len(one.faces) for name, one in meshes.items()}
     about = {
         "views": len(views),
@@ -271,29 +268,45 @@ def fit_exposure_to(image: np.ndarray, target: np.ndarray, mask: np.ndarray | No
     return np.clip(result, 0, 1)
 
 
-def _scores(
-    name: str,
-    image: np.ndarray,
-    alpha: np.ndarray | None,
-    target: np.ndarray,
-    mask: np.ndarray | None,
-    empty: np.ndarray | None,
-    lpips: Lpips | None,
-    fit_exposure: bool,
-    threads: int | None,
-) -> ViewScores:
-    floaters = None
-    if empty is not None and alpha is not None:
-        floaters = int((alpha[empty] > FLOATER_ALPHA).sum())
-    distance = None
-    if lpips is not None:
-        compared = image if mask is None else np.where(mask[..., None], image, target)
-        distance = lpips(compared, target)
-    fitted = None
-    if fit_exposure:
-        fitted = psnr(fit_exposure_to(image, target, mask), target, mask=mask)
-    score = psnr(image, target, mask=mask)
-    return ViewScores(name, score, masked_ssim(image, target, mask, threads), distance, fitted, floaters)
+class _GroundTruth(NamedTuple):
+    """What the images of a view are compared with."""
+
+    name: str
+    image: np.ndarray
+    """(h, w, 3) float32 display RGB in [0, 1]."""
+    mask: np.ndarray | None
+    """(h, w) bool: pixels that count; None: all."""
+    empty: np.ndarray | None
+    """``_empty``."""
+
+    @classmethod
+    def of(cls, view: View) -> _GroundTruth:
+        """ValueError if no pixel counts."""
+        if view.mask is not None and not view.mask.any():
+            raise ValueError(f"view {view.name!r}: its mask leaves no pixel to score")
+        return cls(view.name, np.clip(view.image, 0, 1), view.mask, _empty(view))
+
+
+class _Measures(NamedTuple):
+    """How images are scored."""
+
+    lpips: Lpips | None
+    fit_exposure: bool
+    threads: int | None
+
+    def of(self, image: np.ndarray, alpha: np.ndarray | None, truth: _GroundTruth) -> ViewScores:
+        """The scores of an image, (h, w, 3) in [0, 1], with its (h, w) alpha or None."""
+        name, target, mask, empty = truth
+        floaters = distance = fitted = None
+        if empty is not None and alpha is not None:
+            floaters = int((alpha[empty] > FLOATER_ALPHA).sum())
+        if self.lpips is not None:
+            compared = image if mask is None else np.where(mask[..., None], image, target)
+            distance = self.lpips(compared, target)
+        if self.fit_exposure:
+            fitted = psnr(fit_exposure_to(image, target, mask), target, mask=mask)
+        score, likeness = psnr(image, target, mask=mask), masked_ssim(image, target, mask, self.threads)
+        return ViewScores(name, score, likeness, distance, fitted, floaters)
 
 
 def _empty(view: View) -> np.ndarray | None:
