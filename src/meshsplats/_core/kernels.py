@@ -121,6 +121,12 @@ def adam_rows(
     run("ms_adam_rows", adam)
 
 
+def regular_polygon(sides: int) -> np.ndarray:
+    """(sides, 2) float64 corners on the unit circle."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 def round_fans(fans: np.ndarray, share: float, threads: int | None = None) -> None:
     """Moves the vertices of ``fans`` in place by a ``share``, 0 to 1, of their distances to an ellipse: the
     nearest affine image of a regular polygon, and its centre.
@@ -129,8 +135,7 @@ def round_fans(fans: np.ndarray, share: float, threads: int | None = None) -> No
     ``threads`` (all processors by default) and on every instruction set.
     """
     sides = fans.shape[1] - 1
-    angle = 2 * np.pi * np.arange(sides) / sides
-    polygon = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    polygon = regular_polygon(sides)
     struct = FansStruct(
         count=len(fans),
         sides=sides,

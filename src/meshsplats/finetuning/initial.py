@@ -16,6 +16,7 @@ from meshsplats.conversion.options import FLAT_SIDES, make_options
 from meshsplats.finetuning.config import FinetuneConfig, is_long
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order, checked_order
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -156,3 +157,10 @@ def boundary_vertices(faces: np.ndarray, count: int) -> np.ndarray:
     result[boundary // max(count, 1)] = True
     result[boundary % max(count, 1)] = True
     return result
+
+
+def order_of(mesh: SplatMesh, config: FinetuneConfig) -> Order:
+    """The order in which the triangles of ``mesh`` are blended and optimised."""
+    if config.cuts or config.order == "file":
+        return "fragment"
+    return mesh.order if config.order == "mesh" else checked_order(config.order, mesh.face_splat)

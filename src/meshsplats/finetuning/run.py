@@ -27,6 +27,7 @@ from meshsplats.finetuning.checkpoint import (
 )
 from meshsplats.finetuning.clock import Clock
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
+from meshsplats.finetuning.initial import order_of
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.loss import Loss, check_loss, loss_name
@@ -35,7 +36,7 @@ from meshsplats.finetuning.phases.choice import PHASE_ARRAYS, check_phases, firs
 from meshsplats.finetuning.phases.phase import Moment, Phase
 from meshsplats.finetuning.plain import most_images, with_plain_colors
 from meshsplats.finetuning.reports import Reports, scored_count
-from meshsplats.finetuning.state import State, order_of
+from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine

@@ -17,10 +17,9 @@ from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig, epsilons
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
-from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
+from meshsplats.finetuning.initial import boundary_vertices, order_of, vertex_sizes
 from meshsplats.finetuning.loss import LossRates
 from meshsplats.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
-from meshsplats.order import Order, checked_order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.edges import faces_across
@@ -90,7 +89,6 @@ class State:
             self._exposures = adam(self.exposures, lr=config.exposure_rate, eps=color_epsilon)
         self.solid: np.ndarray | None = None
         self.frozen: np.ndarray | None = None
-        self._rounds = False
 
     @property
     def vertices(self) -> np.ndarray:
@@ -255,9 +253,7 @@ class State:
             np.minimum(opacity, 1, out=opacity)
             self._step_harmonics(gradients, color_rate)
         if self.config.opacity_decay:
-            # In proportion to the rate: its balance with the gradients is the same in runs of any length.
-            lost = self.config.opacity_decay * color_rate / self.config.color_rate
-            opacity[reached] *= np.float32(max(1 - lost, 0))
+            opacity[reached] *= np.float32(self._opacity_kept(color_rate))
         if transparent is not None:
             opacity[transparent] = 0
         if self.solid is not None:
@@ -298,6 +294,11 @@ class State:
             self._harmonics.lr = rate
             self._harmonics.step(flat, reached)
 
+    def _opacity_kept(self, color_rate: float) -> float:
+        """Share of its opacity that a vertex keeps that a step reaches. What it loses is in proportion to the
+        rate: its balance with the gradients is the same in runs of any length."""
+        return max(1 - self.config.opacity_decay * color_rate / self.config.color_rate, 0)
+
     def _harmonics_rate(self, color_rate: float) -> float:
         return self.config.harmonics_rate * color_rate / self.config.color_rate
 
@@ -315,8 +316,6 @@ class State:
             "base mesh": self.bound is not None,
             "exposure": self.exposures is not None,
             "linear light": self.mesh.blending != "display",
-            "decay": bool(self.config.opacity_decay),
-            "rounding": self._rounds,
             "frozen": self.frozen is not None or self.solid is not None,
             "depth groups": self.mesh.depth_group is not None,
         }
@@ -343,8 +342,8 @@ class State:
             (self._harmonics, self._harmonics_rate(rates.colors)),
         )
         sizes = [0.0 if adam is None or rate <= 0 else adam.next_rate(rate) for adam, rate in moving]
-        betas = (config.beta1, config.beta2)
-        asked = StepRates(*loss[:3], sizes[0], sizes[1], sizes[2], betas, epsilons(config))
+        kept, betas = self._opacity_kept(rates.colors), (config.beta1, config.beta2)
+        asked = StepRates(*loss[:3], sizes[0], sizes[1], sizes[2], kept, betas, epsilons(config))
         sums = steps.step(self._parameters, image.camera, image.options, image.target, image.mask, asked)
         if sums.finite:
             self._ahead = steps
@@ -381,8 +380,10 @@ class State:
     def round_fans(self, corners: int, share: float) -> None:
         """Moves each fan of ``corners`` vertices, centre first, towards a flat ellipse, by a ``share`` of
         the distance; for meshes that consist of such fans, one after the other."""
+        if self._ahead is not None:
+            self._ahead.round_fans(corners, share)
+            return
         self._change()
-        self._rounds = True
         round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
     def prune(self, keep: np.ndarray) -> State:
@@ -435,13 +436,6 @@ class State:
         found = {"positions": self._positions, "colors": self._colors}
         found |= {} if self._harmonics is None else {"harmonics": self._harmonics}
         return found if self._exposures is None else found | {"exposure": self._exposures}
-
-
-def order_of(mesh: SplatMesh, config: FinetuneConfig) -> Order:
-    """The order in which the triangles of ``mesh`` are blended and optimised."""
-    if config.cuts or config.order == "file":
-        return "fragment"
-    return mesh.order if config.order == "mesh" else checked_order(config.order, mesh.face_splat)
 
 
 def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

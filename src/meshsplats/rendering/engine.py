@@ -26,8 +26,6 @@ Need = Literal[
     "base mesh",
     "exposure",
     "linear light",
-    "decay",
-    "rounding",
     "frozen",
     "depth groups",
     "loss",
@@ -132,6 +130,10 @@ class WholeSteps(Protocol):
         Returns:
             The sums. If they or the gradients are not finite, nothing has changed.
         """
+
+    def round_fans(self, corners: int, share: float) -> None:
+        """``kernels.round_fans`` on the vertices as the last step left them, all of them in fans of so many
+        ``corners``."""
 
     def fetch(self, into: Parameters) -> None:
         """Brings the arrays of the run up to the steps that were taken."""

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
+from meshsplats._core.kernels import regular_polygon
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, Triangles, checked_filter
@@ -39,8 +40,6 @@ RUN_BY_RUN: frozenset[Need] = frozenset(
         "base mesh",
         "exposure",
         "linear light",
-        "decay",
-        "rounding",
         "frozen",
         "depth groups",
         "loss",
@@ -324,6 +323,11 @@ class GpuSession:
             if self._trainer is None:
                 self._trainer = Trainer(open_device(), self._mesh, now, self.limit)
             return self._trainer.step(camera, settings, target, mask, (red, green, blue), rates)
+
+    def round_fans(self, corners: int, share: float) -> None:
+        assert self._trainer is not None
+        with self._engine.errors():
+            self._trainer.round_fans(regular_polygon(corners - 1), share)
 
     def fetch(self, into: Parameters) -> None:
         assert self._trainer is not None

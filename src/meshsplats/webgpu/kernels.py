@@ -204,7 +204,7 @@ GRADIENT_KERNELS = ("count_marks", "place_marks", "find_behind", "add_samples", 
 
 TRAINING_KERNELS = (
     *("store_window", "load_window", "judge", "rate", "add_losses", "find_image_gradient"),
-    *("check_gradients", "adam", "adam_harmonics"),
+    *("check_gradients", "adam", "adam_harmonics", "round_fans"),
 )
 """Kernels of ``training_source``."""
 
@@ -327,6 +327,12 @@ def adam_steps() -> list[dict[str, Any]]:
         },
         {"kernel": "adam", "bind": checked | common | own, "count": ["vertices", 256]},
     ]
+
+
+def round_steps() -> list[dict[str, Any]]:
+    """From the vertices of fans to rounder ones."""
+    bind = {"11": "vertices", "21": "rounding", "22": "polygon"}
+    return [{"kernel": "round_fans", "bind": bind, "count": ["fans", 64]}]
 
 
 def _training(kernel: str, bind: dict[int, str], **size: Any) -> dict[str, Any]:

@@ -29,6 +29,7 @@ SIDE = 16
 
 _STORE_STEPS, _LOSS_STEPS = tuple(kernels.store_steps()), tuple(kernels.loss_steps())
 _SHADE_STEPS = tuple(step for step in kernels.list_steps() if step.get("kernel") == "shade")
+_ROUND_STEPS = tuple(kernels.round_steps())
 _ADAM_STEPS = (*kernels.filter_steps(), *kernels.adam_steps())
 _window_steps = functools.lru_cache(maxsize=64)(kernels.window_steps)
 
@@ -72,6 +73,8 @@ class Rates:
     """Learning rates with Adam's bias corrections; 0: positions are fixed."""
     harmonics: float
     """The same of harmonics; 0: they are fixed."""
+    opacity_kept: float
+    """Share of its opacity that a vertex with a gradient keeps."""
     betas: tuple[float, float]
     epsilons: tuple[float, float]
     """Adam's, for colours and harmonics, and for positions."""
@@ -92,7 +95,7 @@ def _pipeline(device: Device, kernel: str, output: Output, settings: DrawSetting
     return gradient_pipeline(device, kernel, output, settings, groups)
 
 
-TRAINING = GRADIENTS._replace(pipeline=_pipeline, uniforms=GRADIENTS.uniforms | {"step"})
+TRAINING = GRADIENTS._replace(pipeline=_pipeline, uniforms=GRADIENTS.uniforms | {"step", "rounding"})
 
 
 def most_pixels(device: Device) -> int:
@@ -140,7 +143,8 @@ class Trainer:
             self._frames.upload("harmonic_squares", start.harmonic_moments.square)
             self._frames.upload("splat_vertices", find_splat_vertices(mesh))
         self._frames.allocate("results", 64)
-        self._frames.allocate("step", 96)
+        self._frames.allocate("step", 112)
+        self._frames.allocate("rounding", 16)
 
     def step(
         self,
@@ -200,6 +204,18 @@ class Trainer:
             )
         l1, l2, ssim = (float(value) for value in words[:3].view(np.float32))
         return Sums(l1, ssim, l2, not words[5])
+
+    def round_fans(self, polygon: np.ndarray, share: float) -> None:
+        """Moves each fan, a centre and a rim of as many corners as ``polygon``, (n, 2), has, by a ``share``
+        of the way towards an affine image of it."""
+        corners = 1 + len(polygon)
+        fans = len(self.mesh.vertices) // corners
+        words = np.array([0, corners, fans, 0], np.uint32)
+        words[:1].view(np.float32)[:] = share
+        with self._frames.lock:
+            self._frames.upload("polygon", np.asarray(polygon, np.float32))
+            self._frames.write("rounding", words)
+            self._frames.run(_ROUND_STEPS, "color", {"fans": fans}, DrawSettings())
 
     def fetch(self, into: Parameters) -> None:
         """Writes positions, colours and the moments of both into the arrays of ``into``."""
@@ -268,7 +284,7 @@ class Trainer:
         rates: Rates,
     ) -> None:
         """Writes the uniform ``Step`` of a window."""
-        data = np.zeros(24, np.float32)
+        data = np.zeros(28, np.float32)
         words = data.view(np.uint32)
         camera = tape.camera
         words[:8] = camera.width, camera.height, *area, tape.settings.samples, tiles
@@ -277,4 +293,5 @@ class Trainer:
         data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]
         data[20:22] = rates.harmonics, MAX_COLOR if self._frames.counts["harmonics"] else 1
         words[22:24] = self._masked, self._frames.counts["harmonic_splats"]
+        data[24] = rates.opacity_kept
         self._frames.write("step", data)

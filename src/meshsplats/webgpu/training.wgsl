@@ -17,6 +17,7 @@ struct Step {
   brightest: f32,                        // largest value of RGB
   masked: u32,                           // 1: behind its RGB, the target says which pixels count
   harmonic_splats: u32,                  // splats with harmonics
+  opacity_kept: f32,                     // share of its opacity that a vertex with a gradient keeps
 };
 @group(0) @binding(1) var<uniform> step_of: Step;
 // RGB and transmittance; states; gradients by pixel
@@ -47,6 +48,10 @@ struct Step {
 @group(0) @binding(19) var<storage, read_write> harmonic_squares: array<f32>;
 // first vertices of splats, their end; then the vertices of one splat after the other
 @group(0) @binding(20) var<storage, read> splat_vertices: array<u32>;
+
+struct Rounding { share: f32, corners: u32, fans: u32 };
+@group(0) @binding(21) var<uniform> rounding: Rounding;
+@group(0) @binding(22) var<storage, read> polygon: array<vec2f>;  // regular, of the corners of a rim
 
 const SIDE = 16u;              // pixels along each side of a workgroup's tile
 const RADIUS = 5u;
@@ -263,6 +268,7 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
   color_moments[2u * i + 1u] = square;
   var moved = clamp(value - step_of.color_step * (mean / (sqrt(square) + step_of.color_epsilon)), vec4f(0.0),
     vec4f(vec3f(step_of.brightest), 1.0));
+  moved.w *= step_of.opacity_kept;
   if (traits[i].y == 1.0 && value.w == 0.0) { moved.w = 0.0; }
   colors[i] = moved;
   if (step_of.position_step == 0.0) { return; }
@@ -292,7 +298,7 @@ fn adam_harmonics(@builtin(global_invocation_id) id: vec3u) {
     let g = color_gradient(i).rgb;
     if (all(g == vec3f(0.0))) { continue; }
     reached = true;
-    let basis = basis_of(direction_to(vec3f(vertices[3u * i], vertices[3u * i + 1u], vertices[3u * i + 2u])));
+    let basis = basis_of(direction_to(vertex_at(i)));
     for (var k = 0u; k < frame.terms; k++) { sum[k] += basis[k] * g; }
   }
   if (!reached) { return; }
@@ -306,5 +312,40 @@ fn adam_harmonics(@builtin(global_invocation_id) id: vec3u) {
       harmonic_squares[at] = square;
       harmonics[at] -= step_of.harmonic_step * (mean / (sqrt(square) + step_of.color_epsilon));
     }
+  }
+}
+
+// -------------------------------------------------------------------------------- fans
+
+fn vertex_at(i: u32) -> vec3f {
+  return vec3f(vertices[3u * i], vertices[3u * i + 1u], vertices[3u * i + 2u]);
+}
+fn move_vertex(i: u32, by: vec3f) { for (var k = 0u; k < 3u; k++) { vertices[3u * i + k] += by[k]; } }
+
+// Moves the vertices of fans towards the nearest affine image of a regular polygon, as the core does: a fan
+// has its centre, then its rim. Positions are relative to a corner of the rim, for float32.
+@compute @workgroup_size(64)
+fn round_fans(@builtin(global_invocation_id) id: vec3u) {
+  if (id.x >= rounding.fans) { return; }
+  let center = id.x * rounding.corners;
+  let sides = rounding.corners - 1u;
+  let origin = vertex_at(center + 1u);
+  var mean = vec3f(0.0);
+  var cosine = vec3f(0.0);
+  var sine = vec3f(0.0);
+  for (var i = 0u; i < sides; i++) {
+    let p = vertex_at(center + 1u + i) - origin;
+    mean += p;
+    cosine += polygon[i].x * p;
+    sine += polygon[i].y * p;
+  }
+  mean /= f32(sides);
+  cosine *= 2.0 / f32(sides);
+  sine *= 2.0 / f32(sides);
+  move_vertex(center, rounding.share * (mean - (vertex_at(center) - origin)));
+  for (var i = 0u; i < sides; i++) {
+    let at = center + 1u + i;
+    let on_ellipse = mean + polygon[i].x * cosine + polygon[i].y * sine;
+    move_vertex(at, rounding.share * (on_ellipse - (vertex_at(at) - origin)));
   }
 }
