@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _balls import ball_view, cameras_around
+from _gpu import need_gpu
 from _photographs import write_photographs
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ from meshsplats.finetuning.state import State
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import render_splats
+from meshsplats.rendering import render, render_splats
 from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training.as_splats import splats_of_fans
 from meshsplats.training.growth import (
@@ -518,6 +519,26 @@ def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
     with pytest.raises(MissingDependencyError, match="no GPU"):
         train(ball, train_config(steps=1), run=RunOptions(tmp_path / "run", device="gpu"))
     assert not (tmp_path / "run").exists()
+
+
+def test_training_on_the_gpu_is_that_of_the_processor(ball, monkeypatch):
+    """Steps stay there: arrays come back when fans grow, and at the end."""
+    need_gpu()
+    from meshsplats.webgpu.training import Trainer
+
+    fetched = []
+    plain = Trainer.fetch
+    monkeypatch.setattr(Trainer, "fetch", lambda self, into: (fetched.append(1), plain(self, into)))
+    config = train_config(steps=6, **SMALL | {"growth_events": 1})
+    found = {
+        device: train(ball, config, run=RunOptions(device=device, report_every=0))
+        for device in ("gpu", "cpu")
+    }
+    assert 1 <= len(fetched) <= 4
+    images = {device: render(mesh, ball.test[0].camera).color for device, mesh in found.items()}
+    start = render(starting_fans(ball, config), ball.test[0].camera).color
+    apart = np.linalg.norm(images["gpu"] - images["cpu"])
+    assert apart < 0.02 * np.linalg.norm(images["cpu"] - start)
 
 
 def test_no_growth_event_happens_twice(ball, start, monkeypatch):
