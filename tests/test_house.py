@@ -19,7 +19,6 @@ LONGER = {
     "csrc/splats.h": "projection, order and blending of splats in one piece, as in gradient.h",
     "cli/common.py": "options of all commands",
     "cli/convert.py": "the largest command",
-    "cli/training.py": "options, progress and result of three commands",
 }
 """Files that are longer, and why."""
 WIDER = {

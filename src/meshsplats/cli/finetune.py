@@ -25,7 +25,6 @@ from meshsplats.cli.common import (
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
-    ShowProgress,
     Trained,
     TrainingCommand,
     as_begun,
@@ -222,7 +221,7 @@ class Finetune(TrainingCommand):
         count = -(-len(scene) // options.splats)
         color = None if background is None else background.color
 
-        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+        def optimise(run: RunOptions, show: Display) -> Trained:
             with self.cluster.workers(self.threads) as workers:
                 command = replace(self, threads=workers.threads)
                 shared = Shared(partial(_cell_scene, command, color))

@@ -29,8 +29,8 @@ from meshsplats.cli.common import (
     size_of,
 )
 from meshsplats.cli.messages import UsageError, flag, say
+from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
-from meshsplats.cli.training import progress_display
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs, recorded_options

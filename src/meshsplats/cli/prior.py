@@ -15,7 +15,6 @@ from meshsplats.cli.common import File, Number, Output, SplatOptions
 from meshsplats.cli.messages import UsageError, quoted
 from meshsplats.cli.training import (
     Plan,
-    ShowProgress,
     Trained,
     TrainingCommand,
     as_begun,
@@ -27,7 +26,7 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FinetuneConfig, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.run_files import RunFiles
-from meshsplats.finetuning.setup import Setup
+from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS
@@ -133,7 +132,7 @@ class Prior(TrainingCommand):
             )
         summary = f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles"
 
-        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+        def optimise(run: RunOptions, show: Display) -> Trained:
             trained = train_prior(prior, dataset, config, run=run, on_progress=show)
             counts = {"base_faces": len(trained.base_faces), "triangles": len(trained.mesh.faces)}
             made = f"{counts['triangles']:,} triangles on {counts['base_faces']:,} faces"

@@ -28,8 +28,8 @@ from meshsplats.cli.common import (
     written,
 )
 from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
-from meshsplats.cli.training import progress_display
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, PRINTED, TextureImage, companions, save_base
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
 from meshsplats.mesh import SplatMesh

@@ -14,7 +14,6 @@ from meshsplats.cli.common import File, Output, check_mesh_suffix, check_splat_e
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.training import (
     Plan,
-    ShowProgress,
     Trained,
     TrainingCommand,
 )
@@ -24,7 +23,7 @@ from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
 from meshsplats.finetuning.run_files import RunFiles
-from meshsplats.finetuning.setup import Setup
+from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.outputs import check_outputs
 from meshsplats.formats.splat_formats import written_ending
@@ -131,7 +130,7 @@ class Train(TrainingCommand):
         points = load_points(self.input, origin=dataset.origin)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 
-        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+        def optimise(run: RunOptions, show: Display) -> Trained:
             mesh = train(dataset, config, points=points, run=run, on_progress=show)
             counts: dict[str, int] = {"fans": mesh.splat_count or 0, "triangles": len(mesh.faces)}
             return Trained(

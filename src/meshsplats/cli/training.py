@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -29,12 +27,13 @@ from meshsplats.cli.common import (
     written,
 )
 from meshsplats.cli.messages import UsageError, say
+from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.viewers import alpha_for_viewers
-from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
 from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
 from meshsplats.finetuning.config import LENGTHS, PRESETS, with_changes
@@ -46,7 +45,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as Bar
+    pass
 
 STARTUP_SECONDS = 1.0
 """Time that Python and the libraries take before the command's own clock starts."""
@@ -55,7 +54,6 @@ _CHANGEABLE = {
     *("origin", *LENGTHS),
 }
 """Options that may change when a run is resumed."""
-ShowProgress = Callable[[Progress], None]
 
 
 def tuning_options(
@@ -430,74 +428,3 @@ def _in_words(value: Any) -> str:
     if value is None:
         return "not given"
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-# ---- Progress
-
-
-@contextmanager
-def progress_display() -> Iterator[Display]:
-    """Shows a run: as a bar where stderr is a terminal, else a line for each phase and score."""
-    if not sys.stderr.isatty():
-        yield _Lines()
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    plain = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[text]}"))
-    columns = (next(plain), BarColumn(), next(plain))
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        yield _InBar(bar)
-
-
-class _InBar:
-    def __init__(self, bar: Bar) -> None:
-        self._bar, self._task = bar, bar.add_task("", total=None, text="")
-        self._loss: float | None = None
-        self._phase = ""
-
-    def phase(self, text: str, share: float | None = None) -> None:
-        if text != self._phase:  # rich takes a total of None for no change, and a new task for a pulse
-            self._phase = text
-            self._bar.remove_task(self._task)
-            self._task = self._bar.add_task(text, total=None, text="")
-        if share is not None:
-            self._bar.update(self._task, total=1.0, completed=share)
-
-    def __call__(self, progress: Progress) -> None:
-        if progress.loss is not None:  # smoothed: it differs from view to view
-            self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
-        text = _text(progress, self._loss)
-        self.phase("fine-tuning")
-        self._bar.update(
-            self._task, description="fine-tuning", total=1.0, completed=progress.fraction, text=text
-        )
-
-
-class _Lines:
-    def __init__(self) -> None:
-        self._last: float | None = None
-        self._phase = ""
-
-    def phase(self, text: str, share: float | None = None) -> None:
-        if text != self._phase:
-            self._phase = text
-            say(text)
-
-    def __call__(self, progress: Progress) -> None:
-        if progress.held_out != self._last:
-            self._last = progress.held_out
-            say(_text(progress, progress.loss))
-
-
-def _text(progress: Progress, loss: float | None) -> str:
-    parts = [f"step {progress.step:,}" + (f"/{progress.steps:,}" if progress.steps else "")]
-    if loss is not None:
-        parts.append(f"loss {loss:.4f}")
-    if progress.held_out is not None:
-        parts.append(f"held out {progress.held_out:.2f} dB")
-    if progress.seconds_left is not None:
-        left = int(progress.seconds_left)
-        parts.append(f"{left // 60}:{left % 60:02d} left")
-    return ", ".join(parts)
