@@ -17,7 +17,7 @@ out.mkdir(exist_ok=True)
 
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 camera = ms.orbit(cloud, 1, elevation=22, azimuth=-10, width=340, height=380)[0]
-mesh = ms.convert(cloud, cameras=[camera], colors="base")
+mesh = ms.convert(cloud, cameras=[camera])
 
 # One vertex per corner, so that each triangle has its own shade; smaller fans, so that gaps show.
 corners = mesh.vertices[mesh.faces]
@@ -27,7 +27,7 @@ colors = mesh.colors[mesh.faces]
 opaque = np.concatenate([colors[:, :, :3] * shade, np.ones_like(colors[:, :, :1])], axis=2).clip(0, 1)
 keep = colors[:, :, 3].max(axis=1) > 0.3
 triangles = replace(
-    mesh,
+    mesh.of_degree(0),
     vertices=(centers + 0.4 * (corners - centers))[keep].reshape(-1, 3),
     faces=np.arange(3 * keep.sum()).reshape(-1, 3),
     colors=opaque[keep].reshape(-1, 4),
