@@ -84,7 +84,7 @@ def test_long_images_are_announced(tmp_path, capsys):
 
 
 def test_costs_are_said_with_their_minutes(capsys):
-    from meshsplats.cli.common import announce_cost
+    from meshsplats.cli.images import announce_cost
 
     mesh = facing(20_000, 100.0)
     announce_cost(mesh, [CAMERA.scaled(10)], 4, 2)

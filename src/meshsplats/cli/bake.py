@@ -10,16 +10,8 @@ from pathlib import Path
 import tyro
 
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    Number,
-    Origin,
-    Output,
-    ViewOptions,
-    check_mesh_suffix,
-    plural,
-    size_of,
-    written,
-)
+from meshsplats.cli.common import Number, Origin, Output, check_mesh_suffix, plural, size_of, written
+from meshsplats.cli.images import ViewOptions
 from meshsplats.formats.outputs import check_outputs
 
 

@@ -26,14 +26,13 @@ from meshsplats.cli.common import (
     Output,
     PartOptions,
     SplatOptions,
-    ViewOptions,
     load_scene,
     open_tileset,
     parse_color,
     plural,
     size_of,
-    view_names,
 )
+from meshsplats.cli.images import ViewOptions, view_names
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs

@@ -13,14 +13,7 @@ import tyro
 from meshsplats._files.atomic import together
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    Count,
-    Output,
-    SplatOptions,
-    Text,
-    load_scene,
-    parse_up,
-)
+from meshsplats.cli.common import Count, Output, SplatOptions, Text, load_scene, parse_up
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud

@@ -12,18 +12,8 @@ import tyro
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    DrawOptions,
-    File,
-    Output,
-    PartOptions,
-    SplatOptions,
-    ViewOptions,
-    optional_color,
-    parse_color,
-    track,
-    view_names,
-)
+from meshsplats.cli.common import File, Output, PartOptions, SplatOptions, optional_color, parse_color, track
+from meshsplats.cli.images import DrawOptions, ViewOptions, view_names
 from meshsplats.cli.records import write_configuration, write_json
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import choose_background

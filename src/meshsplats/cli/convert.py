@@ -41,10 +41,10 @@ from meshsplats.cli.common import (
     say_origin,
     size_of,
     track,
-    views_of_a_place,
     warnings_kept,
     written,
 )
+from meshsplats.cli.images import views_of_a_place
 from meshsplats.cli.messages import (
     FAILED,
     NO_SPACE,

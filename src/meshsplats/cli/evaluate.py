@@ -31,8 +31,8 @@ from meshsplats.cli.common import (
     optional_color,
     parse_color,
     track,
-    view_names,
 )
+from meshsplats.cli.images import OrderOfBlending, view_names
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.cli.records import write_configuration
 from meshsplats.cli.targets import TargetOptions
@@ -41,13 +41,7 @@ from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import Background, choose_background
-from meshsplats.evaluation.benchmarks import (
-    BENCHMARKS,
-    Benchmark,
-    Candidates,
-    convert_scene,
-    run_benchmark,
-)
+from meshsplats.evaluation.benchmarks import BENCHMARKS, Benchmark, Candidates, convert_scene, run_benchmark
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, ScoredView, evaluate
 from meshsplats.evaluation.results import (
     PER_VIEW,
@@ -59,11 +53,7 @@ from meshsplats.evaluation.results import (
     save_benchmark,
     save_report,
 )
-from meshsplats.evaluation.strips import (
-    image_folder,
-    mesh_names,
-    score_table,
-)
+from meshsplats.evaluation.strips import image_folder, mesh_names, score_table
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -117,10 +107,7 @@ class Evaluate(Command):
     samples: Count = None
     """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
     with --look splats."""
-    order: Annotated[
-        Literal["fragment", "splat"] | None,
-        tyro.conf.arg(metavar="{fragment,splat}", help_behavior_hint=""),
-    ] = None
+    order: OrderOfBlending = None
     """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
     centres. Default: that of each mesh."""
     background: Text = None

@@ -17,13 +17,10 @@ from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     ClusterOptions,
-    DrawOptions,
     Number,
     Output,
     PartOptions,
     SplatOptions,
-    ViewOptions,
-    announce_cost,
     load_scene,
     open_tileset,
     optional_color,
@@ -31,8 +28,8 @@ from meshsplats.cli.common import (
     plural,
     size_of,
     track,
-    view_names,
 )
+from meshsplats.cli.images import DrawOptions, ViewOptions, announce_cost, view_names
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
 from meshsplats.errors import DataWarning

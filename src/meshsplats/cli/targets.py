@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli.arguments import spelled
-from meshsplats.cli.common import Count, File, Folder, Missing, Text, parse_up
+from meshsplats.cli.common import Count, File, Folder, LookOfSplats, Missing, Text, parse_up
 from meshsplats.cli.messages import UsageError
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
@@ -56,9 +56,7 @@ class TargetOptions:
     folder, else placed ones (--placement)."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
-    look: Annotated[
-        Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
-    ] = None
+    look: LookOfSplats = None
     """Images of splats. area: means over pixels, right at every size (with several samples: Blender, MSAA).
     splats: as in a 3DGS viewer, for this renderer. Default: area; of the other presets: splats."""
     sh_degree: Count = None

@@ -18,6 +18,7 @@ from meshsplats.cli.common import (
     Box,
     ClusterOptions,
     Count,
+    LookOfSplats,
     Number,
     Origin,
     Output,
@@ -57,9 +58,7 @@ class Tiles(Command):
     """Maximum number of triangles of a tile."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
-    look: Annotated[
-        Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
-    ] = None
+    look: LookOfSplats = None
     """area: for programs that take several samples a pixel; splats: as splat viewers show them. Default:
     area."""
     min_opacity: Number = None

@@ -12,11 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import File, Output, check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
-from meshsplats.cli.training import (
-    Plan,
-    Trained,
-    TrainingCommand,
-)
+from meshsplats.cli.training import Plan, Trained, TrainingCommand
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import BLACK, Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions

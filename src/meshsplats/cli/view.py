@@ -28,8 +28,8 @@ from meshsplats.cli.common import (
     parse_up,
     plural,
     size_of,
-    views_of_a_place,
 )
+from meshsplats.cli.images import views_of_a_place
 from meshsplats.cli.messages import UsageError, say, shown_path
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.views import Dataset
