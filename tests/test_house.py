@@ -17,7 +17,6 @@ KINDS = {".py", ".h", ".cpp", ".js", ".wgsl", ".html", ".css"}
 LONGER = {
     "csrc/fan_filter.h": "the filter and its adjoint share the moments of a fan",
     "csrc/splats.h": "projection, order and blending of splats in one piece, as in gradient.h",
-    "cli/convert.py": "the largest command",
 }
 """Files that are longer, and why."""
 WIDER = {

@@ -62,6 +62,8 @@ class SplatStream:
         """The files, in their order."""
         self.block, self.strict, self.axes = int(block), strict, axes
         self._origin = None if origin is None else checked_array("origin", origin, np.float64, (3,))
+        self.count = 0
+        """Splats that the last iteration has given so far."""
 
     @property
     def origin(self) -> np.ndarray:
@@ -75,8 +77,11 @@ class SplatStream:
         return self._origin
 
     def __iter__(self) -> Iterator[GaussianCloud]:
+        self.count = 0
         for path in self.paths:
-            yield from self._of(path)
+            for block in self._of(path):
+                self.count += len(block)
+                yield block
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[Splats, np.ndarray]]:

@@ -1,0 +1,268 @@
+"""Options of ``convert``, what contradicts what, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras
+from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Folder,
+    Missing,
+    Number,
+    Origin,
+    Output,
+    SplatOptions,
+    Text,
+    check_data,
+    check_splat_endings,
+    parse_up,
+)
+from meshsplats.cli.messages import UsageError
+from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.options import PRESETS
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
+from meshsplats.formats.outputs import Ending, check_outputs, splat_options
+from meshsplats.formats.scenes import SUFFIXES as SCENE_SUFFIXES
+from meshsplats.formats.sniff import identify
+from meshsplats.jobs import Job, sources
+from meshsplats.mesh import checked_cutoff
+from meshsplats.rendering.ordering import NODES, check_nodes
+
+_SELECTION = ("crop", "min_opacity", "max_splats", "budget")
+"""Options of the conversion that select splats: they have an effect with --as-splats."""
+_FOR_SPLATS = (
+    *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
+    *("conversion", "reading", "origin", "json", "force", "skip_existing", "spz_version", "linear"),
+    *("up", "scale", "with_mesh", "collider"),
+)
+"""Options of the command that have one."""
+
+
+if TYPE_CHECKING:
+    ConvertOptions = ConversionOptions
+else:
+    ConvertOptions = as_cli_options(
+        ConversionOptions,
+        "In parentheses: the values of the presets.",
+        metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
+        defaults=of_presets(PRESETS),
+    )
+
+
+@dataclass(frozen=True)
+class ConvertCommand(Command):
+    """The options of ``convert``."""
+
+    COMMON = (
+        *("input", "output", "formats", "preset", "look", "cameras", "data", "up", "lit"),
+        *("alpha", "as_splats", "max_splats", "max_triangles", "crop", "json", "force"),
+    )
+    EXCLUSIVE = (("cameras", "data"),)
+    CONFIGURABLE = True
+
+    input: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
+    ]
+    """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
+    input."""
+    output: Output
+    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or
+    splats: .spz, .sog, .splat, .compressed.ply, .usdz. Or a folder, for files named like the inputs."""
+    formats: Annotated[tuple[Ending, ...], tyro.conf.arg(help_behavior_hint="")] = ()
+    """With a folder: formats to write. Default: glb."""
+    preset: Literal["default", "paper"] = "default"
+    """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
+    cameras: File = None
+    """Cameras that the mesh will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
+    folder that has one. Default: those of the input if it is a model folder, else none."""
+    data: Folder = None
+    """Data set of photographs, in place of --cameras: the cameras of its training views."""
+    missing: Missing = "error"
+    up: Text = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
+    file, else -y."""
+    scale: Number = None
+    """Factor for all lengths of the result, of meshes and splats: metres in an output unit, say."""
+    lit: bool = False
+    """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
+    smooth: bool = False
+    """With --lit: normals of the surface that the splats form, in place of the triangles' own, which look
+    mottled under light."""
+    color_type: tyro.conf.Fixed[Literal["uint16", "float32"]] = "uint16"
+    """.glb: storage of colours."""
+    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid", "ordered"] = "auto"
+    """auto: for .glb, blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by
+    a few images of both; else blend. blend: the viewer blends true opacities; mask (.glb): it draws as solid
+    what has at least ``cutoff``; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
+    with soft_share: solid and blended triangles apart; ordered (.glb), for web viewers and engines alone:
+    every triangle twice, for either side, in an order of blending that suits views from all around."""
+    nodes: tyro.conf.Fixed[int | Literal["auto"] | None] = None
+    """--alpha ordered: parts that viewers sort, each a draw call; auto: few, if they do. Default: 8."""
+    quick: tyro.conf.Fixed[bool] = False
+    """--alpha ordered: an order by a formula, in a second, and several dB worse."""
+    cutoff: tyro.conf.Fixed[float | None] = None
+    """--alpha opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
+    compression: Literal["none", "meshopt"] = "none"
+    """.glb: meshopt: a quarter to a third of the size, for viewers that can unpack it."""
+    as_splats: bool = False
+    """Write splats, not a mesh, as .ply, .glb or .usdc, too: all of them, or those that --crop, --max-splats
+    and min_opacity leave."""
+    spz_version: tyro.conf.Fixed[Literal[3, 4] | None] = None
+    """.spz: version. 4 is read by newer programs only. Default: 3."""
+    linear: tyro.conf.Fixed[bool | None] = None
+    """Splats as .usdc, .usda, .usdz: linear colours, for renderers that take all colours so."""
+    with_mesh: File = None
+    """Splats as .glb or USD: a mesh to put into the file, too, such as one converted of them."""
+    collider: File = None
+    """Splats as .glb or USD: a mesh that physics engines collide with and nobody draws, in the file."""
+    fidelity: Count = None
+    """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
+    stream: bool = False
+    """Convert in blocks, so that memory does not grow with the file: into a .ply mesh, or with --as-splats
+    into a .ply of splats, without a preview. The result is the same."""
+    origin: Origin = "keep"
+    no_preview: bool = False
+    """Write no preview."""
+    no_sidecar: bool = False
+    """Write neither preview nor configuration."""
+    conversion: ConvertOptions = field(default_factory=ConvertOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    json: bool = False
+    """Print the results as JSON, a line for each input, errors too."""
+    force: bool = False
+    """Overwrite existing outputs."""
+    skip_existing: bool = False
+    """Keep the meshes that are there, and make those that are missing. Says which of them are older than
+    their input or were made with other options."""
+
+    def check_options(self, kinds: Sequence[str]) -> None:
+        """UsageError or ValueError for options that contradict each other or have no effect."""
+        if self.force and self.skip_existing:
+            raise UsageError("give --force or --skip-existing, not both")
+        if self.fidelity is not None and self.fidelity < 1:
+            raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
+        if self.scale is not None and not 0 < self.scale < float("inf"):
+            raise ValueError(f"--scale must be a number above 0, got {self.scale}")
+        if self.up is not None:
+            parse_up(self.up)
+        if self.stream:
+            self._check_stream(kinds)
+        if self.as_splats:
+            self._check_splat_options(kinds)
+            return
+        if self.with_mesh is not None or self.collider is not None:
+            raise UsageError("--with-mesh and --collider go beside splats: --as-splats")
+        if self.spz_version is not None or self.linear is not None:
+            raise UsageError("--set spz_version and linear are for splats: --as-splats")
+        glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
+        if self.lit and not (glb or usd):
+            raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
+        if self.smooth and not self.lit:
+            raise UsageError("--smooth has no effect without --lit")
+        only_glb = self.color_type != "uint16" or self.alpha in GLB_ALPHA or self.compression != "none"
+        if not glb and only_glb:
+            raise UsageError(
+                "--alpha mask, hybrid or ordered, --compression and --set color_type are for .glb files"
+            )
+        if self.cutoff is not None:
+            if self.alpha not in ("opaque", "mask"):
+                raise UsageError("--set cutoff is for --alpha opaque or mask")
+            checked_cutoff(self.cutoff)
+        if self.alpha != "ordered" and (self.nodes is not None or self.quick):
+            raise UsageError("--set nodes and quick are for --alpha ordered")
+        if self.alpha == "ordered" and (self.lit or self.compression != "none"):
+            raise UsageError("--alpha ordered goes with neither --lit nor --compression")
+        if self.nodes is not None:
+            check_nodes(self.nodes)
+        check_data(self.data, self.missing, self.cameras)
+        self.options_for(sources(self.input))  # checks the values before the work
+
+    def resolved(self) -> dict[str, Any]:
+        if self.as_splats or all(identify(path) == "mesh" for path in self.input):
+            return {}
+        return asdict(self.options_for(self.input))
+
+    def options_for(self, inputs: Sequence[Path]) -> ConversionOptions:
+        beside = any((path / "cameras.json").is_file() for path in inputs if path.is_dir())
+        has_cameras = bool(self.cameras or self.data) or beside
+        return self.conversion.resolved(self.preset, has_cameras=has_cameras)
+
+    def _check_stream(self, kinds: Sequence[str]) -> None:
+        """UsageError or ValueError for what needs the whole scene in memory."""
+        from meshsplats.conversion.streaming import refuse_whole
+
+        if tuple(kinds) != ("ply",):
+            raise UsageError("--stream writes .ply; for other programs, 'meshsplats tiles' makes .glb tiles")
+        if self.fidelity is not None or self.alpha not in ("auto", "blend") or self.scale is not None:
+            raise UsageError("--fidelity, --alpha and --scale need all in memory: leave out --stream")
+        refuse_whole(self.options_for(sources(self.input)))
+
+    def _check_splat_options(self, kinds: Sequence[str]) -> None:
+        check_splat_endings(*kinds)
+        splat_options(kinds, spz_version=self.spz_version, linear=self.linear)
+        if meshes := [path for path in (self.with_mesh, self.collider) if path is not None]:
+            if not all(f".{kind}" in SCENE_SUFFIXES for kind in kinds) or self.linear is not None:
+                raise UsageError("--with-mesh and --collider are for .glb and USD, with display colours")
+            check_outputs([self.output], True, inputs=meshes)
+        standard = {f.name: f.default for f in fields(self) if f.name not in _FOR_SPLATS}
+        idle = [name for name, value in standard.items() if getattr(self, name) != value]
+        explicit = asdict(self.conversion)
+        if self.conversion.budget == "drop" or self.conversion.max_splats is None:
+            idle += [name for name in ("cameras", "data") if getattr(self, name) is not None]
+        idle += [name for name, value in explicit.items() if value is not None and name not in _SELECTION]
+        if idle:
+            flags = ", ".join(spelled(type(self), name) for name in idle)
+            raise UsageError(f"{flags}: for a mesh, no effect with --as-splats")
+        self.conversion.resolved("paper", has_cameras=False)
+
+    def seen_by(self) -> list[Camera] | None:
+        """The cameras of the options, in the world; None: each input may have its own."""
+        if self.data is not None:
+            dataset = load_dataset(self.data, missing=self.missing, origin=(0, 0, 0))
+            return [view.camera for view in dataset.train or dataset.views]
+        return None if self.cameras is None else load_cameras(self.cameras)
+
+    def alone(self, job: Job, path: Path) -> ConvertCommand:
+        """The command that writes ``path`` of ``job`` alone."""
+        alone = replace(self, input=(job.source,), output=path, formats=())
+        suffix = path.suffix.lower()
+        if suffix != ".glb":
+            alone = replace(alone, color_type="uint16", compression="none")
+            if self.alpha in GLB_ALPHA:
+                alone = replace(alone, alpha="auto", cutoff=None, nodes=None, quick=False)
+        lit = suffix == ".glb" or suffix.startswith(".usd")
+        return alone if lit else replace(alone, lit=False, smooth=False)
+
+    def merges(self) -> bool:
+        """Whether splats are merged to keep a limit."""
+        limits = (self.conversion.max_splats, self.conversion.max_triangles)
+        return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
+
+    @property
+    def files(self) -> MeshFileOptions:
+        """How meshes are saved."""
+        return MeshFileOptions(
+            self.alpha,
+            self.cutoff,
+            self.lit,
+            self.smooth,
+            self.color_type,
+            self.compression,
+            nodes=NODES if self.nodes is None else self.nodes,
+            quick=self.quick,
+        )
+
+    @property
+    def look_of_result(self) -> Literal["area", "splats"]:
+        """The look that the conversion is for."""
+        return "splats" if self.conversion.footprint == "filter" else self.conversion.look or "area"
