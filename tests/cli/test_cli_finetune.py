@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _glb import read_glb
 from _photographs import write_photographs
 from conftest import words_of
 
@@ -416,9 +417,7 @@ def test_every_option_of_the_configuration_can_be_given():
 
 
 def alpha_modes(path) -> list[str]:
-    data = path.read_bytes()
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    return [material["alphaMode"] for material in document["materials"]]
+    return [material["alphaMode"] for material in read_glb(path)[0]["materials"]]
 
 
 def test_a_mesh_for_engines(splats, tmp_path, capsys):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import _splat_encoders as encode
 import numpy as np
 import pytest
+from _glb import edit_glb
 from _gltf_meshes import TRIANGLE, gltf, instanced, skinned
 from _meshes import random_mesh
 from _splat_files import random_splats
@@ -253,20 +254,6 @@ def test_gltf_textures_and_points_are_left_out_with_a_word(tmp_path):
         "1 primitives of points or lines were lef",
         "1 primitives have a texture, which was l",
     ]
-
-
-def edit_glb(path, change):
-    """Lets ``change`` alter the JSON part of a .glb file in place."""
-    data = path.read_bytes()
-    (length,) = struct.unpack_from("<I", data, 12)
-    document = json.loads(data[20 : 20 + length])
-    change(document)
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    path.write_bytes(
-        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-    )
 
 
 def test_our_mesh_moved_by_another_program(tmp_path):
