@@ -111,8 +111,8 @@ def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_pa
 @pytest.mark.parametrize(
     "options",
     [
-        ["--sh-degree", "0"],
-        ["--axes", "y-up"],
+        ["--width", "48", "--sh-degree", "0"],
+        ["--width", "48", "--axes", "y-up"],
         ["--width", "40", "--set", "distance=0.4,0.6"],
         ["--cameras", "nine.json"],
     ],
@@ -372,7 +372,7 @@ def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
     out = tmp_path / "tuned.npz"
-    arguments = [str(splats), "-o", str(out), *SMALL, "--steps", "40", "--set", "report_every=1"]
+    arguments = [str(splats), "-o", str(out), *SMALL, "--steps", "40", "--set", "report_every=3"]
     command = [sys.executable, "-m", "meshsplats", "finetune", *arguments]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
