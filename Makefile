@@ -49,8 +49,8 @@ SANITIZER_CXX ?= g++
 SANITIZER_FLAGS := -std=gnu++17 -O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -fPIC -shared -pthread \
 	-ffp-contract=off -fno-math-errno -fno-trapping-math -fvisibility=hidden -Wno-psabi -Wno-uninitialized \
 	-Wno-maybe-uninitialized $(if $(filter x86_64,$(shell uname -m)),-march=x86-64-v3) -DMS_CHECKS -D_GLIBCXX_ASSERTIONS
-CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_splat_order test_rasterize \
-	test_cutoff test_ramp test_fan_filter test_viewers test_losses test_adam test_merging test_core_fuzz
+CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat_order rasterize cutoff ramp fan_filter \
+	viewers losses adam merging core_fuzz,$(or $(shell find tests -name test_$(name).py),tests/test_$(name).py))
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
@@ -126,13 +126,15 @@ $(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
 	@touch $@
 
 # Left out is what does not depend on the versions: what Chromium and Dawn draw and compile, the rules of this
-# repository, and real scenes, which go through the same lines as small ones.
-LOWEST_LEFT_OUT := $(addprefix viewer/test_,compilers.py controls.py docs_page.py exact.py screens.py \
-	shader_of_docs.py) webgpu/test_dawn.py test_benchmarks.py test_compare_commits.py test_house.py test_rooms.py
+# repository, what the core computes, to which all commands give arrays, and real scenes, which go through the same
+# lines as small ones.
+LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py controls.py docs_page.py exact.py screens.py \
+	shader_of_docs.py) webgpu/test_dawn.py test_benchmarks.py test_compare_commits.py test_house.py test_rooms.py) \
+	$(CORE_TESTS)
 
 test-lowest: $(LOWEST_VENV)/installed
 	MESHSPLATS_SHARED_DATA=left-out $(LOWEST_VENV)/bin/python -m pytest $(PARALLEL) \
-	  $(LOWEST_LEFT_OUT:%=--ignore=tests/%)
+	  $(LOWEST_LEFT_OUT:%=--ignore=%)
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
 $(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')
@@ -170,8 +172,7 @@ sanitized = LD_PRELOAD="$$($(SANITIZER_CXX) -print-file-name=$(1)) $$($(SANITIZE
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	TSAN_OPTIONS='halt_on_error=1 ignore_noninstrumented_modules=1' OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
 	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python
-core_tests = -m pytest --capture=sys -k 'not ($(CORE_TESTS_LEFT_OUT))' \
-	$(foreach name,$(CORE_TESTS),$(or $(shell find tests -name $(name).py),tests/$(name).py))
+core_tests = -m pytest --capture=sys -k 'not ($(CORE_TESTS_LEFT_OUT))' $(CORE_TESTS)
 
 test-sanitizers: test-memory test-threads
 test-memory: $(VENV)/installed-dev $(SANITIZED)/address.so

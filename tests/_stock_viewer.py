@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
+from _glb import read_glb
 from _zbuffer import _fragments, _pixels
 
 from meshsplats import Camera, SplatMesh
@@ -20,9 +19,7 @@ def stock_image(path: Path, view: Camera, *, samples: int = 1) -> np.ndarray:
     """Colour (h, w, 3) on white. Meshes are sorted by the depths of the middles of their bounds, farthest
     first; their triangles are blended as they are listed, those that face away left out. Nodes are taken
     where the mesh's own frame has them."""
-    content = path.read_bytes()
-    length = struct.unpack_from("<I", content, 12)[0]
-    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    document, binary = read_glb(path)
     assert all(not m.get("doubleSided") and m["alphaMode"] == "BLEND" for m in document["materials"])
 
     def array(index: int) -> np.ndarray:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -45,6 +47,32 @@ def node_package() -> Callable[[str], Path]:
                 f"{name} is not here: npm install {name} in a folder, and name it in MESHSPLATS_NODE_FOLDER"
             )
         return Path(folder)
+
+    return found
+
+
+VALIDATE = """
+const validator = require('gltf-validator'), fs = require('fs');
+(async () => {
+  const reports = [];
+  for (const file of process.argv.slice(1))
+    reports.push((await validator.validateBytes(new Uint8Array(fs.readFileSync(file)))).issues);
+  console.log(JSON.stringify(reports));
+})();
+"""
+
+
+@pytest.fixture(scope="session")
+def gltf_issues(node_package: Callable[[str], Path]) -> Callable[..., list[dict[str, Any]]]:
+    """Gives what the Khronos validator has to say of each of some files."""
+    folder = node_package("gltf-validator")
+
+    def found(*files: Path) -> list[dict[str, Any]]:
+        command = ["node", "-e", VALIDATE, *map(str, files)]
+        done = subprocess.run(command, cwd=folder, capture_output=True, check=True, timeout=60)
+        reports: list[dict[str, Any]] = json.loads(done.stdout)
+        assert len(reports) == len(files)
+        return reports
 
     return found
 

@@ -201,6 +201,7 @@ def test_commands_of_the_documents_work(page, scene_file, tmp_path, monkeypatch,
             small = ["--no-tune", "--width", "48", "--levels", "2"]
         if command[1] == "surface":
             small = ["--resolution", "16", "--views", "6", "--size", "96", "--rounds", "1"]
+            small += [] if "--texture" in command else ["--texture", "128"]
         if command[1] == "deform":
             (tmp_path / "edited.obj").write_bytes((tmp_path / "base.obj").read_bytes())
         if command[1] == "prior":

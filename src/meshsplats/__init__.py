@@ -9,7 +9,6 @@ called.
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at run time
@@ -66,10 +65,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.viewer.page import PageOptions, make_page
     from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
-try:
-    __version__ = version("meshsplats")
-except PackageNotFoundError:  # run from a source tree that was never installed
-    __version__ = "0+unknown"
+__version__: str
 
 _HOME = {
     "meshsplats.base_mesh": ("BaseMesh",),
@@ -212,11 +208,23 @@ __all__ = [
 if not TYPE_CHECKING:  # a checker would take any name for one that this finds
 
     def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
+        if name == "__version__":
+            value = _version()
+        elif name in _MODULES:
+            value = getattr(importlib.import_module(_MODULES[name]), name)
+        else:
             raise AttributeError(f"module 'meshsplats' has no attribute {name!r}")
-        value = getattr(importlib.import_module(_MODULES[name]), name)
         globals()[name] = value
         return value
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version  # most of the time of "import meshsplats"
+
+    try:
+        return version("meshsplats")
+    except PackageNotFoundError:  # run from a source tree that was never installed
+        return "0+unknown"
 
 
 def __dir__() -> list[str]:

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from _glb import read_glb
 from _splats import few_splats
 from conftest import make_link, words_of
 from PIL import Image
@@ -309,8 +310,7 @@ def test_no_splats_left(splats, tmp_path, capsys):
 def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     out = tmp_path / "m.glb"
     assert run(splats, "-o", out, "--alpha", "mask", "--no-preview") == 0
-    data = out.read_bytes()
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    document, _ = read_glb(out)
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
@@ -494,8 +494,7 @@ def test_hybrid_is_for_meshes_with_solid_triangles(splats, tmp_path, capsys):
     mesh = SplatMesh([(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 1)], [(0, 1, 2), (1, 3, 2)], colors)
     save_mesh(mesh, source)
     assert run(source, "-o", out, "--alpha", "hybrid", "--no-preview") == 0
-    data = out.read_bytes()
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    document, _ = read_glb(out)
     assert [m["alphaMode"] for m in document["materials"]] == ["OPAQUE", "BLEND"]
     capsys.readouterr()
     assert run(splats, "-o", tmp_path / "b.glb", "--alpha", "hybrid") == 2

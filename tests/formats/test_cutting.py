@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _glb import read_glb
 from _meshes import assert_same, random_mesh
 from _rendering import FLIPS, camera, grid_faces, soup, turned
 from _zbuffer import zbuffer
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_mesh_bytes import SQUARE, chunks, values
+from test_mesh_bytes import SQUARE, values
 
 from meshsplats import SplatMesh, cut_mesh, load_mesh, save_mesh
 from meshsplats.rendering import render
@@ -212,14 +213,14 @@ def test_a_z_buffer_draws_the_file_as_the_cutoff_says(tmp_path, suffix, recwarn)
 
 def test_an_opaque_glb_has_a_plain_material(tmp_path):
     save_mesh(SQUARE, tmp_path / "m.glb", alpha="opaque", cutoff=0.25)
-    document, binary = chunks(tmp_path / "m.glb")
+    document, binary = read_glb(tmp_path / "m.glb")
     (material,) = document["materials"]
     assert material["alphaMode"] == "OPAQUE"
     assert "alphaCutoff" not in material
     colors = values(document, binary, document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"])
     assert {c[3] for c in colors} == {65535}
     save_mesh(SQUARE, tmp_path / "m.glb", alpha="mask", cutoff=0.35)
-    assert chunks(tmp_path / "m.glb")[0]["materials"][0]["alphaCutoff"] == 0.35
+    assert read_glb(tmp_path / "m.glb")[0]["materials"][0]["alphaCutoff"] == 0.35
 
 
 def test_an_opaque_usd_surface_has_no_opacity(tmp_path):
@@ -241,6 +242,6 @@ def test_cutoffs_without_effect_are_refused(tmp_path):
 
 def test_a_mesh_without_translucency_needs_no_option(tmp_path):
     save_mesh(cut_mesh(SQUARE, 0.25), tmp_path / "m.glb")
-    assert chunks(tmp_path / "m.glb")[0]["materials"][0]["alphaMode"] == "OPAQUE"
+    assert read_glb(tmp_path / "m.glb")[0]["materials"][0]["alphaMode"] == "OPAQUE"
     save_mesh(cut_mesh(SQUARE, 0.25), tmp_path / "m.glb", alpha="blend")
-    assert chunks(tmp_path / "m.glb")[0]["materials"][0]["alphaMode"] == "BLEND"
+    assert read_glb(tmp_path / "m.glb")[0]["materials"][0]["alphaMode"] == "BLEND"

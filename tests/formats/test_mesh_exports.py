@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _glb import edit_glb
 from _meshes import fan_mesh, random_mesh
-from test_mesh_foreign import edit_glb
 
 from meshsplats import DataWarning, MissingDependencyError, SplatMesh, load_mesh, save_mesh
 from meshsplats.colors import srgb_to_linear

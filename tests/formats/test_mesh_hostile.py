@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _glb import edit_glb
 from _meshes import fan_mesh, random_mesh
 from conftest import make_link
-from test_mesh_foreign import TRIANGLE, edit_glb, gltf
+from test_mesh_foreign import TRIANGLE, gltf
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
 from meshsplats.formats import _validation as mesh_checks

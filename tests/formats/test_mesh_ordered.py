@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import struct
 import warnings
 
 import numpy as np
 import pytest
+from _glb import read_glb, write_glb
 from _meshes import assert_same, random_mesh
 from hypothesis import given
 from hypothesis import strategies as st
@@ -49,17 +48,6 @@ def test_the_origin_stays(tmp_path):
         assert_same(load_mesh(tmp_path / "far.glb"), far, 1 / 10_000)
 
 
-def parse(content: bytes) -> tuple[dict, bytes]:
-    length = struct.unpack_from("<I", content, 12)[0]
-    return json.loads(content[20 : 20 + length]), content[20 + length :]
-
-
-def packed(document: dict, rest: bytes) -> bytes:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
 @pytest.fixture(name="ordered", params=[1, 3])
 def ordered_fixture(request, tmp_path):
     rng = np.random.default_rng(2)
@@ -70,7 +58,7 @@ def ordered_fixture(request, tmp_path):
 
 def test_every_triangle_is_there_with_both_windings(ordered):
     mesh, path = ordered
-    document, rest = parse(path.read_bytes())
+    document, rest = read_glb(path)
     assert [m["doubleSided"] for m in document["materials"]] == [False]
     count = sum(document["accessors"][m["primitives"][0]["indices"]]["count"] for m in document["meshes"])
     assert count == 2 * 3 * len(mesh.faces)
@@ -86,20 +74,20 @@ ALTERED = ["indices", "turned", "offset", "vertex", "one primitive less", "nodes
 def test_copies_that_do_not_match_are_an_error(ordered, what):
     """Any altered byte of what tells them apart, or a triangle that has no partner."""
     _, path = ordered
-    document, rest = parse(path.read_bytes())
+    document, rest = read_glb(path)
     note = document["meshes"][0]["extras"]["meshsplats"]["copies"]
     binary = bytearray(rest)
     message = "each triangle is there twice"
     if what == "indices":
         accessor = document["accessors"][document["meshes"][-1]["primitives"][0]["indices"]]
-        at = 8 + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        at = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
         binary[at : at + 2], binary[at + 2 : at + 4] = binary[at + 2 : at + 4], binary[at : at + 2]
         if binary == rest:
             pytest.skip("the first two corners are one vertex")
     elif what in ("turned", "offset", "vertex"):
         if what not in note:
             pytest.skip("one node has no list of vertices")
-        binary[8 + document["bufferViews"][note[what]["bufferView"]]["byteOffset"]] ^= 1
+        binary[document["bufferViews"][note[what]["bufferView"]]["byteOffset"]] ^= 1
     elif what == "nodes":
         note["nodes"] = "many"
         if len(document["meshes"]) > 1:
@@ -107,7 +95,7 @@ def test_copies_that_do_not_match_are_an_error(ordered, what):
     else:
         accessor = document["accessors"][document["meshes"][0]["primitives"][0]["indices"]]
         accessor["count"] -= 3
-    path.write_bytes(packed(document, bytes(binary)))
+    write_glb(path, document, bytes(binary))
     if what == "nodes":
         assert_same(load_mesh(path), ordered[0], 1 / 10_000)
         return
@@ -118,9 +106,9 @@ def test_copies_that_do_not_match_are_an_error(ordered, what):
 def test_a_mesh_that_was_moved_has_no_copies_either(ordered):
     """Another program may place the nodes elsewhere."""
     mesh, path = ordered
-    document, rest = parse(path.read_bytes())
+    document, rest = read_glb(path)
     document["nodes"][0]["scale"] = [2, 2, 2]
-    path.write_bytes(packed(document, rest))
+    write_glb(path, document, rest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         moved = load_mesh(path)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from _glb import edit_glb, read_glb
 from _meshes import assert_same
 from _priors import bumpy, cube
-from test_mesh_foreign import edit_glb
 
 from meshsplats import DataWarning, FileFormatError, SplatMesh, load_mesh, save_mesh
 from meshsplats.prior import MeshPrior, bind, load_prior
@@ -58,10 +57,7 @@ def test_vertices_recomputed_from_the_archive_alone(tmp_path):
 def test_vertices_recomputed_from_the_glb_alone(tmp_path):
     mesh = MeshPrior(scattered()).pose()
     save_mesh(mesh, tmp_path / "prior.glb")
-    data = (tmp_path / "prior.glb").read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + length])
-    binary = data[20 + length + 8 :]
+    document, binary = read_glb(tmp_path / "prior.glb")
     note = document["meshes"][0]["extras"]["meshsplats"]["binding"]
 
     def array(entry, dtype):

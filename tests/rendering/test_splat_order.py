@@ -21,10 +21,17 @@ from _rendering import (
 )
 from test_rendering_variants import in_another_process
 
-from meshsplats import SplatMesh, convert
+from meshsplats import Camera, SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
 from meshsplats.rendering.backward import OpacityRamp, TapedRendering, TapeOptions
+
+DEEP = "more layers than a chunk"
+
+
+def view_of(name: str, width: int = 37, height: int = 29) -> Camera:
+    """For a scene. All of the layers of ``DEEP`` are in every pixel: blocks of two sizes are enough."""
+    return camera(7, 5) if name == DEEP else camera(width, height)
 
 
 def scenes() -> dict[str, tuple[SplatMesh, dict]]:
@@ -60,7 +67,7 @@ def scenes() -> dict[str, tuple[SplatMesh, dict]]:
         "opaque": (replace(fans(8, 60), colors=np.ones((len(fans(8, 60).colors), 4))), {}),
         "equal depths": (numbered(layers([2.0] * 12, 0.3), 2), {}),
         "many layers": (numbered(stack, 1), {}),
-        "more layers than a chunk": (numbered(layers(np.linspace(1, 2, 2500), 0.002), 3), {}),
+        DEEP: (numbered(layers(np.linspace(1, 2, 2500), 0.002), 3), {}),
         "depth groups": (numbered(soup(9), 3, depth_group=np.arange(60) // 10), {}),
     }
 
@@ -74,7 +81,7 @@ def test_equal_to_float64(name, extras):
     mesh, options = SCENES[name]
     if extras and not mesh.attributes:
         extras = {"depth": True, "normals": True}
-    assert_mesh_is_exact(mesh, camera(), **options, **extras)
+    assert_mesh_is_exact(mesh, view_of(name), **options, **extras)
 
 
 @pytest.mark.parametrize("most", [1, 3])
@@ -209,7 +216,7 @@ def test_one_picture_with_a_tape_and_without():
         np.testing.assert_array_equal(image.color, render(mesh, view).color)
 
 
-@pytest.mark.parametrize("name", ["planes of splats", "opaque", "near plane", "more layers than a chunk"])
+@pytest.mark.parametrize("name", ["planes of splats", "opaque", "near plane", DEEP])
 def test_threads_and_tapes_change_no_gradient(name):
     mesh = SCENES[name][0]
     one = gradients(mesh, threads=1)
@@ -231,7 +238,9 @@ def test_gradients_equal_to_float64(name):
 
     mesh, options = SCENES[name]
     options = options | {"face_splat": mesh.face_splat, "filter_px2": mesh.filter_px2, "order": "splat"}
-    views = [turned(camera(48, 40), 3), camera(48, 40)] if name == "planes of splats" else [camera(48, 40)]
+    views = [view_of(name, 48, 40)]
+    if name == "planes of splats":
+        views.append(turned(views[0], 3))
     found = test_rasterize.gradients(rasterize, torch.float32, mesh, views, **options)
     truth = test_rasterize.gradients(reference_autograd.rasterize, torch.float64, mesh, views, **options)
     for array, a, b in zip(("vertices", "attributes", "background", "poses"), found, truth, strict=True):

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
-import struct
 import sys
 
 import numpy as np
 import pytest
+from _glb import read_glb
 from conftest import shared_data
 
 from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, look_at, psnr, save_gaussians
@@ -184,11 +183,7 @@ def test_a_collider_lies_where_the_mesh_is_in_other_programs(tmp_path):
     assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(paths[0]), "--up", "x"]) == 0
     options = [*PLAIN, "--faces", "200", "--resolution", "24"]
     assert main(["surface", str(paths[0]), "-o", str(paths[1]), *options]) == 0
-    documents = []
-    for path in paths:
-        data = path.read_bytes()
-        (length,) = struct.unpack_from("<I", data, 12)
-        documents.append(json.loads(data[20 : 20 + length]))
+    documents = [read_glb(path)[0] for path in paths]
     assert [d["nodes"][0]["rotation"] for d in documents] == [documents[0]["nodes"][0]["rotation"]] * 2
     scene, collider = (load_mesh(path) for path in paths)
     for limit in (np.min, np.max):

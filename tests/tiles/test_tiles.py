@@ -6,7 +6,6 @@ import errno
 import json
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _cities import COUNT, SMALL, digest, write_city
+from _glb import read_glb
 
 from meshsplats import (
     FileFormatError,
@@ -65,15 +65,9 @@ def tileset(splats, tmp_path_factory):
 # ---- A reader by the letter of the specifications, without any of ours
 
 
-def glb(path):
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
-
-
 def positions(path):
     """Vertices in the frame of the tileset: turned by the node of the file, then from y up to z up."""
-    document, binary = glb(path)
+    document, binary = read_glb(path)
     (node,) = document["nodes"]
     accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
     view = document["bufferViews"][accessor["bufferView"]]
@@ -85,7 +79,7 @@ def positions(path):
 
 
 def splat_rows(path):
-    document, binary = glb(path)
+    document, binary = read_glb(path)
     view = document["bufferViews"][document["meshes"][0]["extras"]["meshsplats"]["face_splat"]["bufferView"]]
     return np.unique(np.frombuffer(binary, "<i4", view["byteLength"] // 4, view["byteOffset"]))
 
@@ -141,7 +135,7 @@ def test_every_splat_is_in_one_leaf_and_every_box_holds_its_tiles(splats, tilese
     rows = np.concatenate([splat_rows(path) for path in leaves])
     np.testing.assert_array_equal(np.sort(rows), np.arange(COUNT))
     for _, tile, target in tiles:
-        document, _ = glb(target)
+        document, _ = read_glb(target)
         primitive = document["meshes"][0]["primitives"][0]
         triangles = document["accessors"][primitive["indices"]]["count"] // 3
         assert triangles == tile["extras"]["triangles"] <= 4096
@@ -240,7 +234,7 @@ def test_a_run_that_fails_anywhere_is_resumed(splats, tileset, tmp_path, monkeyp
 
 
 def materials(folder):
-    return [glb(path)[0]["materials"][0] for path in sorted(folder.rglob("*.glb"))]
+    return [read_glb(path)[0]["materials"][0] for path in sorted(folder.rglob("*.glb"))]
 
 
 @pytest.mark.parametrize("alpha", ["blend", "mask"])
@@ -417,15 +411,15 @@ def test_a_torn_line_of_the_journal_does_not_count(tmp_path):
 
 
 def test_splats_in_one_spot_are_parted_by_their_order(tmp_path):
-    cloud = next(city_blocks(4000, degree=0))
-    means = np.zeros((4000, 3))
+    cloud = next(city_blocks(1000, degree=0))
+    means = np.zeros((1000, 3))
     means[-1] = 1
     fields = {name: getattr(cloud, name) for name in ("quaternions", "scales", "opacities", "sh")}
-    save_gaussian_blocks([type(cloud)(means, **fields)], tmp_path / "spot.ply", 4000)
+    save_gaussian_blocks([type(cloud)(means, **fields)], tmp_path / "spot.ply", 1000)
     build_tiles(stream_gaussians(tmp_path / "spot.ply"), tmp_path / "tiles", SMALL)
     tiles = list(walk(tmp_path / "tiles" / "tileset.json", np.inf))
     rows = np.concatenate([splat_rows(path) for _, tile, path in tiles if not tile.get("children")])
-    np.testing.assert_array_equal(np.sort(rows), np.arange(4000))
+    np.testing.assert_array_equal(np.sort(rows), np.arange(1000))
     assert max(tile["extras"]["triangles"] for _, tile, _ in tiles) <= 4096
 
 
@@ -630,18 +624,7 @@ def test_commands(splats, tileset, tmp_path, capsys):
     assert "a tileset, not splats; render and info take it" in capsys.readouterr().err
 
 
-def test_the_validator_of_khronos_accepts_the_tiles(tileset, node_package):
-    folder = node_package("gltf-validator")
-    script = (
-        "const v = require('gltf-validator'), fs = require('fs');"
-        "(async () => { for (const f of process.argv.slice(1)) {"
-        " const r = await v.validateBytes(new Uint8Array(fs.readFileSync(f)));"
-        " console.log(r.issues.numErrors, r.issues.numWarnings, f); } })()"
-    )
-    files = [str(path) for path in sorted(tileset.rglob("*.glb"))]
-    done = subprocess.run(
-        ["node", "-e", script, *files], cwd=folder, capture_output=True, text=True, check=True
-    )
-    lines = done.stdout.splitlines()
-    assert len(lines) == len(files)
-    assert [line for line in lines if not line.startswith("0 0 ")] == []
+def test_the_validator_of_khronos_accepts_the_tiles(tileset, gltf_issues):
+    files = sorted(tileset.rglob("*.glb"))
+    for file, issues in zip(files, gltf_issues(*files), strict=True):
+        assert issues["numErrors"] == issues["numWarnings"] == 0, (file, issues["messages"])

@@ -71,6 +71,28 @@ def start(ball):
 
 
 @pytest.fixture(scope="module")
+def found_patches():
+    """By views and number; with the views, as else other ones could come to have their id."""
+    return {}
+
+
+@pytest.fixture
+def start_found_once(found_patches, monkeypatch):
+    """For tests of what follows: what photographs show is looked for once, not by each training."""
+    from meshsplats.training import run
+
+    look = run.starting_patches
+
+    def patches(views, count, points, threads):
+        key = (*map(id, views), count)
+        if key not in found_patches:
+            found_patches[key] = look(views, count, points, threads), views
+        return found_patches[key][0]
+
+    monkeypatch.setattr(run, "starting_patches", patches)
+
+
+@pytest.fixture(scope="module")
 def trained(ball):
     return train(ball, train_config(steps=120, **SMALL))
 
@@ -110,6 +132,7 @@ def test_a_ball_is_recovered_from_its_photographs(ball, start, trained):
     assert after > before + 4
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_a_scene_without_masks_is_recovered_too(room):
     config = train_config(steps=100, start_splats=1500, max_splats=2000, growth_events=2)
     start, mesh = starting_fans(room, config), train(room, config)
@@ -118,6 +141,7 @@ def test_a_scene_without_masks_is_recovered_too(room):
     assert not mesh.attributes
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_growth_is_worth_its_fans(ball, trained):
     still = train(ball, train_config(steps=120, **SMALL | {"growth_events": 0}))
     assert fan_count(still) < fan_count(trained)
@@ -158,6 +182,7 @@ def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
     assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_changing_light_is_fitted(ball):
     """Each photograph has a gain of its own; held-out views have their mean."""
     gains = np.random.default_rng(5).uniform(0.6, 1.0, len(ball.train))
@@ -171,6 +196,7 @@ def test_changing_light_is_fitted(ball):
     assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_photographs_that_fit_are_not_named(ball, recwarn):
     train(ball, train_config(steps=60, **SMALL))
     assert not recwarn.list
@@ -376,6 +402,7 @@ def test_shapes_decay_in_each_step_as_the_learning_rate_falls(ball, start):
     np.testing.assert_allclose(mesh.vertices, ellipses.reshape(-1, 3) + left * distance, rtol=0, atol=1e-5)
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_fans_of_a_training_are_nearly_ellipses(trained, ball):
     def distance(mesh: SplatMesh) -> float:
         fans = mesh.vertices.reshape(-1, 7, 3)
@@ -446,6 +473,7 @@ def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads(ball):
     assert not same(meshes[0], train(ball, replace(config, seed=1)))
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_a_resumed_run_ends_with_the_same_bits(ball, tmp_path):
     """Stopped before, between and after growth, with exposures; each time the mesh so far is there."""
     config = train_config(steps=24, exposure=True, **SMALL)
@@ -585,6 +613,7 @@ def test_memory_is_estimated_up_front(ball, monkeypatch):
         train(ball, train_config(steps=1))
 
 
+@pytest.mark.usefixtures("start_found_once")
 def test_a_resumed_run_keeps_its_shell(room, tmp_path, monkeypatch):
     """The same bits as without a stop, where fans of the shell would be dropped."""
     from meshsplats.training import run

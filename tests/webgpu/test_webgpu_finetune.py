@@ -495,6 +495,7 @@ def test_the_command(tmp_path):
     save_gaussians(make_scene(200), tmp_path / "scene.ply")
     out = tmp_path / "tuned.npz"
     words = [str(tmp_path / "scene.ply"), "-o", str(out), "--device", "gpu", "--width", "32", "--steps", "3"]
+    words += ["--views", "6", "--held-out", "2"]
     assert main(["finetune", *words]) == 0
     assert len(load_mesh(out).faces)
     assert main(["finetune", *words, "--steps", "5", "--resume", "--force"]) == 0

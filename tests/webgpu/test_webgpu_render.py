@@ -289,7 +289,7 @@ def test_lists_grow(monkeypatch):
 
 
 def test_large_images_are_drawn_in_windows(monkeypatch):
-    mesh, view = many_triangles()
+    mesh, view = soup(1, 100, spread=(2, 2, 2)), camera(70, 50, near=0.3)
     whole = render(mesh, view, samples=2, device="gpu", **EXTRAS)
     monkeypatch.setattr(frames, "WINDOW_SAMPLES", 5000)
     assert_same_image(render(replace(mesh), view, samples=2, device="gpu", **EXTRAS), whole)

@@ -9,7 +9,7 @@ import pytest
 from _gpu import assert_same_image, both, need_gpu
 from _rendering import EXTRAS, camera, layers, turned
 from conftest import shared_data
-from test_splat_order import SCENES, crossed
+from test_splat_order import SCENES, crossed, view_of
 from test_webgpu_gradients import CPU, GPU, bits, descend, large_fan, of_mesh, random_gradient, renderer_of
 from test_webgpu_gradients import assert_same_gradients as assert_same_gradients_of
 from test_webgpu_render import bits as image_bits
@@ -43,7 +43,7 @@ def test_equal_to_the_core(name, extras):
     if extras and not mesh.attributes:
         extras = {"depth": True, "normals": True}
     least = 95 if name == "a filter" else 105
-    assert_same_image(*both(mesh, camera(), **options, **extras), least=least, most=1e-3)
+    assert_same_image(*both(mesh, view_of(name), **options, **extras), least=least, most=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -131,9 +131,9 @@ def test_the_cutoff_of_a_mesh_in_the_order_of_splats_has_a_depth_buffer():
 
 def test_one_walk_blends_all_however_many_layers():
     mesh = replace(layers(np.full(700, 2.0), 0.003), face_splat=np.arange(700) // 2, order="splat")
-    images = draw(mesh, camera(), BY_SPLAT)
+    images = draw(mesh, camera(20, 9), BY_SPLAT)
     assert images.work.walks == images.work.tiles
-    assert draw(mesh, camera(), DrawSettings()).work.walks > images.work.tiles
+    assert draw(mesh, camera(20, 9), DrawSettings()).work.walks > images.work.tiles
 
 
 def test_walks_that_exceed_their_budget_go_on_where_they_ended():
@@ -184,7 +184,7 @@ def test_real_scenes(name):
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_equal_to_those_of_the_core(name):
     mesh, options = SCENES[name]
-    assert_same_gradients_of(mesh, camera(48, 40), **options, filter_px2=mesh.filter_px2)
+    assert_same_gradients_of(mesh, view_of(name, 48, 40), **options, filter_px2=mesh.filter_px2)
 
 
 def test_gradients_of_samples_that_end_early():
