@@ -33,27 +33,35 @@ _GZIP_LEVEL, _ZSTD_LEVEL = 4, 9
 
 def write_spz(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud``; see ``save_gaussians``. MissingDependencyError for version 4 without Zstandard."""
-    version = writing.spz_version or 3
-    compress = _compressor(writing.where) if version == 4 else None
+    compress = _compressor(writing.where) if writing.spz_version == 4 else None
     warn_of_losses(cloud, writing.where, keeps=("antialiased",))
     bits = _fraction_bits(cloud, writing.where)
-    streams = _streams(cloud, bits)
-    degree = cloud.sh_degree
-    flags = ANTIALIASED if cloud.kernel == "antialiased" else 0
     if compress is None:
-        head = struct.pack("<4sIIBBBB", MAGIC, 3, len(cloud), degree, bits, flags, 0)
-        packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 31)
-        with open(path, "wb") as file:
-            for part in (head, *streams):
-                file.write(packer.compress(part))
-            file.write(packer.flush())
+        path.write_bytes(_version_3(cloud, bits))
         return
+    streams = _streams(cloud, bits)
     packed = [compress(stream) for stream in streams]
-    head = struct.pack("<4sIIBBBB", MAGIC, 4, len(cloud), degree, bits, flags, len(streams))
-    head += struct.pack("<I12x", 32)
+    head = _head(cloud, 4, bits, len(streams)) + struct.pack("<I12x", 32)
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     with open(path, "wb") as file:
         file.writelines([head, table, *packed])
+
+
+def spz_bytes(cloud: GaussianCloud, where: object) -> bytes:
+    """A file of version 3 of ``cloud``; a DataWarning names ``where`` if its positions are too coarse."""
+    return _version_3(cloud, _fraction_bits(cloud, where))
+
+
+def _version_3(cloud: GaussianCloud, bits: int) -> bytes:
+    packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 31)
+    parts = (_head(cloud, 3, bits), *_streams(cloud, bits))
+    return b"".join([*map(packer.compress, parts), packer.flush()])
+
+
+def _head(cloud: GaussianCloud, version: int, bits: int, streams: int = 0) -> bytes:
+    """The first 16 bytes of a file."""
+    flags = ANTIALIASED if cloud.kernel == "antialiased" else 0
+    return struct.pack("<4sIIBBBB", MAGIC, version, len(cloud), cloud.sh_degree, bits, flags, streams)
 
 
 def _compressor(where: object) -> Any:
