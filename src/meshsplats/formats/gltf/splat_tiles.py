@@ -36,8 +36,6 @@ _FLOAT, _UINT8 = 5126, 5121
 def write_splat_tile(cloud: GaussianCloud, path: Path, up: np.ndarray) -> None:
     """Writes ``cloud``, whose positions lie around its own middle for fine steps, as a GLB file in which
     ``up`` (3,) is +y, whole or not at all."""
-    from meshsplats import __version__
-
     middle = (cloud.means.min(axis=0).astype(np.float64) + cloud.means.max(axis=0)) / 2
     # SPZ has the axes of HALF_TURN_X, which the node takes back.
     near = replace(cloud, means=(cloud.means - middle).astype(np.float32), up=None)
@@ -62,18 +60,10 @@ def write_splat_tile(cloud: GaussianCloud, path: Path, up: np.ndarray) -> None:
         "mode": 0,
         "extensions": {EXTENSION: {"extensions": {SPZ: {"bufferView": view}}}},
     }
-    document = {
-        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
-        "extensionsUsed": [EXTENSION, SPZ],
-        "extensionsRequired": [EXTENSION, SPZ],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "matrix": (matrix.T.ravel() + 0.0).tolist()}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": [{"count": len(cloud), **accessor} for accessor in accessors],
-        "bufferViews": chunk.views,
-        "buffers": [{"byteLength": chunk.length}],
-    }
+    chunk.accessors = [{"count": len(cloud), **accessor} for accessor in accessors]
+    nodes = [{"mesh": 0, "matrix": (matrix.T.ravel() + 0.0).tolist()}]
+    extensions = {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
+    document = {"asset": {}, **extensions} | chunk.document(nodes, [{"primitives": [primitive]}])
     with atomic_path(path, needs=chunk.length) as temporary:
         write_binary(temporary, document, chunk, what=f"{path}: the splats", advice="")
 
