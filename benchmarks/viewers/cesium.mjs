@@ -3,7 +3,8 @@
 //   node cesium.mjs TILESET_FOLDER IMAGE.png [MAXIMUM_SCREEN_SPACE_ERROR] [RANGE]
 //
 // Runs in a folder where `npm install cesium puppeteer-core` was run; CHROMIUM names the browser. RANGE: distance of
-// the camera in radii of the tileset. Prints the tiles that were loaded and their triangles.
+// the camera in radii of the tileset. Prints the tiles that were loaded, their triangles or splats, and the camera: its
+// view matrix, column by column, from the frame of the tileset, and its vertical angle.
 
 import fs from 'fs';
 import http from 'http';
@@ -39,14 +40,17 @@ window.show = async (error, range) => {
   await new Promise(done => {
     let calm = 0;
     viewer.scene.postRender.addEventListener(() => {
-      calm = tileset.tilesLoaded ? calm + 1 : 0;
-      if (calm > 5) done();
+      const splats = tileset.gaussianSplatPrimitive;
+      calm = tileset.tilesLoaded && (!splats || splats._drawCommand) ? calm + 1 : 0;
+      if (calm > (splats ? 20 : 5)) done();
     });
   });
   const statistics = tileset.statistics;
   return {
     version: Cesium.VERSION, failures, selected: statistics.selected,
     loaded: statistics.numberOfLoadedTilesTotal, triangles: statistics.numberOfTrianglesSelected,
+    splats: tileset.gaussianSplatPrimitive?._numSplats ?? 0,
+    view: Cesium.Matrix4.toArray(viewer.camera.viewMatrix), fovy: viewer.camera.frustum.fovy,
   };
 };
 </script>`;

@@ -16,6 +16,7 @@ from meshsplats._geometry import rotation_rows
 from meshsplats.cli import main
 from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.formats.splat_formats import format_to_write, written_ending
+from meshsplats.formats.splats import _quantising
 from meshsplats.formats.splats._palette import palette
 from meshsplats.formats.splats._quantising import (
     codebook,
@@ -496,3 +497,15 @@ def test_real_splats_lose_little(tmp_path, name):
     least = {".ply": 100, ".glb": 100, ".compressed.ply": 45, ".spz": 45, ".sog": 50}
     for suffix, limit in least.items():
         assert loss(cloud, written(cloud, tmp_path / f"a{suffix}")) > limit, suffix
+
+
+def test_the_nearest_turn_of_a_cube_is_that_of_the_largest_product():
+    """Of any rotation, and of those that two or more turns are as near to."""
+    turns, _ = _quantising._cube()
+    rng = np.random.default_rng(0)
+    ties = rng.integers(-2, 3, (2000, 4)).astype(float)
+    q = np.concatenate([rng.normal(size=(2000, 4)), ties[ties.any(axis=1)], turns, -turns])
+    q = (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+    products = np.abs(turns @ q.T)
+    found = products[_quantising._nearest_turn(q, turns), np.arange(len(q))]
+    np.testing.assert_allclose(found, products.max(axis=0), rtol=1e-6)

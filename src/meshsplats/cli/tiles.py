@@ -54,8 +54,10 @@ class Tiles(Command):
     """Splat file, or the folder of a trained model; several of them; a folder of splat files."""
     output: Output
     """Folder for the tileset; it appears when it is complete. Until then, FOLDER.partial."""
+    as_splats: bool = False
+    """Tiles of splats (SPZ in glTF), as CesiumJS draws them, not of triangles."""
     max_triangles: int = 1 << 16
-    """Maximum number of triangles of a tile."""
+    """Maximum number of triangles of a tile. A splat of --as-splats counts as 2."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
     look: LookOfSplats = None
@@ -63,11 +65,14 @@ class Tiles(Command):
     area."""
     min_opacity: Number = None
     """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
-    colors: Literal["base", "view"] = "base"
-    """base: one colour for each splat, which every program shows. view: also the harmonics of colours that
-    depend on the view, for this program's images and for shaders; 1.6 to 2 times as large."""
+    colors: Annotated[
+        Literal["base", "view"] | None, tyro.conf.arg(metavar="{base,view}", help_behavior_hint="")
+    ] = None
+    """base: one colour for each splat, which every program shows; the default of meshes. view: also the
+    harmonics of colours that depend on the view, for this program's images and for shaders; 1.6 to 2 times
+    as large."""
     color_degree: Count = None
-    """With --colors view: harmonics up to this degree, 1 to 3. Default: all that the splats have."""
+    """Harmonics of 'view' up to this degree, 1 to 3. Default: all that the splats have."""
     crop: Box = None
     """Only splats with their centre in this box, in the coordinates of the file."""
     up: Text = None
@@ -122,11 +127,12 @@ class Tiles(Command):
             result = {"tileset": str(self.output / "tileset.json"), **asdict(found)}
             print(json.dumps(result | {"seconds": round(seconds, 2)}, indent=1))
             return
+        made = f" -> {found.triangles:,} triangles" if found.alpha else ""
         print(
-            f"{found.splats:,} splats -> {found.triangles:,} triangles in {found.tiles:,} tiles of"
-            f" {found.levels} levels, {found.bytes / 1e6:,.1f} MB, in {seconds:.1f} s"
+            f"{found.splats:,} splats{made} in {found.tiles:,} tiles of {found.levels} levels,"
+            f" {found.bytes / 1e6:,.1f} MB, in {seconds:.1f} s"
         )
-        if line := alpha_in_words(asdict(found.alpha)):
+        if found.alpha and (line := alpha_in_words(asdict(found.alpha))):
             print(line)
         if source.origin.any():
             say_origin(source.origin, self.origin)
@@ -152,7 +158,8 @@ class Tiles(Command):
             x, y, z = (float(u) for u in parse_up(self.up))
             up = (x, y, z)
         place: Literal["world", "local"] = "world" if self.origin == "keep" else "local"
-        options = TileOptions(self.max_triangles, self.preset, conversion, up, self.lit, self.alpha, place)
+        given = (self.preset, conversion, up, self.lit, self.alpha, place)
+        options = TileOptions(self.max_triangles, self.as_splats, *given)
         options.resolved()
         return options
 

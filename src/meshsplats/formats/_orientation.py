@@ -12,6 +12,8 @@ HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
 """Half turn about x: from y up to y down and back; reverses z, too."""
 HALF_TURN_Z = np.diag([-1.0, -1.0, 1.0])
 """Half turn about z: from y up to y down and back; reverses x, too."""
+TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Viewers of tilesets turn glTF, whose y axis points up, so."""
 
 
 def up_quaternion(up: np.ndarray) -> list[float]:
@@ -33,6 +35,12 @@ def up_rotation(up: np.ndarray) -> np.ndarray:
     """(3, 3) float64 matrix of ``up_quaternion``."""
     x, y, z, w = up_quaternion(up)
     return np.array(list(rotation_rows(w, x, y, z)))
+
+
+def tile_frame(up: np.ndarray) -> np.ndarray:
+    """(3, 3) float64 rotation from the world frame to that of a tileset, in which ``up`` (3,) is +z: that of
+    a GLB's node and of viewers together."""
+    return np.asarray(TO_Z_UP @ up_rotation(up))
 
 
 def turned_origin(mesh: SplatMesh | BaseMesh) -> np.ndarray:

@@ -126,7 +126,12 @@ class SplatStream:
         with content_of(path) as content:
             kind = splat_format(content)
             up = kind.reader.up(content)
-        return None if up is None else to_y_down(kind, self.axes) @ up
+        if up is None:
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # those of the file come when it is read
+            with self._opened(path) as (_, turn):
+                return np.asarray(turn @ up)
 
 
 def stream_gaussians(

@@ -2,7 +2,8 @@
 
 The tileset is an octree. Its leaves hold the triangles that ``convert`` makes of the whole scene, each of
 them once. An inner tile stands for its children when it is seen from afar: their splats are merged to a
-quarter, and its geometric error says how far the merged ones lie from those of the file.
+quarter, and its geometric error says how far the merged ones lie from those of the file. Tiles of splats
+have the splats themselves.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -28,6 +30,7 @@ from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey, survey
+from meshsplats.errors import DataWarning
 from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
 from meshsplats.formats.gltf.writer import change_alpha
 from meshsplats.formats.streaming import SplatStream
@@ -50,15 +53,15 @@ class TilesetSummary:
     splats: int
     """Count of the splats in its leaves."""
     triangles: int
-    """Count of the triangles of its leaves."""
+    """Count of the triangles of its leaves; 0 for tiles of splats."""
     tiles: int
     levels: int
     bytes: int
     """Of all files."""
     error: float
     """Geometric error of the root, scene units."""
-    alpha: AlphaChoice
-    """The alpha mode of the tiles."""
+    alpha: AlphaChoice | None
+    """The alpha mode of the tiles; None for tiles of splats."""
 
 
 def build_tiles(
@@ -172,6 +175,9 @@ class _Build:
     def run(self) -> TilesetSummary:
         self._check_start()
         scene = self._survey()
+        if self._options.as_splats and scene.kernel == "2dgs":
+            text = "SPZ leaves out the kernel '2dgs': the tiles are drawn as '3dgs'"
+            warnings.warn(f"{self._folder}: {text}", DataWarning, stacklevel=3)
         degree = harmonics_degree(scene, self._conversion)
         cube = Cube(scene.low, scene.high)
         buckets = Buckets(self._work / "splats", cube, self.journal, BUCKET, degree)
@@ -207,16 +213,19 @@ class _Build:
         leaves = [node for node in nodes.values() if not node.children]
         splats = sum(node.splats for node in leaves)
         up = unit_up(self._options.up or DEFAULT_UP)
-        write_tilesets(self._out, nodes, root, up, splats, self._origin)
+        of_splats = self._options.as_splats
+        write_tilesets(self._out, nodes, root, up, splats, self._origin, of_splats=of_splats)
         alpha = self._alpha(scene, nodes)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
         levels = _height(nodes, root)
         return TilesetSummary(splats, triangles, len(nodes), levels, size, nodes[root].error, alpha)
 
-    def _alpha(self, scene: Survey, nodes: dict[str, Node]) -> AlphaChoice:
+    def _alpha(self, scene: Survey, nodes: dict[str, Node]) -> AlphaChoice | None:
         """The alpha mode of the tiles, after choosing it if that is asked for. They are written with 'mask',
         in whose place the choice fits."""
+        if self._options.as_splats:
+            return None
         if self._options.alpha != "auto":
             return AlphaChoice(self._options.alpha)
         noted = self.journal.find("alpha")

@@ -13,25 +13,29 @@ import numpy as np
 from meshsplats._files.atomic import write_bytes, write_text
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
 from meshsplats.cluster import Shared
-from meshsplats.conversion.budget import triangles_each
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import SceneViews
 from meshsplats.conversion.merging import FILTER_PX2, merge
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey
+from meshsplats.formats._orientation import tile_frame
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
+from meshsplats.formats.gltf.splat_tiles import write_splat_tile
 from meshsplats.formats.gltf.writer import Alpha
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.buckets import DEPTH, Cube, cloud_of, read_records, record_type, records_of
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.options import TileOptions
-from meshsplats.tiles.tileset import Node, tile_frame, tile_path
+from meshsplats.tiles.tileset import Node, tile_path
 
 SHARE = 4
 """Splats of the children for each one of an inner tile: surfaces, seen from twice as far, cover a quarter."""
 ERROR_SHARE = 0.99
 """Share of the mass of an inner tile that its geometric error speaks for."""
+SPLAT_REACH = 3.0
+"""Standard deviations from the centre of a splat to where viewers end it, about."""
 SURVEY = "survey.npz"
 """Beside the journal of an unfinished tileset."""
 
@@ -66,8 +70,8 @@ class TileWriter:
         self._options, self._threads = options, threads
         self._conversion = options.resolved()
         self._work, self._out = folder / "work", folder / "tileset"
-        self._most = options.max_triangles // triangles_each(self._conversion)
-        up = unit_up(options.up or DEFAULT_UP)
+        self._most = options.max_triangles // options.triangles_each(self._conversion)
+        self._up = up = unit_up(options.up or DEFAULT_UP)
         self._frame = tile_frame(up)
         scene = stored_survey(self._work / SURVEY)
         self._kernel = scene.kernel
@@ -167,17 +171,17 @@ class TileWriter:
         children: list[str],
         below: Sequence[Node] = (),
     ) -> Node:
-        """Writes the mesh of a tile."""
-        mesh = self._driver.mesh(self._driver.sized(cloud, rows, pixel))
-        alpha: Alpha = "mask" if self._options.alpha == "auto" else self._options.alpha
-        if alpha == "opaque":
-            # A tile of nothing but fog keeps its densest part: glTF has no empty meshes.
-            mesh = cut_mesh(mesh, min(CUTOFF, 0.9 * float(mesh.colors[:, 3].max())))
+        """Writes the content of a tile."""
         path = self._out / tile_path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        lit = True if self._options.lit else None
-        save_mesh(mesh, path, lit=lit, alpha=None if alpha == "opaque" else alpha)
-        corners = mesh.vertices.astype(np.float64) @ self._frame.T
+        triangles = vertices = 0
+        if self._options.as_splats:
+            write_splat_tile(cloud, path, self._up)
+            corners = self._reach(cloud)
+        else:
+            mesh = self._save_mesh(self._driver.mesh(self._driver.sized(cloud, rows, pixel)), path)
+            triangles, vertices = len(mesh.faces), len(mesh.vertices)
+            corners = mesh.vertices.astype(np.float64) @ self._frame.T
         low = np.min([corners.min(axis=0), *(node.low for node in below)], axis=0)
         high = np.max([corners.max(axis=0), *(node.high for node in below)], axis=0)
         return Node(
@@ -186,10 +190,27 @@ class TileWriter:
             high=[float(x) for x in high],
             error=float(error),
             splats=len(cloud),
-            triangles=len(mesh.faces),
-            vertices=len(mesh.vertices),
+            triangles=triangles,
+            vertices=vertices,
             children=children,
         )
+
+    def _save_mesh(self, mesh: SplatMesh, path: Path) -> SplatMesh:
+        """Writes the ``mesh`` of a tile; returns it as it is written."""
+        alpha: Alpha = "mask" if self._options.alpha == "auto" else self._options.alpha
+        if alpha == "opaque":
+            # A tile of nothing but fog keeps its densest part: glTF has no empty meshes.
+            mesh = cut_mesh(mesh, min(CUTOFF, 0.9 * float(mesh.colors[:, 3].max())))
+        lit = True if self._options.lit else None
+        save_mesh(mesh, path, lit=lit, alpha=None if alpha == "opaque" else alpha)
+        return mesh
+
+    def _reach(self, cloud: GaussianCloud) -> np.ndarray:
+        """(2 n, 3) least and greatest corners of the boxes around splats, in the frame of the tileset."""
+        centers = cloud.means.astype(np.float64) @ self._frame.T
+        axes = self._frame @ (cloud.rotations.astype(np.float64) * cloud.scales[:, None])
+        reach = SPLAT_REACH * np.linalg.norm(axes, axis=2)
+        return np.concatenate([centers - reach, centers + reach])
 
     # -- cells above those in memory
 

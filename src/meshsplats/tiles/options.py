@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal
 
 from meshsplats._options import Range, check_options
@@ -15,6 +15,7 @@ TilesAlpha = Literal["auto", "blend", "mask", "opaque"]
 
 MAX_TRIANGLES = 1 << 16
 """Triangles of a tile."""
+_OF_SPLATS = ("crop", "min_opacity", "colors", "color_degree")
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,11 @@ class TileOptions:
     """Options of ``build_tiles``."""
 
     max_triangles: Annotated[int, Range(1, math.inf)] = MAX_TRIANGLES
-    """Largest number of triangles of a tile."""
+    """Largest number of triangles of a tile. A splat counts as two of them, as viewers draw it."""
+    as_splats: bool = False
+    """Tiles of splats, not of meshes, as CesiumJS streams them: glTF with KHR_gaussian_splatting and SPZ.
+    They keep all harmonics, unless ``conversion`` says otherwise by ``colors`` or ``color_degree``; of its
+    other options, only ``crop`` and ``min_opacity`` have a meaning."""
     preset: Preset = "default"
     """Preset of the conversion."""
     conversion: ConversionOptions | None = None
@@ -47,15 +52,32 @@ class TileOptions:
         """The checked options of the conversion. Raises ValueError."""
         check_options(self)
         conversion = self.conversion or ConversionOptions()
-        if conversion.colors is None and conversion.color_degree is None:
+        if self.as_splats:
+            self._check_splats(conversion)
+        elif conversion.colors is None and conversion.color_degree is None:
             conversion = replace(conversion, colors="base")
         chosen = conversion.resolved(self.preset, has_cameras=False)
         refuse_whole(chosen)
         if chosen.footprint == "filter":
             raise ValueError("footprint='filter' is for this project's renderer, tiles are for others")
-        least = triangles_each(chosen)
+        least = self.triangles_each(chosen)
         if self.max_triangles < 8 * least:
             raise ValueError(
                 f"max_triangles of a tile must be at least {8 * least}, got {self.max_triangles!r}"
             )
         return chosen
+
+    def triangles_each(self, conversion: ConversionOptions) -> int:
+        """Triangles of a splat with the resolved options of the ``conversion``."""
+        return 2 if self.as_splats else triangles_each(conversion)
+
+    def _check_splats(self, conversion: ConversionOptions) -> None:
+        """Raises ValueError for options that tiles of splats have no use for."""
+        given = {"preset": self.preset != "default", "lit": self.lit, "alpha": self.alpha != "auto"}
+        given |= {f.name: getattr(conversion, f.name) is not None for f in fields(conversion)}
+        wrong = [name for name, there in given.items() if there and name not in _OF_SPLATS]
+        if wrong:
+            raise ValueError(
+                f"{', '.join(wrong)}: of meshes; tiles of splats have only {', '.join(_OF_SPLATS)}: leave it"
+                " out, or as_splats"
+            )

@@ -24,8 +24,8 @@ from meshsplats._json import read_json
 from meshsplats._kinds import need_path
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
-from meshsplats.formats._orientation import up_quaternion
-from meshsplats.formats.gltf.scene import rotation_matrix
+from meshsplats.formats._orientation import tile_frame
+from meshsplats.formats.gltf.splat_tiles import CONTENT
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import NAME
@@ -37,8 +37,6 @@ _MAX_BYTES = 64 << 20
 _MAX_TILES = 1 << 22
 _MAX_DEPTH = 64
 _PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
-_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Viewers turn glTF, whose y axis points up, so."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +57,6 @@ class Node:
     """Keys."""
 
 
-def tile_frame(up: np.ndarray) -> np.ndarray:
-    """(3, 3) float64 rotation from the world frame to that of a tileset, in which ``up`` (3,) is +z: that of
-    a GLB's node and of viewers together."""
-    return _TO_Z_UP @ rotation_matrix(up_quaternion(up))[:3, :3]
-
-
 def tile_path(key: str) -> str:
     """Name of the GLB of a tile in the folder of the tileset."""
     return "/".join([*_folders(key), f"{key[len(_group(key)) :] or 'root'}.glb"])
@@ -77,13 +69,18 @@ def write_tilesets(
     up: np.ndarray,
     splats: int,
     origin: np.ndarray,
+    *,
+    of_splats: bool = False,
 ) -> None:
-    """Writes the tileset files of ``nodes`` (by key) below ``root``; that of the root last.
+    """Writes the tileset files of ``nodes`` (by key) below ``root``; that of the root last. ``of_splats``:
+    tiles are no meshes.
 
     Tiles are relative to the point ``origin`` (3,) of the world, to which the transform of the root moves
     them.
     """
     note: dict[str, Any] = {"up": [float(x) for x in up], "splats": splats}
+    if of_splats:
+        note["contents"] = "splats"
     if origin.any():
         note["origin"] = origin.tolist()
     files = [key for key in sorted(nodes) if key != root and _starts_file(key, nodes, root)]
@@ -95,6 +92,7 @@ def write_tilesets(
             "asset": {"version": "1.1", "generator": f"MeshSplats {__version__}"},
             "geometricError": max(nodes[key].error, float(np.linalg.norm(box)) if key == root else 0.0),
             "root": {"refine": "REPLACE", **tile},
+            **(CONTENT if of_splats else {}),
         }
         if key == root:
             document["extras"] = {"meshsplats": note}
@@ -139,8 +137,10 @@ def _tile(node: Node, nodes: dict[str, Node], group: str) -> dict[str, Any]:
         "boundingVolume": {"box": _box(node)},
         "geometricError": node.error,
         "content": {"uri": _relative(tile_path(node.key), group)},
-        "extras": {"splats": node.splats, "triangles": node.triangles, "vertices": node.vertices},
+        "extras": {"splats": node.splats},
     }
+    if node.triangles:
+        tile["extras"] |= {"triangles": node.triangles, "vertices": node.vertices}
     children = []
     for key in node.children:
         if _group(key) == group or not nodes[key].children:
@@ -225,6 +225,8 @@ class Tileset:
         self.path = Path(path) / NAME if Path(path).is_dir() else Path(path)
         document = _load(self.path)
         note = _object(_object(document, "extras", self.path), "meshsplats", self.path)
+        if note.get("contents") == "splats":
+            raise FileFormatError(f"{self.path}: a tileset of splats, not of meshes: load_gaussians reads it")
         up = _numbers(note.get("up"), 3, "the up direction", self.path)
         if not up.any():
             raise FileFormatError(f"{self.path}: the up direction must not be 0")

@@ -15,16 +15,13 @@ import numpy as np
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._scene import SceneParts
-from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
 from meshsplats.formats.gltf.splats_writer import splats_part
 from meshsplats.formats.gltf.writer import mesh_part
 
 COLLIDER = "collider-colonly"
 """Godot's suffix for a mesh that becomes a collider and is not drawn."""
-_FLOAT, _UINT32 = 5126, 5125
-_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
 _REFERS = {
     "bufferView": "bufferViews",
@@ -105,7 +102,7 @@ def _collider_part(collider: BaseMesh) -> Part:
     material = {"name": "invisible", "alphaMode": "MASK", "pbrMetallicRoughness": invisible}
     note = {"meshsplats": {"version": 1, "collider": True}}
     meshes = [{"name": COLLIDER, "primitives": [primitive], "extras": note}]
-    return _document(chunk, COLLIDER, collider, meshes, [material])
+    return chunk.document([placed_node(COLLIDER, collider, mesh=0)], meshes, [material]), chunk
 
 
 def _surface_part(base: BaseMesh, lit: bool) -> Part:
@@ -139,7 +136,7 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
         mode = "OPAQUE" if texture < 0 else alpha_mode(base.textures[texture])
         materials.append(_material(factor or {}, mode, lit))
     meshes = [{"name": "surface", "primitives": primitives}]
-    document, chunk = _document(chunk, "surface", base, meshes, materials)
+    document = chunk.document([placed_node("surface", base, mesh=0)], meshes, materials)
     if images:
         listed = [{"source": i, "sampler": i} for i in range(len(images))]
         document |= {"images": images, "samplers": samplers, "textures": listed}
@@ -186,33 +183,6 @@ def _image(chunk: BinaryChunk, pixels: np.ndarray) -> int:
 def _triangles(
     chunk: BinaryChunk, vertices: np.ndarray, faces: np.ndarray, extra: dict[str, np.ndarray] | None = None
 ) -> dict[str, Any]:
-    corners = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
-    attributes = {"POSITION": chunk.accessor(vertices, _FLOAT, _ARRAY_BUFFER, **corners)}
-    for name, array in (extra or {}).items():
-        attributes[name] = chunk.accessor(array, _FLOAT, _ARRAY_BUFFER)
-    indices = chunk.accessor(faces.reshape(-1).view(np.uint32), _UINT32, _ELEMENT_ARRAY_BUFFER)
-    return {"attributes": attributes, "indices": indices, "material": 0}
-
-
-def _document(
-    chunk: BinaryChunk,
-    name: str,
-    base: BaseMesh,
-    meshes: list[dict[str, Any]],
-    materials: list[dict[str, Any]],
-) -> Part:
-    from meshsplats import __version__
-
-    node: dict[str, Any] = {"name": name, "mesh": 0, "rotation": up_quaternion(base.up)}
-    if base.origin.any():
-        node["translation"] = turned_origin(base).tolist()
-    document = {
-        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": meshes,
-        "materials": materials,
-        "accessors": chunk.accessors,
-        "bufferViews": chunk.views,
-    }
-    return document, chunk
+    attributes = {"POSITION": chunk.positions(vertices)}
+    attributes |= {name: chunk.attribute(array) for name, array in (extra or {}).items()}
+    return {"attributes": attributes, "indices": chunk.indices(faces), "material": 0}

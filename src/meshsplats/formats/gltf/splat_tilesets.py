@@ -21,6 +21,7 @@ import numpy as np
 from meshsplats._json import json_object
 from meshsplats._origin import choose_origin, sampled
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._orientation import TO_Z_UP, tile_frame
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.splats import names_splats, placed_clouds, splat_document
@@ -30,9 +31,9 @@ from meshsplats.formats.splats._cloud_builder import joined_within
 from meshsplats.gaussians import GaussianCloud
 
 FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""To x right, y down, z forward."""
-_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Viewers turn glTF, whose y axis points up, so."""
+"""To x right, y down, z forward, in tilesets of others; ours say from where they were turned."""
+_TO_Z_UP = np.eye(4)
+_TO_Z_UP[:3, :3] = TO_Z_UP
 _MAX_BYTES = 64 << 20
 _MAX_TILES = 1 << 20
 _MAX_DEPTH = 64
@@ -60,14 +61,24 @@ class _Tree:
         self._count = 0
         document = self._document(path)
         self.root = self._root(document, path)
-        self.of_meshes = "meshsplats" in (document.get("extras") or ())
-        """Whether ``meshsplats tiles`` has written it."""
+        extras = document.get("extras")
+        note = extras.get("meshsplats") if isinstance(extras, dict) else None
+        self.own_up: np.ndarray | None = None
+        """(3,) float64 direction that points up in the world of a tileset of ``meshsplats tiles``."""
+        self.of_meshes = note is not None
+        if isinstance(note, dict) and note.get("contents") == "splats":
+            self.of_meshes = False
+            self.own_up = self._numbers(note.get("up"), 3, "the up direction", path)
+            if not self.own_up.any():
+                raise FileFormatError(f"{path}: the up direction must not be 0")
 
     def tiles(self) -> list[_Tile]:
         return self._below(self.root, self._path, np.eye(4), "", 0)
 
     def up(self) -> np.ndarray:
-        """(3,) float64: z, or away from the ground for a tileset on the globe."""
+        """(3,) float64: z, or away from the ground for a tileset of others on the globe."""
+        if self.own_up is not None:
+            return np.array([0.0, 0, 1])
         tile = self.root
         volume = self._object(tile, "boundingVolume", self._path)
         if isinstance(region := volume.get("region"), list):
@@ -198,6 +209,8 @@ class SplatTileset(Splats):
             raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
         self._tiles = tree.tiles()
         self.up = tree.up()
+        if tree.own_up is not None:
+            self.to_y_down = tile_frame(tree.own_up).T
 
     @cached_property
     def _sample(self) -> np.ndarray:

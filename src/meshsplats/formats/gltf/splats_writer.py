@@ -22,9 +22,6 @@ from meshsplats.formats.splats._quantising import as_bytes
 from meshsplats.formats.writing import FormatWriter, Writing
 from meshsplats.gaussians import GaussianCloud
 
-_FLOAT, _UINT8 = 5126, 5121
-_ARRAY_BUFFER = 34962
-
 
 def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud``; see ``save_gaussians``. ValueError for more than the 4 GiB that a file can hold."""
@@ -36,31 +33,17 @@ def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
 def splats_part(cloud: GaussianCloud, *, beside_meshes: bool = False) -> tuple[dict[str, Any], BinaryChunk]:
     """The document of ``cloud`` and its chunk. ``beside_meshes``: its node turns it to where our writer of
     meshes puts those of the same world, whose axes have no half turn about the vertical."""
-    from meshsplats import __version__
-
     turned = cloud.transformed(HALF_TURN_Z)
     chunk, attributes = BinaryChunk(), {}
     for name, array in _attributes(turned).items():
-        component = _UINT8 if array.dtype == np.uint8 else _FLOAT
-        more: dict[str, Any] = {"normalized": True} if component == _UINT8 else {}
-        if name == "POSITION":
-            more = {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        attributes[name] = chunk.accessor(array, component, _ARRAY_BUFFER, **more)
+        attributes[name] = chunk.positions(array) if name == "POSITION" else chunk.attribute(array)
     kind = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     kind |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
-    document = {
-        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "splats", "mesh": 0, **_place(cloud, beside_meshes)}],
-        "meshes": [{"name": "splats", "primitives": [primitive], **_note(cloud, beside_meshes)}],
-        "accessors": chunk.accessors,
-        "bufferViews": chunk.views,
-        "buffers": [{"byteLength": chunk.length}],
-    }
-    return document, chunk
+    nodes = [{"name": "splats", "mesh": 0, **_place(cloud, beside_meshes)}]
+    meshes = [{"name": "splats", "primitives": [primitive], **_note(cloud, beside_meshes)}]
+    document: dict[str, Any] = {"asset": {}, "extensionsUsed": [EXTENSION]}  # in front of what grows
+    return document | chunk.document(nodes, meshes), chunk
 
 
 def _attributes(cloud: GaussianCloud) -> dict[str, np.ndarray]:

@@ -23,11 +23,10 @@ from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.draw_order import DrawOrder
-from meshsplats.formats._orientation import turned_origin, up_quaternion
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf import compressed, copies
-from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
+from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
 from meshsplats.formats.gltf.compressed import Compression, Grid
 from meshsplats.formats.gltf.view_colors import (
     IN_VIEW_COLORS,
@@ -41,8 +40,6 @@ from meshsplats.mesh import SplatMesh, solid_faces
 ColorType = Literal["uint16", "float32"]
 Alpha = Literal["blend", "mask", "opaque", "hybrid"]
 
-_FLOAT, _INT8, _INT16, _UINT16, _UINT32 = 5126, 5120, 5122, 5123, 5125
-_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _ROWS = 1 << 15
 
 
@@ -236,11 +233,7 @@ def _scene(
 ) -> dict[str, Any]:
     """The JSON part of a file of ``meshes``, which hold ``mesh``; several are below one node that places
     them."""
-    from meshsplats import __version__
-
-    node: dict[str, Any] = {"name": "splats", "rotation": up_quaternion(mesh.up)}
-    if mesh.origin.any():
-        node["translation"] = turned_origin(mesh).tolist()
+    node = placed_node("splats", mesh)
     nodes = [node]
     if grid is not None:
         nodes.append({"name": "grid", "mesh": 0} | grid.node)
@@ -250,17 +243,7 @@ def _scene(
     else:
         nodes += [{"name": f"splats {k + 1}", "mesh": k} for k in range(len(meshes))]
         node["children"] = list(range(1, len(nodes)))
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": nodes,
-        "meshes": meshes,
-        "materials": materials,
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": buffer.length}],
-    }
+    document = buffer.document(nodes, meshes, materials)
     if any("extensions" in material for material in materials):
         document["extensionsUsed"] = ["KHR_materials_unlit"]
     return document
@@ -282,34 +265,14 @@ def _primitive(
 ) -> dict[str, Any]:
     """A primitive with the triangles of ``mesh``, and further attributes of its vertices."""
     places = mesh.vertices if grid is None else grid.places(mesh.vertices)
-    attributes = {
-        "POSITION": buffer.accessor(
-            places,
-            _FLOAT if grid is None else _UINT16,
-            _ARRAY_BUFFER,
-            min=places.min(axis=0).tolist(),
-            max=places.max(axis=0).tolist(),
-        ),
-    }
-    if mesh.normals is not None and grid is None:
-        attributes["NORMAL"] = buffer.accessor(mesh.normals, _FLOAT, _ARRAY_BUFFER)
-    elif mesh.normals is not None:
-        normals = compressed.small_normals(mesh.normals)
-        attributes["NORMAL"] = buffer.accessor(normals, _INT16, _ARRAY_BUFFER, normalized=True)
-    colors = linear_colors(mesh, color_type)
-    if color_type == "uint16":
-        attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
-    else:
-        attributes["COLOR_0"] = buffer.accessor(colors, _FLOAT, _ARRAY_BUFFER)
-    for name, table in tables.items():
-        component = {"float32": _FLOAT, "int8": _INT8, "uint16": _UINT16}[table.dtype.name]
-        flag = {} if component == _FLOAT else {"normalized": True}
-        attributes[name] = buffer.accessor(table, component, _ARRAY_BUFFER, **flag)
-    # The largest 16-bit index is kept free: graphics interfaces use it as a restart mark.
-    small = len(mesh.vertices) <= 0xFFFF
-    indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
-    index_accessor = buffer.accessor(indices, _UINT16 if small else _UINT32, _ELEMENT_ARRAY_BUFFER)
-    return {"attributes": attributes, "indices": index_accessor, "material": material}
+    attributes = {"POSITION": buffer.positions(places)}
+    if mesh.normals is not None:
+        normals = mesh.normals if grid is None else compressed.small_normals(mesh.normals)
+        attributes["NORMAL"] = buffer.attribute(normals)
+    attributes["COLOR_0"] = buffer.attribute(linear_colors(mesh, color_type))
+    attributes |= {name: buffer.attribute(table) for name, table in tables.items()}
+    indices = buffer.indices(mesh.faces, len(mesh.vertices))
+    return {"attributes": attributes, "indices": indices, "material": material}
 
 
 def _material(alpha: Alpha, lit: bool, cutoff: float) -> dict[str, Any]:
@@ -362,7 +325,7 @@ def _add_own_arrays(
         entry: dict[str, Any] = {"name": name, "columns": columns}
         if attributes is not None and (columns is None or 1 <= columns <= 4):
             semantic = _semantic(name, attributes)
-            attributes[semantic] = buffer.accessor(values, _FLOAT, _ARRAY_BUFFER)
+            attributes[semantic] = buffer.attribute(values)
             entry["semantic"] = semantic
         elif columns != 0:
             entry |= _raw(buffer, values)

@@ -51,8 +51,7 @@ def nearest_axes(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
     for start in range(0, len(quaternions), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
         q = quaternions[part]
-        # w of q * conj(g) is their dot product.
-        best = np.abs(turns @ q.T).argmax(axis=0)
+        best = _nearest_turn(q, turns)
         (aw, ax, ay, az), (bw, bx, by, bz) = np.ascontiguousarray(q.T), conjugates[:, best]
         w = aw * bw - ax * bx - ay * by - az * bz
         sign = np.where(w < 0, np.float32(-1), np.float32(1))
@@ -63,6 +62,33 @@ def nearest_axes(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
         rows = 3 * np.arange(len(q))[:, None]
         moved[part] = scales[part].reshape(-1)[rows + places[best]]
     return turned, moved
+
+
+def _nearest_turn(q: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """(n,) which of the ``turns`` g (24, 4) of a cube is nearest to each of ``q`` (n, 4): the one of largest
+    |w| of q * conj(g), their dot product.
+
+    Turns have one component 1, or two of sqrt(1/2), or four of 1/2, with any signs: the largest product is
+    that of the largest component of q, of the two largest, or of all, which is found ten times as fast as by
+    all products.
+    """
+    a, b, c, d = sizes = np.abs(np.ascontiguousarray(q.T))
+    largest, second = np.maximum(np.maximum(a, b), np.maximum(c, d)), np.empty_like(a)
+    np.maximum(np.minimum(np.maximum(a, b), np.maximum(c, d)), np.minimum(a, b), out=second)
+    np.maximum(second, np.minimum(c, d), out=second)
+    two, four = (largest + second) * np.float32(np.sqrt(0.5)), (a + b + c + d) * np.float32(0.5)
+    least = np.where(two > largest, second, largest)
+    least[four > np.maximum(two, largest)] = 0
+    code = np.zeros(len(q), np.uint8)
+    for i, size in enumerate(sizes):
+        code += np.where(size < least, 1, np.where(q[:, i] < 0, 0, 2)).astype(np.uint8) * np.uint8(3**i)
+    table = np.full(81, -1)
+    for sign in (-1, 1):
+        table[(np.rint(np.sign(sign * turns)).astype(int) + 1) @ 3 ** np.arange(4)] = np.arange(len(turns))
+    best = table[code]
+    ties = np.flatnonzero(best < 0)  # of the second largest with the third
+    best[ties] = np.abs(turns @ q[ties].T).argmax(axis=0)
+    return best
 
 
 def _cube() -> tuple[np.ndarray, np.ndarray]:

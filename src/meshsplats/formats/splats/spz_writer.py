@@ -28,32 +28,43 @@ _STEPS = 8
 """Steps of positions, at least, in the deviation that most splats exceed along their second axis."""
 _FIRST_BUCKET, _BUCKET = 8, 16
 """Steps of 1/128 in a step of harmonics of degree 1 and beyond."""
-_GZIP_LEVEL, _ZSTD_LEVEL = 4, 9
+_GZIP_LEVEL, _REPEATED_LEVEL, _ZSTD_LEVEL = 4, 2, 9
+"""Of splats that repeat each other, level 2 makes smaller files, and in less time."""
 
 
 def write_spz(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud``; see ``save_gaussians``. MissingDependencyError for version 4 without Zstandard."""
-    version = writing.spz_version or 3
-    compress = _compressor(writing.where) if version == 4 else None
+    compress = _compressor(writing.where) if writing.spz_version == 4 else None
     warn_of_losses(cloud, writing.where, keeps=("antialiased",))
     bits = _fraction_bits(cloud, writing.where)
-    streams = _streams(cloud, bits)
-    degree = cloud.sh_degree
-    flags = ANTIALIASED if cloud.kernel == "antialiased" else 0
     if compress is None:
-        head = struct.pack("<4sIIBBBB", MAGIC, 3, len(cloud), degree, bits, flags, 0)
-        packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 31)
-        with open(path, "wb") as file:
-            for part in (head, *streams):
-                file.write(packer.compress(part))
-            file.write(packer.flush())
+        path.write_bytes(_version_3(cloud, bits))
         return
+    streams = _streams(cloud, bits, order_for_streams(cloud.means, cloud.quaternions))
     packed = [compress(stream) for stream in streams]
-    head = struct.pack("<4sIIBBBB", MAGIC, 4, len(cloud), degree, bits, flags, len(streams))
-    head += struct.pack("<I12x", 32)
+    head = _head(cloud, 4, bits, len(streams)) + struct.pack("<I12x", 32)
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     with open(path, "wb") as file:
         file.writelines([head, table, *packed])
+
+
+def spz_bytes(cloud: GaussianCloud, where: object) -> bytes:
+    """A file of version 3 of ``cloud``; a DataWarning names ``where`` if its positions are too coarse."""
+    return _version_3(cloud, _fraction_bits(cloud, where))
+
+
+def _version_3(cloud: GaussianCloud, bits: int) -> bytes:
+    order = order_for_streams(cloud.means, cloud.quaternions)
+    level = _REPEATED_LEVEL if isinstance(order, slice) else _GZIP_LEVEL
+    packer = zlib.compressobj(level, zlib.DEFLATED, 31)
+    parts = (_head(cloud, 3, bits), *_streams(cloud, bits, order))
+    return b"".join([*map(packer.compress, parts), packer.flush()])
+
+
+def _head(cloud: GaussianCloud, version: int, bits: int, streams: int = 0) -> bytes:
+    """The first 16 bytes of a file."""
+    flags = ANTIALIASED if cloud.kernel == "antialiased" else 0
+    return struct.pack("<4sIIBBBB", MAGIC, version, len(cloud), cloud.sh_degree, bits, flags, streams)
 
 
 def _compressor(where: object) -> Any:
@@ -84,9 +95,10 @@ def _fraction_bits(cloud: GaussianCloud, where: object) -> int:
     return bits
 
 
-def _streams(cloud: GaussianCloud, bits: int) -> list[bytes]:
-    """The attributes in file order, in the axes of the format; none of harmonics of degree 0."""
-    cloud = cloud.take(order_for_streams(cloud.means, cloud.quaternions)).transformed(HALF_TURN_X)
+def _streams(cloud: GaussianCloud, bits: int, order: np.ndarray | slice) -> list[bytes]:
+    """The attributes in the order of the file, its splats in ``order``, in the axes of the format; none of
+    harmonics of degree 0."""
+    cloud = cloud.take(order).transformed(HALF_TURN_X)
     quaternions, scales = nearest_axes(cloud.quaternions, cloud.scales)
     limit = 2**23 - 1
     fixed = np.clip(np.rint(cloud.means.astype(np.float64) * 2.0**bits), -limit, limit).astype("<i4")
