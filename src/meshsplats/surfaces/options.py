@@ -41,7 +41,7 @@ class SurfaceOptions:
     mean colours of the images."""
     sh_degree: Annotated[int | None, Range(0, 4), Advanced] = None
     """Largest degree of the splats' view-dependent colour in the images; None: all."""
-    move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 1.5
+    move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 0.5
     """Step of the vertices, relative to the length of an edge."""
     stiffness: Annotated[float, Range(0, 1000), With("rounds"), Advanced] = 2.0
     """How far a vertex takes its neighbours along: the weight of the Laplacian."""
