@@ -1,55 +1,117 @@
-"""Surfaces of splats against the splats: quality, time, size.
+"""Surfaces of splats against the splats, and against photographs: quality, time, size.
 
     python benchmarks/surfaces.py --data ../shared/data playbot guitar truck
+    python benchmarks/surfaces.py --data ../shared/data --faces 40000 lego
 
-For each scene the surface with default options, by images of degree 0. PSNR is that of its images, 2 x 2
-samples, against the splats' (degree 0, means over areas, on white) from the standard cameras, eight of 400
-pixels at the given distances. "colours" is the same surface with colours of vertices, as fused. Seconds are
-those of the processor, of all threads.
+For each scene the surface with default options, by images of degree 0. Its images, 2 x 2 samples, are
+compared with those of the splats (degree 0, means over areas, on white) from the standard cameras, eight of
+400 pixels at the given distances. lego is fitted to photographs and compared with those that are held out.
+"colours" is the same surface with colours of vertices, as fused; "opaque" are the splats' own images, each
+pixel opaque in its own colour or white: what an opaque surface of these colours could reach at best.
+
+FLIP is the difference that people see where two images take turns (Andersson and others 2020; 0: none, 1: the
+largest), by its authors' package: pip install flip-evaluator. LPIPS needs networks that no package brings.
+Seconds are those of the processor, of all threads.
 """
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from _common import DATA, SCENES, Report, Stopwatch, arguments
+from _common import DATA, PHOTOGRAPHED, SCENES, Report, Stopwatch, arguments, mean_psnr
 
 import meshsplats as ms
+from meshsplats.base_mesh import BaseMesh
+
+DISTANCES = ("mid", "close")
+SOLID = 0.5
+"""Alpha from which a pixel of "opaque" is."""
+HELD_OUT = "held-out photographs"
+
+
+class Truth(NamedTuple):
+    """What the images of a surface are compared with."""
+
+    name: str
+    cameras: list[ms.Camera]
+    images: list[np.ndarray]
+    """On white."""
+    opaque: list[np.ndarray]
+    """The same, each pixel opaque or white."""
+
+
+def truths(name: str, data: Path, photographs: ms.Dataset | None, threads: int | None) -> Iterator[Truth]:
+    if photographs is not None:
+        views = photographs.test
+        images = [view.load().over((1, 1, 1)) for view in views]
+        yield Truth(HELD_OUT, [view.camera for view in views], images, [])
+        return
+    scene = SCENES[name]
+    for distance in DISTANCES:
+        cameras = scene.cameras(data, distance)
+        drawn = [
+            ms.draw_splats(scene.cloud(data), camera, sh_degree=0, background=(0, 0, 0), threads=threads)
+            for camera in cameras
+        ]
+        opaque = []
+        for image in drawn:
+            own = image.color / np.maximum(image.alpha, 1e-3)[..., None]
+            opaque.append(np.where(image.alpha[..., None] >= SOLID, own, 1))
+        images = [image.color + (1 - image.alpha)[..., None] for image in drawn]
+        yield Truth(distance, cameras, images, opaque)
+
+
+def flip(image: np.ndarray, truth: np.ndarray) -> float:
+    """FLIP of two images; nan without its package."""
+    try:
+        from flip_evaluator import evaluate
+    except ImportError:
+        return float("nan")
+    pair = (np.ascontiguousarray(i.clip(0, 1), np.float32) for i in (truth, image))
+    return float(evaluate(*pair, "LDR", applyMagma=False)[1])
+
+
+def scores(base: BaseMesh, truth: Truth, threads: int | None) -> tuple[str, str]:
+    """Mean PSNR in dB and mean FLIP."""
+    drawn = [ms.draw_surface(base, camera, threads=threads) for camera in truth.cameras]
+    differences = [flip(*pair) for pair in zip(drawn, truth.images, strict=True)]
+    return f"{mean_psnr(drawn, truth.images):.2f}", f"{np.mean(differences):.4f}"
 
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("scenes", nargs="+", choices=list(SCENES))
+    parser.add_argument("scenes", nargs="+", choices=[*SCENES, "lego"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--faces", type=int, default=20_000)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
+    threads = options.threads
     with Report(options) as report, tempfile.TemporaryDirectory() as folder:
-        report.table("scene", "distance", "triangles", "colours dB", "surface dB", "MB", "seconds")
+        report.table(
+            *("scene", "compared with", "triangles", "colours dB", "FLIP", "surface dB", "FLIP"),
+            *("opaque dB", "MB", "seconds"),
+        )
         for name in options.scenes:
-            scene = SCENES[name]
+            scene = SCENES.get(name) or PHOTOGRAPHED[name]
             cloud = scene.cloud(options.data)
-            more = {"faces": options.faces, "sh_degree": 0, "threads": options.threads}
-            plain = ms.make_surface(cloud, texture=0, rounds=0, **more)
+            photographs = ms.load_dataset(options.data / scene.photographs) if scene.photographs else None
+            more = {"faces": options.faces, "sh_degree": 0, "threads": threads}
+            plain = ms.make_surface(cloud, photographs, texture=0, rounds=0, **more)
             watch = Stopwatch()
-            surface = ms.make_surface(cloud, **more)
+            surface = ms.make_surface(cloud, photographs, **more)
             seconds = watch.processor
             path = Path(folder) / "surface.glb"
             ms.save_base(surface, path)
-            for distance in ("mid", "close"):
-                cameras = scene.cameras(options.data, distance)
-                truths = [ms.draw_splats(cloud, camera, sh_degree=0).color for camera in cameras]
-                scores = [
-                    np.mean(
-                        [ms.psnr(ms.draw_surface(base, c), t) for c, t in zip(cameras, truths, strict=True)]
-                    )
-                    for base in (plain, surface)
-                ]
+            for truth in truths(name, options.data, photographs, threads):
+                found = [value for base in (plain, surface) for value in scores(base, truth, threads)]
+                bound = f"{mean_psnr(truth.opaque, truth.images):.2f}" if truth.opaque else ""
                 size = f"{path.stat().st_size / 1e6:.1f}"
-                values = [f"{len(surface.faces):,}", *(f"{s:.2f}" for s in scores), size, f"{seconds:.0f}"]
-                report.row(name, distance, *values)
+                shown = [f"{len(surface.faces):,}", *found, bound, size, f"{seconds:.0f}"]
+                report.row(name, truth.name, *shown)
 
 
 if __name__ == "__main__":

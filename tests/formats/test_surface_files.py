@@ -158,6 +158,34 @@ def test_materials(tmp_path, unlit):
     assert "NORMAL" in document["meshes"][0]["primitives"][0]["attributes"]
 
 
+@pytest.mark.parametrize(
+    ("collision", "suffix"), [(None, "surface"), ("drawn", "surface-col"), ("only", "surface-colonly")]
+)
+def test_godot_knows_colliders_by_their_names(tmp_path, collision, suffix):
+    save_base(tetrahedron(), tmp_path / "a.glb", collision=collision)
+    data = (tmp_path / "a.glb").read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + length])
+    assert [document["nodes"][0]["name"], document["meshes"][0]["name"]] == [suffix, suffix]
+    base, again = tetrahedron(), load_base(tmp_path / "a.glb")
+    np.testing.assert_array_equal(again.vertices[again.faces], base.vertices[base.faces])
+    assert again.textured == (collision != "only")
+
+
+@pytest.mark.parametrize("collision", [None, "drawn", "only"])
+def test_usd_physics_knows_colliders(tmp_path, collision):
+    pxr = pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    assert pxr
+    save_base(tetrahedron(), tmp_path / "a.usdc", collision=collision)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    (prim,) = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    assert prim.HasAPI(UsdPhysics.CollisionAPI) == (collision is not None)
+    assert prim.HasAPI(UsdPhysics.MeshCollisionAPI) == (collision is not None)
+    assert (UsdGeom.Imageable(prim).ComputePurpose() == "guide") == (collision == "only")
+
+
 def test_what_cannot_be_written(tmp_path):
     base, plain = tetrahedron(), tetrahedron(textured=False)
     both = BaseMesh(
@@ -173,6 +201,9 @@ def test_what_cannot_be_written(tmp_path):
         (base, "a.glb", {"image": "gif"}, "image must be one of"),
         (plain, "a.glb", {"image": "png"}, "with a texture"),
         (base, "a.stl", {"image": "png"}, "with a texture"),
+        (base, "a.glb", {"collision": "box"}, "collision must be one of drawn, only, got 'box'"),
+        (base, "a.obj", {"collision": "only"}, "collision applies to .glb"),
+        (base, "a.glb", {"collision": "only", "image": "png"}, "with a texture"),
         (BaseMesh(np.zeros((0, 3)), np.zeros((0, 3), int)), "a.glb", {}, "no faces"),
         (both, "a.glb", {}, "one texture on all faces"),
     ]:

@@ -15,7 +15,7 @@ from meshsplats.base_mesh import Texture
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.surfaces import draw_surface
 from meshsplats.surfaces.atlas import GUTTER, cells, filled, unwrap
-from meshsplats.surfaces.fitting import SmoothSteps, fit, mean_colors, target_of
+from meshsplats.surfaces.fitting import SMALL, SmoothSteps, fit, mean_colors, target_of
 from meshsplats.surfaces.images import Surface, SurfaceImage
 from meshsplats.surfaces.views import smaller
 
@@ -118,6 +118,19 @@ def test_a_step_takes_neighbours_along():
     near = np.linalg.norm(points - points[0], axis=1) < 0.5
     assert moved[0, 0] > moved[near][1:, 0].max() > moved[~near, 0].max() > 0
     np.testing.assert_allclose(SmoothSteps(points, faces, 20.0).step(0 * push, 0.1), points, atol=1e-12)
+
+
+@needs_scipy
+def test_steps_are_as_long_for_faint_gradients_as_for_large_ones_but_not_for_noise():
+    points, faces = unit_ball(2)
+    push = np.zeros_like(points)
+    push[:3, 0] = 1.0, 0.3, 0.01
+    moved = points - SmoothSteps(points, faces, 0.0).step(push, 0.1)
+    expected = [g / np.sqrt(g**2 + SMALL**2) for g in (1.0, 0.3, 0.01)]
+    np.testing.assert_allclose(moved[:3, 0], 0.1 * np.array(expected), rtol=1e-9)
+    assert expected[1] > 0.9
+    assert expected[2] < 0.15
+    np.testing.assert_array_equal(moved[3:], 0)
 
 
 def test_what_an_image_is_compared_with():

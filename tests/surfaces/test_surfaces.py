@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from meshsplats.surfaces import make_surface
 from meshsplats.surfaces.fusion import isosurface
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.manifold import split_pinches
+from meshsplats.surfaces.options import SurfaceOptions, level_options
 
 QUICK = {"texture": 0, "rounds": 0, "views": 24, "size": 96, "resolution": 32, "threads": 1}
 needs_extra = pytest.mark.skipif(
@@ -174,6 +176,41 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     assert main(["surface", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
     assert main(["surface", str(out), "-o", str(out), "--force"]) == 2
     assert "is read by this command" in capsys.readouterr().err
+
+
+@needs_extra
+def test_levels_of_detail_have_a_quarter_of_the_triangles_each(tmp_path, capsys):
+    save_gaussians(discs(), tmp_path / "scene.ply")
+    out = tmp_path / "ball.glb"
+    command = ["surface", str(tmp_path / "scene.ply"), "-o", str(out), *PLAIN, "--resolution", "24"]
+    command += ["--faces", "800", "--levels", "3", "--json"]
+    assert main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    rows = [found, *found["levels"]]
+    assert [row["mesh"] for row in rows] == [str(out), *(str(tmp_path / f"ball_lod{k}.glb") for k in (1, 2))]
+    for row, count in zip(rows, (800, 200, 50), strict=True):
+        base = load_mesh(row["mesh"])
+        assert row["triangles"] == len(base.faces) == pytest.approx(count, abs=2)
+        assert open_edges(base.faces) == 0
+        assert np.abs(np.linalg.norm(base.vertices, axis=1) - 1).max() < 0.3
+    # None of the files is written over by accident, and none is begun that could not be finished.
+    out.unlink()
+    assert main(command) == 3
+    assert main([*command, "--faces", "60", "--force"]) == 1
+    assert main([*command, "--levels", "0", "--force"]) == 1
+    assert not out.exists()
+
+
+def test_levels_are_halved_until_they_would_be_too_small():
+    options = SurfaceOptions(faces=640, texture=256, size=80)
+    levels = level_options(options, 3)
+    assert [(o.faces, o.texture, o.size) for o in levels] == [(640, 256, 80), (160, 128, 40), (40, 64, 20)]
+    assert [o.faces for o in level_options(replace(options, faces=0, texture=0), 3)] == [0, 0, 0]
+    for field, value in (("faces", 60), ("texture", 128), ("size", 40)):
+        with pytest.raises(ValueError, match="fewer than 3 levels"):
+            level_options(replace(options, **{field: value}), 3)
+    with pytest.raises(ValueError, match="levels must be 1 or more, got 0"):
+        level_options(options, 0)
 
 
 @needs_extra

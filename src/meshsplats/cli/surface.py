@@ -30,10 +30,10 @@ from meshsplats.cli.common import (
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
-from meshsplats.formats.base_meshes import BASE_SUFFIXES, PRINTED, TextureImage, companions, save_base
+from meshsplats.formats import base_meshes as files
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
 from meshsplats.mesh import SplatMesh
-from meshsplats.surfaces.options import SurfaceOptions
+from meshsplats.surfaces.options import SurfaceOptions, level_options
 
 if TYPE_CHECKING:
     Options = SurfaceOptions
@@ -45,7 +45,8 @@ else:
     )
 
 
-Image = Annotated[TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")]
+Collider = Annotated[files.Collision | None, tyro.conf.arg(metavar="{drawn,only}", help_behavior_hint="")]
+Image = Annotated[files.TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,8 @@ class Surface(Command):
     """The mesh, opaque: .glb, .usdz with the texture inside; .obj, .ply, .usdc with the texture beside; .npz
     without; .stl, .3mf for printing."""
     surface: Options = field(default_factory=Options)
+    levels: int = 1
+    """Levels of detail, each with a quarter of the triangles of the one before: MESH.glb, MESH_lod1.glb..."""
     data: Folder = None
     """Data set of photographs to fit shape and texture to, in place of images of the scene."""
     missing: Missing = "error"
@@ -74,6 +77,8 @@ class Surface(Command):
     """A material that shows the texture as it is, without lights."""
     image: Image = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
+    collision: Collider = None
+    """(.glb, USD) A static collider for engines, which is drawn, too, or not. Default: none."""
     scale: Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
     no_preview: bool = False
@@ -93,50 +98,56 @@ class Surface(Command):
         from meshsplats.images.writing import save_image
         from meshsplats.rendering.previews import preview_camera
         from meshsplats.surfaces import draw_surface
-        from meshsplats.surfaces.fusion import libraries
-        from meshsplats.surfaces.making import surface_from
+        from meshsplats.surfaces.making import surfaces_from
         from meshsplats.surfaces.views import place_of, sources_of
 
         start = time.perf_counter()
         options = self._checked()
         preview, config = beside(self.output, PREVIEW), beside(self.output, CONFIGURATION)
-        more = companions(self.output, self.image) if options.texture else []
-        outputs = [self.output, *more, config, *([] if self.no_preview else [preview])]
+        meshes, textured = files.level_files(self.output, self.levels), self.collision != "only"
+        more = [p for m in meshes for p in files.companions(m, self.image) if options.texture and textured]
+        outputs = [*meshes, *more, config, *([] if self.no_preview else [preview])]
         check_outputs(outputs, self.force, inputs=[self.input])
         scene = load_scene(self.input, self.reading)
         origin = scene.origin
-        libraries()  # fails early
         data = None if self.data is None else load_dataset(self.data, missing=self.missing, origin=origin)
         cameras = None if self.cameras is None else load_cameras(self.cameras, origin=origin)
         sources = sources_of(scene, data, cameras, options, self.threads)
         with progress_display() as display:
-            base = surface_from(
+            bases = surfaces_from(
                 scene,
                 sources,
                 options,
+                self.levels,
                 threads=self.threads,
                 progress=lambda name, done, total: display.phase(name, done / total),
             )
-        result = written(scaled(base, self.scale), self.origin)
+        how: dict[str, Any] = {"unlit": self.unlit, "image": self.image, "collision": self.collision}
         with together():
-            save_base(result, self.output, unlit=self.unlit, image=self.image)
+            for base, path in zip(bases, meshes, strict=True):
+                files.save_base(written(scaled(base, self.scale), self.origin), path, **how)
             write_configuration(config, "surface", self)
             if not self.no_preview:
                 camera = preview_camera(scene)
                 if place := place_of(scene, sources):
                     say(f"{place.in_words()}: seen from views that were found")
                     camera = place.cameras[0].within(camera.width)
-                save_image(preview, draw_surface(base, camera, threads=self.threads))
-        seconds, count = time.perf_counter() - start, len(base.faces)
+                save_image(preview, draw_surface(bases[0], camera, threads=self.threads))
+        seconds, made = time.perf_counter() - start, list(zip(meshes, bases, strict=True))
         if self.json:
-            found = {"mesh": str(self.output), "triangles": count, "bytes": self.output.stat().st_size}
-            print(json.dumps(found | {"seconds": round(seconds, 2)}, indent=1))
+            rows = [
+                {"mesh": str(path), "triangles": len(base.faces), "bytes": path.stat().st_size}
+                for path, base in made
+            ]
+            print(json.dumps(rows[0] | {"levels": rows[1:], "seconds": round(seconds, 2)}, indent=1))
             return
-        look = f"a texture of {options.texture} texels" if base.textures else "colours of vertices"
-        print(f"{self.output} ({count:,} triangles, {look}, {size_of(self.output)}) in {seconds:.1f} s")
+        for path, base in made:
+            look = f"{len(base.textures[0].pixels)} texels" if base.textures else "colours of vertices"
+            print(f"{path} ({len(base.faces):,} triangles, {look}, {size_of(path)})")
+        print(f"in {seconds:.1f} s")
         if not self.no_preview:
             print(f"preview: {preview}")
-        if self.output.suffix.lower() not in (*PRINTED, ".usdz"):
+        if self.output.suffix.lower() not in (*files.PRINTED, ".usdz"):
             splats = ["--splats", str(self.input), *self.reading.again()]
             source = ["--data", "photos/"] if isinstance(scene, SplatMesh) else splats
             print(f"next: {command_line(['meshsplats', 'prior', self.output, *source, '-o', 'prior.npz'])}")
@@ -147,12 +158,13 @@ class Surface(Command):
     def _checked(self) -> SurfaceOptions:
         """The options of the library; UsageError or ValueError where they are wrong."""
         suffix = self.output.suffix.lower()
-        if suffix not in BASE_SUFFIXES:
-            raise UsageError(f"-o must end in {', '.join(BASE_SUFFIXES)}, got {self.output.name!r}")
-        if suffix in PRINTED and self.surface.shape == "open":
+        if suffix not in files.BASE_SUFFIXES:
+            raise UsageError(f"-o must end in {', '.join(files.BASE_SUFFIXES)}, got {self.output.name!r}")
+        files.check_writing(self.output, unlit=self.unlit, image=self.image, collision=self.collision)
+        if suffix in files.PRINTED and self.surface.shape == "open":
             raise UsageError(f"{suffix} is for printing, which wants a solid: --shape closed")
         check_data(self.data, self.missing, self.cameras)
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise UsageError(f"--scale must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}
-        return SurfaceOptions(**given).checked()
+        return level_options(SurfaceOptions(**given), self.levels)[0]

@@ -29,6 +29,8 @@ from meshsplats.mesh import SplatMesh
 
 TextureImage = Literal["png", "jpg", "webp"]
 """Kinds of image files of textures."""
+Collision = Literal["drawn", "only"]
+"""Whether a surface that things collide with is drawn, too."""
 _BESIDE = (".obj", ".ply", ".usdc", ".usda", ".usd")
 """Formats whose texture is a file of its own."""
 _SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
@@ -95,7 +97,12 @@ def load_base(
 
 
 def save_base(
-    base: BaseMesh, path: str | os.PathLike[str], *, unlit: bool = False, image: TextureImage | None = None
+    base: BaseMesh,
+    path: str | os.PathLike[str],
+    *,
+    unlit: bool = False,
+    image: TextureImage | None = None,
+    collision: Collision | None = None,
 ) -> None:
     """Writes a surface, opaque, with its texture or else its vertex colours, whole or not at all.
 
@@ -113,6 +120,10 @@ def save_base(
         unlit: (`.glb`, USD) a material that shows the texture as it is, without lights.
         image: how the texture is stored; by default as PNG, or where that takes more than a megabyte, not in
             USD, as JPEG of quality 95. WebP keeps every byte, but not all programs read it in `.glb`.
+        collision: (`.glb`, USD) marks the surface as a static collider. In `.glb` its name ends in ``-col``
+            or ``-colonly``, by which Godot imports one; USD: UsdPhysics' CollisionAPI and MeshCollisionAPI.
+            ``drawn``: it is drawn, too. ``only``: Godot and renderers of USD (purpose 'guide') leave it out,
+            and it has neither texture nor colours.
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, or has
@@ -124,13 +135,9 @@ def save_base(
     need_path(path=path)
     target = Path(path)
     suffix = target.suffix.lower()
-    if suffix not in BASE_SUFFIXES:
-        known = ", ".join(BASE_SUFFIXES)
-        raise ValueError(f"{target.name!r} does not name a format; choose a name that ends in {known}")
-    if unlit and suffix not in _SHADED:
-        raise ValueError(f"unlit applies to {', '.join(_SHADED)} only, not to {suffix}")
-    if image is not None and image not in get_args(TextureImage):
-        raise ValueError(f"image must be one of {', '.join(get_args(TextureImage))}, got {image!r}")
+    check_writing(target, unlit=unlit, image=image, collision=collision)
+    if collision == "only":
+        base = BaseMesh(base.vertices, base.faces, up=base.up, origin=base.origin)
     if image is not None and (suffix == ".npz" or suffix in PRINTED or not base.textured):
         raise ValueError(f"image is for surfaces with a texture, and formats that keep it, not for {suffix}")
     if not len(base.faces):
@@ -139,7 +146,7 @@ def save_base(
         raise ValueError(f"a surface has one texture on all faces, this mesh has {len(base.textures)}")
     own = None if image is None else f".{image}"
     writers: dict[str, Callable[[Path], None]] = {
-        ".glb": lambda to: write_surface_glb(base, to, unlit=unlit, image=own),
+        ".glb": lambda to: write_surface_glb(base, to, unlit=unlit, image=own, collision=collision),
         ".obj": lambda to: write_surface_obj(base, to, target, own),
         ".ply": lambda to: write_surface_ply(base, to, target, own),
         ".npz": lambda to: write_npz(plain_mesh(base), to),
@@ -148,10 +155,38 @@ def save_base(
     }
 
     def usd(to: Path) -> None:
-        write_surface_usd(base, to, target, unlit=unlit, image=own)
+        write_surface_usd(base, to, target, unlit=unlit, image=own, collision=collision)
 
     with together(), atomic_path(target) as temporary:
         writers.get(suffix, usd)(temporary)
+
+
+def check_writing(
+    target: Path,
+    *,
+    unlit: bool = False,
+    image: TextureImage | None = None,
+    collision: Collision | None = None,
+) -> None:
+    """ValueError where the format of ``target`` is unknown or does not have one of the options of
+    ``save_base``."""
+    suffix = target.suffix.lower()
+    if suffix not in BASE_SUFFIXES:
+        known = ", ".join(BASE_SUFFIXES)
+        raise ValueError(f"{target.name!r} does not name a format; choose a name that ends in {known}")
+    if unlit and suffix not in _SHADED:
+        raise ValueError(f"unlit applies to {', '.join(_SHADED)} only, not to {suffix}")
+    if image is not None and image not in get_args(TextureImage):
+        raise ValueError(f"image must be one of {', '.join(get_args(TextureImage))}, got {image!r}")
+    if collision is not None and collision not in get_args(Collision):
+        raise ValueError(f"collision must be one of {', '.join(get_args(Collision))}, got {collision!r}")
+    if collision is not None and suffix not in _SHADED:
+        raise ValueError(f"collision applies to {', '.join(_SHADED)} only, not to {suffix}")
+
+
+def level_files(path: Path, count: int) -> list[Path]:
+    """The files of ``count`` levels of detail, the first of which is ``path``."""
+    return [path, *(path.with_name(f"{path.stem}_lod{k}{path.suffix}") for k in range(1, count))]
 
 
 def companions(path: Path, image: TextureImage | None = None) -> list[Path]:

@@ -15,6 +15,9 @@ from meshsplats.surfaces.images import Surface, SurfaceImage
 
 BETAS = 0.9, 0.99
 """Decay of the means of the vertices' gradients and of their squares."""
+SMALL = 0.1
+"""Gradients of vertices, relative to the largest, from which steps have their whole length: smaller ones are
+noise, as those of vertices that hardly any view shows."""
 RELAXATION = 0.5, 0.1
 """Share of the error of a view that its texels take over, at the beginning and at the end."""
 DOUBT = 0.25
@@ -32,8 +35,11 @@ _SEED = 7
 
 class SmoothSteps:
     """Adam on vertices, in coordinates in which smooth motions are short (Nicolet and others 2021, Large
-    Steps in Inverse Rendering of Geometry): u = (1 + stiffness L) x with the combinatorial Laplacian L, and
-    one second moment for all coordinates."""
+    Steps in Inverse Rendering of Geometry): u = (1 + stiffness L) x with the combinatorial Laplacian L.
+
+    Each vertex has one second moment for its three coordinates: steps do not depend on the axes. With one
+    for all vertices, as in the paper, the few at the outlines of large parts move, and the rest hardly.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, stiffness: float) -> None:
         try:
@@ -48,18 +54,21 @@ class SmoothSteps:
         matrix = sparse.identity(count) + stiffness * (sparse.diags(near.sum(axis=1).A1) - near)
         self._solve: Callable[[np.ndarray], np.ndarray] = splu(matrix.tocsc()).solve
         self._place = matrix @ vertices
-        self._mean, self._square, self._count = np.zeros_like(vertices), 0.0, 0
+        self._mean, self._square, self._count = np.zeros_like(vertices), np.zeros((count, 1)), 0
 
     def step(self, gradient: np.ndarray, rate: float) -> np.ndarray:
-        """The vertices (v, 3) float64 after a step down ``gradient`` (v, 3) of about ``rate`` scene units."""
+        """The vertices (v, 3) float64 after a step down ``gradient`` (v, 3), of up to about ``rate`` scene
+        units for each; where gradients are below ``SMALL`` of the largest it is shorter."""
         slope = self._solve(gradient)
         first, second = BETAS
         self._count += 1
         self._mean = first * self._mean + (1 - first) * slope
-        self._square = second * self._square + (1 - second) * float(np.square(slope).sum(axis=1).max())
-        if self._square > 0:
+        self._square = second * self._square + (1 - second) * np.square(slope).sum(axis=1, keepdims=True)
+        largest = float(self._square.max(initial=0))
+        if largest > 0:
             mean = self._mean / (1 - first**self._count)
-            self._place = self._place - rate * mean / np.sqrt(self._square / (1 - second**self._count))
+            size = np.sqrt((self._square + SMALL**2 * largest) / (1 - second**self._count))
+            self._place = self._place - rate * mean / size
         return self._solve(self._place)
 
 

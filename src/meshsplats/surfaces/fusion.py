@@ -15,9 +15,8 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.core_arguments import camera_struct
+from meshsplats.surfaces.options import LEVEL_FACTOR
 
-MAX_RESOLUTION = 512
-"""Maximum number of voxels along the longest side of the grid."""
 TRUNCATION = 3.0
 """Truncation of signed distances, in voxels."""
 _SOLID = 0.5
@@ -126,6 +125,17 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     if 0 < faces < len(triangles):
         vertices, triangles = simplify(vertices, triangles, target_count=faces)
     return vertices.astype(np.float64), triangles.astype(np.int32)
+
+
+def coarser(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh, (n, 3) vertices and (m, 3) triangles, with about a quarter of its triangles."""
+    simplify = libraries()[2]
+    points, triangles = simplify(
+        vertices.astype(np.float32),
+        faces.astype(np.int32),
+        target_count=max(4, len(faces) // LEVEL_FACTOR**2),
+    )
+    return points.astype(np.float64), triangles.astype(np.int32)
 
 
 def large_parts(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

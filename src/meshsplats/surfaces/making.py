@@ -23,12 +23,12 @@ from meshsplats.rendering import render
 from meshsplats.surfaces.atlas import cells, cells_side, unwrap
 from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors
-from meshsplats.surfaces.fusion import grid_around, isosurface, libraries, signed_distances
+from meshsplats.surfaces.fusion import coarser, grid_around, isosurface, signed_distances
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
 from meshsplats.surfaces.manifold import split_pinches
-from meshsplats.surfaces.options import SurfaceOptions
-from meshsplats.surfaces.views import Sources, smaller, sources_of
+from meshsplats.surfaces.options import SurfaceOptions, level_options
+from meshsplats.surfaces.views import Sources, reduced, smaller, sources_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -90,42 +90,71 @@ def make_surface(
     need(Dataset, data=data, optional=True)
     need_all(Camera, cameras=cameras, optional=True)
     chosen = replace(options or SurfaceOptions(), **changes).checked()
-    libraries()  # fails early
     if data is not None:
         data = data.relative_to(scene.origin)
     sources = sources_of(scene, data, cameras, chosen, threads)
-    return surface_from(scene, sources, chosen, threads=threads, progress=progress)
+    return surfaces_from(scene, sources, chosen, threads=threads, progress=progress)[0]
 
 
-def surface_from(
+def surfaces_from(
     scene: GaussianCloud | SplatMesh,
     sources: Sources,
     chosen: SurfaceOptions,
+    count: int = 1,
     *,
     threads: int | None = None,
     progress: ProgressOf | None = None,
-) -> BaseMesh:
-    """``make_surface`` from these cameras and images."""
+) -> list[BaseMesh]:
+    """``count`` surfaces from these cameras and images: that of ``make_surface``, and of each the next, with
+    a quarter of its triangles, and half the sides of its texture and of its images.
+
+    Raises ValueError as ``make_surface``, and for more levels than triangles, texels or pixels allow.
+    """
+    levels = level_options(chosen, count)
     said = progress or (lambda *_: None)
     vertices, faces = _fused(scene, sources, chosen, threads, said)
+    result = []
+    for number, level in enumerate(levels):
+        if number:
+            vertices, faces = coarser(vertices, faces)
+        views = tuple(reduced(view, level.size) for view in sources.views)
+        base, vertices = _surface_of(
+            scene, vertices, faces, replace(sources, views=views), level, threads, said
+        )
+        result.append(base)
+    return result
+
+
+def _surface_of(
+    scene: GaussianCloud | SplatMesh,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    sources: Sources,
+    chosen: SurfaceOptions,
+    threads: int | None,
+    progress: ProgressOf,
+) -> tuple[BaseMesh, np.ndarray]:
+    """The surface of these triangles with their texture, and where fitting put the vertices."""
     surface = Surface(vertices, faces, *_blank_texture(vertices, faces, chosen.texture))
     if chosen.texture or chosen.rounds:
-        surface = _fitted(surface, sources, chosen, threads, said)
+        surface = _fitted(surface, sources, chosen, threads, progress)
+    fitted = surface.vertices
     if sources.closed:
         sheets = split_pinches(surface.vertices, faces, surface.uv)
         faces = sheets.faces
         surface = surface._replace(vertices=sheets.vertices, uv=sheets.corners.astype(np.float32))
     base = BaseMesh(surface.vertices.astype(np.float32), faces, up=guess_up(scene), origin=scene.origin)
     if not chosen.texture:
-        return replace(base, colors=_vertex_colors(base, sources.views, threads))
+        return replace(base, colors=_vertex_colors(base, sources.views, threads)), fitted
     pixels = np.full((*surface.texels.shape[:2], 4), 255, np.uint8)
     pixels[..., :3] = np.rint(255 * surface.texels)
-    return replace(
+    textured = replace(
         base,
         uv=surface.uv,
         face_texture=np.zeros(len(faces), np.int32),
         textures=(Texture(pixels, ("clamp", "clamp")),),
     )
+    return textured, fitted
 
 
 def _blank_texture(vertices: np.ndarray, faces: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:

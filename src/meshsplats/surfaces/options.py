@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypedDict
 
 from meshsplats._options import Advanced, Range, With, check_options
-from meshsplats.surfaces.fusion import MAX_RESOLUTION
 
 Shape = Literal["auto", "closed", "open"]
 
+MAX_RESOLUTION = 512
+"""Maximum number of voxels along the longest side of the grid."""
+LEVEL_FACTOR = 2
+"""Sides of the textures and of the images of each level of detail, relative to the next; of triangles the
+square."""
 MAX_TEXTURE = 8192
 """Largest side of a texture."""
 
@@ -37,7 +41,7 @@ class SurfaceOptions:
     mean colours of the images."""
     sh_degree: Annotated[int | None, Range(0, 4), Advanced] = None
     """Largest degree of the splats' view-dependent colour in the images; None: all."""
-    move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 1.5
+    move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 0.5
     """Step of the vertices, relative to the length of an edge."""
     stiffness: Annotated[float, Range(0, 1000), With("rounds"), Advanced] = 2.0
     """How far a vertex takes its neighbours along: the weight of the Laplacian."""
@@ -50,6 +54,31 @@ class SurfaceOptions:
         if 0 < self.texture < 64:
             raise ValueError(f"texture must be 64 texels or more, or 0 for none, got {self.texture}")
         return self
+
+
+def level_options(options: SurfaceOptions, count: int) -> list[SurfaceOptions]:
+    """The options of ``count`` levels of detail, from the finest on; ``faces`` of 0 stay, as each level has a
+    quarter of the triangles of the one before. ValueError for levels that are too small, or none."""
+    if count < 1:
+        raise ValueError(f"levels must be 1 or more, got {count}")
+    levels = [
+        replace(
+            options,
+            faces=options.faces // LEVEL_FACTOR ** (2 * k),
+            texture=options.texture // LEVEL_FACTOR**k,
+            size=options.size // LEVEL_FACTOR**k,
+        )
+        for k in range(count)
+    ]
+    least = levels[-1]
+    try:
+        for level in levels:
+            level.checked()
+        if not (least.faces or not options.faces) or not (least.texture or not options.texture):
+            raise ValueError("nothing is left")
+    except ValueError as error:
+        raise ValueError(f"fewer than {count} levels: the coarsest would be too small: {error}") from error
+    return levels
 
 
 class SurfaceChanges(TypedDict, total=False):

@@ -17,6 +17,7 @@ from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.surfaces.fusion import libraries
 from meshsplats.surfaces.images import SAMPLES
 from meshsplats.surfaces.options import SurfaceOptions
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
@@ -46,8 +47,10 @@ def sources_of(
     """The cameras and images for a surface of ``scene``: of an object on all sides of it, else where data
     sets of splats have theirs.
 
-    Raises ValueError for too few cameras.
+    Raises ValueError for too few cameras, and MissingDependencyError without the extra ``base``, before the
+    work.
     """
+    libraries()
     side, shape, own = options.size, options.shape, cameras is None and data is None
     given = None if cameras is None else [camera.within(side) for camera in cameras]
     photos = None if data is None else [reduced(view, side) for view in data.train]

@@ -20,7 +20,13 @@ _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987
 _WEBP = "EXT_texture_webp"
 
 
-def write_surface_glb(base: BaseMesh, path: Path, *, unlit: bool, image: str | None) -> None:
+_NAMES = {None: "surface", "drawn": "surface-col", "only": "surface-colonly"}
+"""By the suffixes Godot makes a collider; with the second it leaves out the mesh."""
+
+
+def write_surface_glb(
+    base: BaseMesh, path: Path, *, unlit: bool, image: str | None, collision: str | None = None
+) -> None:
     """Writes ``base`` to ``path``: see ``save_base``."""
     from meshsplats import __version__
 
@@ -63,7 +69,8 @@ def write_surface_glb(base: BaseMesh, path: Path, *, unlit: bool, image: str | N
         material["extensions"] = {"KHR_materials_unlit": {}}
         used.append("KHR_materials_unlit")
     note = {"version": 1, "blending": "display", "up": [float(u) for u in base.up]}
-    node: dict[str, Any] = {"name": "surface", "mesh": 0, "rotation": up_quaternion(base.up)}
+    name = _NAMES[collision]
+    node: dict[str, Any] = {"name": name, "mesh": 0, "rotation": up_quaternion(base.up)}
     if base.origin.any():
         note["origin"] = base.origin.tolist()
         node["translation"] = turned_origin(base).tolist()
@@ -73,7 +80,7 @@ def write_surface_glb(base: BaseMesh, path: Path, *, unlit: bool, image: str | N
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"name": "surface", "primitives": [primitive], "extras": {"meshsplats": note}}],
+        "meshes": [{"name": name, "primitives": [primitive], "extras": {"meshsplats": note}}],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": buffer.length}],

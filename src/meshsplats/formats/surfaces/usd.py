@@ -15,10 +15,12 @@ from meshsplats.errors import MissingDependencyError
 from meshsplats.formats.surfaces.corners import smooth_normals, texture_file
 from meshsplats.formats.usd.materials import preview_material, primvar_reader, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed
-from meshsplats.formats.usd.stage import placed_mesh
+from meshsplats.formats.usd.stage import make_collider, placed_mesh
 
 
-def write_surface_usd(base: BaseMesh, path: Path, target: Path, *, unlit: bool, image: str | None) -> None:
+def write_surface_usd(
+    base: BaseMesh, path: Path, target: Path, *, unlit: bool, image: str | None, collision: str | None = None
+) -> None:
     """Writes ``base`` to ``path``, which will be ``target``: see ``save_base``."""
     try:
         import pxr  # noqa: F401
@@ -29,23 +31,25 @@ def write_surface_usd(base: BaseMesh, path: Path, target: Path, *, unlit: bool, 
     if target.suffix.lower() != ".usdz":
         if picture is not None:
             write_bytes(picture, content)
-        export(_stage(base, unlit, picture.name if picture else None), path)
+        export(_stage(base, unlit, picture.name if picture else None, collision), path)
         return
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".meshsplats-") as folder:
         inner = Path(folder) / "surface.usdc"
         if picture is not None:
             inner.with_suffix(suffix).write_bytes(content)
-        export(_stage(base, unlit, f"surface{suffix}" if picture else None), inner)
+        export(_stage(base, unlit, f"surface{suffix}" if picture else None, collision), inner)
         packed(inner, path)
 
 
-def _stage(base: BaseMesh, unlit: bool, picture: str | None) -> Any:
+def _stage(base: BaseMesh, unlit: bool, picture: str | None, collision: str | None) -> Any:
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
     types, at = Sdf.ValueTypeNames, "/Splats/Material"
     stage, shape = placed_mesh(base, "Surface", double_sided=False)
     shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(smooth_normals(base)))
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    if collision is not None:
+        make_collider(shape, drawn=collision == "drawn")
     if picture is not None and base.uv is not None:
         uv = base.uv.copy()
         uv[..., 1] = 1 - uv[..., 1]  # USD's v is up

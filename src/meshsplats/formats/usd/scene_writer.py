@@ -19,7 +19,7 @@ from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.scene_writer import alpha_mode, png_of
 from meshsplats.formats.usd.materials import preview_material, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed, splats_stage
-from meshsplats.formats.usd.stage import new_stage, placed_mesh
+from meshsplats.formats.usd.stage import make_collider, new_stage, placed_mesh
 from meshsplats.formats.usd.writer import mesh_stage
 
 
@@ -60,12 +60,8 @@ def write_scene_usd(parts: SceneParts, path: Path, where: Path, *, lit: bool) ->
 
 
 def _collider_stage(collider: BaseMesh) -> Any:
-    from pxr import UsdGeom, UsdPhysics
-
     stage, shape = placed_mesh(collider)
-    shape.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
-    UsdPhysics.MeshCollisionAPI.Apply(shape.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
+    make_collider(shape, drawn=False)
     return stage
 
 

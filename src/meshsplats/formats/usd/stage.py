@@ -48,3 +48,13 @@ def placed_mesh(
         corners = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
         shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
     return stage, shape
+
+
+def make_collider(shape: Any, *, drawn: bool) -> None:
+    """Makes a UsdGeom.Mesh a static collider of its triangles; unless ``drawn``, renderers leave it out."""
+    from pxr import UsdGeom, UsdPhysics
+
+    UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
+    UsdPhysics.MeshCollisionAPI.Apply(shape.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
+    if not drawn:
+        shape.CreatePurposeAttr(UsdGeom.Tokens.guide)
