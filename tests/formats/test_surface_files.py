@@ -163,9 +163,7 @@ def test_materials(tmp_path, unlit):
 )
 def test_godot_knows_colliders_by_their_names(tmp_path, collision, suffix):
     save_base(tetrahedron(), tmp_path / "a.glb", collision=collision)
-    data = (tmp_path / "a.glb").read_bytes()
-    (length,) = struct.unpack_from("<I", data, 12)
-    document = json.loads(data[20 : 20 + length])
+    document, _ = read_glb(tmp_path / "a.glb")
     assert [document["nodes"][0]["name"], document["meshes"][0]["name"]] == [suffix, suffix]
     base, again = tetrahedron(), load_base(tmp_path / "a.glb")
     np.testing.assert_array_equal(again.vertices[again.faces], base.vertices[base.faces])
