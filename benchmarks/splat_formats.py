@@ -100,7 +100,10 @@ def row(
     other = source.with_name(f"theirs.{ending}")
     program = node / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     words = ["node", program, "-q", "-w", "-g", "cpu", *theirs, source, other]
-    used = run(words, stderr=subprocess.DEVNULL)
+    try:
+        used = run(words, stderr=subprocess.DEVNULL)
+    except subprocess.CalledProcessError:  # two scales a splat, for example
+        return [*cells, "fails", "", "", ""]
     size = other.stat().st_size
     cells += [f"{size / count:.2f}", loss(other, cameras, truths), f"{used.processor:.2f}"]
     return [*cells, f"{own.stat().st_size / size:.3f}"]

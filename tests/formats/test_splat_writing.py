@@ -509,3 +509,15 @@ def test_the_nearest_turn_of_a_cube_is_that_of_the_largest_product():
     products = np.abs(turns @ q.T)
     found = products[_quantising._nearest_turn(q, turns), np.arange(len(q))]
     np.testing.assert_allclose(found, products.max(axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".sog", ".compressed.ply"])
+def test_flat_splats_stay_flat(tmp_path, suffix):
+    """The axis without extent is the third one, whose scale readers of '2dgs' drop."""
+    cloud = cloud_of(500, degree=0)
+    flat = replace(cloud, kernel="2dgs", scales=cloud.scales * np.array([1, 1, 0], np.float32))
+    back = paired(flat, written(flat, tmp_path / f"a{suffix}"))
+    assert back.kernel == "2dgs"
+    assert not back.scales[:, 2].any()
+    size = np.square(flat.scales).max(axis=1)[:, None, None]
+    np.testing.assert_allclose(covariances(back) / size, covariances(flat) / size, atol=0.1)

@@ -3,7 +3,8 @@
 Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. Attributes are float and
 activated, in the axes that other writers of splats use: x left, y up, z forward. A node turns the cloud's
 ``up`` to +y and puts it at its ``origin``; the mesh's ``extras.meshsplats`` name both, too. COLOR_0 is for
-viewers that know points only. What compresses splats in glTF (SPZ) is a draft, so it is read, not written.
+viewers that know points only. What compresses splats in glTF (SPZ) is a draft, which only tiles use
+(``splat_tiles.py``).
 """
 
 from __future__ import annotations

@@ -24,7 +24,8 @@ _LEAST_LOG, _MOST_LOG = -20.0, 20.0
 def write_compressed_ply(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     """Writes ``cloud``; see ``save_gaussians``."""
     cloud = cloud.take(sorted_in_space(cloud.means))
-    quaternions, scales = nearest_axes(cloud.quaternions, cloud.scales)
+    flat = cloud.kernel == "2dgs"
+    quaternions, scales = nearest_axes(cloud.quaternions, cloud.scales, third_stays=flat)
     logs = np.clip(log_scales(scales), _LEAST_LOG, _MOST_LOG)
     colors = np.float32(0.5) + np.float32(SH_C0) * cloud.sh[:, 0]
     ranges, words = [], np.empty((len(cloud), 4), "<u4")
@@ -51,6 +52,8 @@ def write_compressed_ply(cloud: GaussianCloud, path: Path, writing: Writing) -> 
 def _header(cloud: GaussianCloud, chunks: int) -> list[str]:
     lines = ["ply", "format binary_little_endian 1.0", *origin_comments(cloud.origin)]
     lines += note_comments(cloud.kernel, cloud.up)
+    if cloud.kernel == "2dgs":  # as Brush writes it: there are three scales all the same
+        lines.append("comment SplatRenderMode: 2dgs")
     lines.append(f"element chunk {chunks}")
     for group in ("", "scale_"):
         lines += [f"property float {end}_{group}{axis}" for end in ("min", "max") for axis in "xyz"]

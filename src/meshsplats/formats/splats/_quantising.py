@@ -38,20 +38,27 @@ def order_for_streams(points: np.ndarray, shapes: np.ndarray) -> np.ndarray | sl
     return slice(None) if 4 * int(repeats.sum()) > len(shapes) else sorted_in_space(points)
 
 
-def nearest_axes(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_axes(
+    quaternions: np.ndarray, scales: np.ndarray, *, third_stays: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """The same ellipsoids by their smallest rotations: (n, 4) quaternions, (n, 3) scales.
 
     A Gaussian does not change when its axes change signs and places. Of the 24 rotations that name it, the
     one nearest to none has a w above 0.85 and the others below 0.39: w, the largest, can be left out, and the
-    others take fewer bits.
+    others take fewer bits. ``third_stays``: the third axis keeps its place, for flat splats (kernel '2dgs'),
+    whose third scale readers drop. The nearest of the 8 rotations that do so has a w above 0.65 and the
+    others below sqrt(1/2).
     """
     turns, places = _cube()
     conjugates = (turns * np.array([1, -1, -1, -1], np.float32)).T
+    allowed = np.flatnonzero(places[:, 2] == 2)
     turned, moved = np.empty_like(quaternions), np.empty_like(scales)
     for start in range(0, len(quaternions), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
         q = quaternions[part]
-        best = _nearest_turn(q, turns)
+        best = (
+            allowed[np.abs(turns[allowed] @ q.T).argmax(axis=0)] if third_stays else _nearest_turn(q, turns)
+        )
         (aw, ax, ay, az), (bw, bx, by, bz) = np.ascontiguousarray(q.T), conjugates[:, best]
         w = aw * bw - ax * bx - ay * by - az * bz
         sign = np.where(w < 0, np.float32(-1), np.float32(1))

@@ -43,7 +43,8 @@ def write_sog(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     images: dict[str, bytes] = {}
     meta = _meta(cloud)
     meta["means"] = _means(cloud, images)
-    quaternions, scales = nearest_axes(cloud.quaternions, cloud.scales)
+    flat = cloud.kernel == "2dgs"
+    quaternions, scales = nearest_axes(cloud.quaternions, cloud.scales, third_stays=flat)
     importance = _importance(cloud)
     weights = np.repeat(importance, 3)
     logs = log_scales(scales)
