@@ -89,7 +89,9 @@ def test_they_are_left_out_unless_asked_for(splats, tileset, tmp_path, capsys):
     words = ["tiles", str(splats), "-o", str(tmp_path / "v"), "--max-triangles", "4096", "--alpha", "mask"]
     assert main([*words, "--colors", "view"]) == 0
     assert digest(tmp_path / "v") == digest(tileset)
-    assert main([*words, "--color-degree", "1", "--force"]) == 1
+    assert main([*words, "--color-degree", "1", "--force"]) == 0  # a degree asks for them, too
+    assert digest(tmp_path / "v") == digest(tileset)
+    assert main([*words, "--colors", "base", "--color-degree", "1", "--force"]) == 1
     assert "color_degree has no effect without colors 'view'" in capsys.readouterr().err
 
 
