@@ -78,6 +78,10 @@ def drawing(tmp_path_factory, node_package):
         def log_message(self, *args):
             pass
 
+        def end_headers(self):
+            self.send_header("Cache-Control", "no-store")  # two meshes of one second have one date
+            super().end_headers()
+
     server = http.server.ThreadingHTTPServer(
         ("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))
     )
