@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import DataWarning, FileFormatError, GaussianCloud, load_gaussians, save_gaussians
+from meshsplats.spherical_harmonics import sh_basis
 
 ENCODINGS = ["ascii", "binary_little_endian", "binary_big_endian"]
 FACES = Table("face", [("uchar", "int", "vertex_indices")], [[[0, 1, 2]], [[0, 1, 2, 3]], [[]], [[4, 5, 6]]])
@@ -375,18 +377,83 @@ def test_zero_padded_harmonics_change_nothing():
     np.testing.assert_allclose(padded.opacities, short.opacities, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
-        (("sb_params_0", "sb_params_5"), r"Beta splats: colours .* \(sb_params_\*\) are left out"),
-        (("beta",), r"Beta splats: kernels other than Gaussians \(beta\) are left out"),
-    ],
-)
-def test_columns_of_beta_splats_are_named(tmp_path, columns, message):
+def test_kernels_of_beta_splats_are_named(tmp_path):
     values = random_splats(5, degree=0)
     plain = write_ply(tmp_path / "a.ply", [splat_table(values)])
-    beta = write_ply(tmp_path / "b.ply", [splat_table(values | {name: values["x"] for name in columns})])
+    beta = write_ply(tmp_path / "b.ply", [splat_table(values | {"beta": values["x"]})])
     expected = load_gaussians(plain)
-    with pytest.warns(DataWarning, match=message):
+    with pytest.warns(DataWarning, match=r"Beta splats: kernels other than Gaussians \(beta\) are left out"):
         cloud = load_gaussians(beta)
     np.testing.assert_array_equal(cloud.sh, expected.sh)
+
+
+def lobes(count: int, each: int) -> np.ndarray:
+    """(count, 6, each) red, green, blue, theta, phi and beta of lobes, as files have them."""
+    rng = np.random.default_rng(each)
+    stored = rng.uniform(-0.4, 0.6, (count, 6, each))
+    stored[:, 3], stored[:, 4] = rng.uniform(0, np.pi, (2, count, each)) * np.array([1, 2])[:, None, None]
+    stored[:, 5] = rng.uniform(-1, 2, (count, each))
+    return stored.astype(np.float32)
+
+
+def with_lobes(values: dict[str, np.ndarray], stored: np.ndarray) -> dict[str, np.ndarray]:
+    flat = stored.reshape(len(stored), -1)
+    return values | {f"sb_params_{i}": flat[:, i] for i in range(flat.shape[1])}
+
+
+@pytest.mark.parametrize("each", [1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_lobes_of_beta_splats_become_the_nearest_harmonics(tmp_path, each, degree):
+    values, stored = random_splats(6, degree=degree), lobes(6, each)
+    plain = load_gaussians(write_ply(tmp_path / "a.ply", [splat_table(values)]))
+    path = write_ply(tmp_path / "b.ply", [splat_table(with_lobes(values, stored))])
+    with pytest.warns(DataWarning, match=r"lobes \(sb_params_\*\) become harmonics of degree 3"):
+        cloud = load_gaussians(path)
+    assert cloud.sh_degree == 3
+    # Their formula, in directions that cover the sphere evenly; products with each harmonic.
+    i = np.arange(100_000) + 0.5
+    z, turn = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    around = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+    basis = 4 * np.pi / len(i) * sh_basis(around, 3)
+    for n in range(6):
+        seen = np.zeros((len(i), 3))
+        for red, green, blue, theta, phi, beta in stored[n].T.astype(float):
+            u = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+            color = np.log1p(2 ** (10 * np.array([red, green, blue]))) / (10 * np.log(2))
+            seen += np.maximum(around @ u, 0)[:, None] ** (4 * np.exp(beta)) * color
+        expected = basis.T @ seen
+        expected[: plain.sh.shape[1]] += plain.sh[n]
+        np.testing.assert_allclose(cloud.sh[n], expected, atol=2e-4)
+
+
+def test_beta_splats_by_their_own_names(tmp_path):
+    """Those of the code of the paper; others write f_dc and f_rest."""
+    values = with_lobes(random_splats(6, degree=2), lobes(6, 2))
+    renamed = {n.replace("f_dc_", "sh0_").replace("f_rest_", "shN_"): v for n, v in values.items()}
+    one, other = (write_ply(tmp_path / f"{k}.ply", [splat_table(v)]) for k, v in enumerate((values, renamed)))
+    with pytest.warns(DataWarning):
+        np.testing.assert_array_equal(load_gaussians(one).sh, load_gaussians(other).sh)
+
+
+def test_lobes_without_end_cost_their_splats_only(tmp_path):
+    """A narrow lobe is none; without a direction or a colour there is no splat."""
+    values, stored = random_splats(4, degree=0), lobes(4, 1)
+    stored[0, 5], stored[1, 3], stored[2, 0] = 300, np.nan, np.inf
+    plain = load_gaussians(write_ply(tmp_path / "a.ply", [splat_table(values)]))
+    path = write_ply(tmp_path / "b.ply", [splat_table(with_lobes(values, stored))])
+    with pytest.warns(DataWarning) as told:
+        cloud = load_gaussians(path)
+    assert [bool(re.search("2 of 4 splats", str(each.message))) for each in told] == [False, True]
+    np.testing.assert_array_equal(cloud.means, plain.means[[0, 3]])
+    np.testing.assert_array_equal(cloud.sh[0, 1:], 0)
+
+
+@pytest.mark.parametrize("names", [range(5), range(1, 7), (0, 1, 2, 3, 4, 6)], ids=str)
+def test_lobes_of_beta_splats_are_whole(tmp_path, names):
+    values = random_splats(5, degree=0)
+    wrong = values | {f"sb_params_{i}": values["x"] for i in names}
+    with pytest.raises(
+        FileFormatError, match=r"found \d sb_params_\* properties up to \d; .* 6 for each lobe"
+    ):
+        load_gaussians(write_ply(tmp_path / "a.ply", [splat_table(wrong)]))

@@ -3,7 +3,8 @@
 Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest_*`` (spherical harmonics,
 channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
 length). 2DGS files have two scales; the third axis is flat. Mip-Splatting files have ``filter_3D``, the width
-of a smoothing filter that applies to scales and opacities. Properties are found by name. What comments and
+of a smoothing filter that applies to scales and opacities. Deformable Beta Splatting is in ``beta.py``.
+Properties are found by name. What comments and
 other elements say is in ``notes.py``, splats that move in ``motion.py``. The comment ``meshsplats origin X Y
 Z`` is ours: positions are relative to that point of the world.
 """
@@ -27,6 +28,7 @@ from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats import _activation
 from meshsplats.formats.content import Content
 from meshsplats.formats.ply.activated import SAMPLE, Activated, harmonics_of, span_of, suspects, warn_of
+from meshsplats.formats.ply.beta import add_lobes, lobe_columns, warn_of_beta
 from meshsplats.formats.ply.compressed_splats import is_compressed_splat
 from meshsplats.formats.ply.header import Element, PlyHeader, origin_comments, origin_of_comments
 from meshsplats.formats.ply.motion import Motion, motion_of
@@ -39,6 +41,8 @@ from meshsplats.gaussians import GaussianCloud, Kernel
 
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SH0 = ("sh0_0", "sh0_1", "sh0_2")
+"""``_DC`` of Deformable Beta Splatting, whose f_rest are shN."""
 _RGB = ("red", "green", "blue")
 _FILTER = "filter_3D"
 _REST_COUNTS = {0: 1, 9: 4, 24: 9, 45: 16}
@@ -60,7 +64,8 @@ class _Columns:
                 f"{where}: not splats but {mesh}: element 'vertex' has no opacity, scale_0.., rot_0.."
                 f" properties (it has {_listed(element.names)}); load_mesh reads meshes"
             )
-        self.color = _DC if names.issuperset(_DC) else _RGB
+        self.color = next((known for known in (_DC, _SH0) if names.issuperset(known)), _RGB)
+        start = "shN_" if self.color is _SH0 else "f_rest_"
         if not names.issuperset(self.color):
             missing += [n for n in _DC if n not in names]
         if missing:
@@ -68,20 +73,22 @@ class _Columns:
                 f"{where}: element 'vertex' lacks {', '.join(missing)}, which splats need (it has"
                 f" {_listed(element.names)})"
             )
-        rest = sorted(
-            int(n[7:]) for n in names if n.startswith("f_rest_") and n[7:].isdecimal() and n.isascii()
-        )
+        numbers = (n.removeprefix(start) for n in names if n.startswith(start) and n.isascii())
+        rest = sorted(int(n) for n in numbers if n.isdecimal())
         if len(rest) not in _REST_COUNTS or rest != list(range(len(rest))):
+            last = f" up to {start}{rest[-1]}" if rest else ""
             raise FileFormatError(
-                f"{where}: found {len(rest)} f_rest properties{f' up to f_rest_{rest[-1]}' if rest else ''};"
-                " spherical harmonics of degree 0, 1, 2, 3 have f_rest_0 to f_rest_(n-1) with n = 0, 9, 24,"
-                " 45"
+                f"{where}: found {len(rest)} {start[:-1]} properties{last}; spherical harmonics of degree 0,"
+                f" 1, 2, 3 have {start}0 to {start}(n-1) with n = 0, 9, 24, 45"
             )
-        self.coefficients = _REST_COUNTS[len(rest)]
+        self.stored = _REST_COUNTS[len(rest)]
+        """Coefficients in the file."""
+        self.lobes = lobe_columns(element.names, where)
+        self.coefficients = _REST_COUNTS[45] if self.lobes else self.stored
         self.filter = (_FILTER,) if _FILTER in names else ()
         # Ordered by coefficient, as sh in memory; files are ordered by channel.
-        b = self.coefficients - 1
-        self.sh = (*self.color, *(f"f_rest_{c * b + j}" for j in range(b) for c in range(3)))
+        b = self.stored - 1
+        self.sh = (*self.color, *(f"{start}{c * b + j}" for j in range(b) for c in range(3)))
         self.color_span: np.ndarray | None = None
         if self.color is _RGB:
             kinds = [p.dtype for name in _RGB for p in element.properties if p.name == name]
@@ -93,7 +100,8 @@ class _Columns:
     def needed(self) -> tuple[str, ...]:
         """All properties that are read."""
         moving = self.motion.needed if self.motion else ()
-        return (*POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *self.filter, *moving)
+        lobes = (*self.lobes, *self.filter)
+        return (*POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *lobes, *moving)
 
 
 def is_float_splat(header: PlyHeader) -> bool:
@@ -116,7 +124,7 @@ def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
             f" {_listed([e.name for e in header.elements])})"
         )
     columns = _Columns(element, header, where)
-    _warn_of_beta(element.names, where)
+    warn_of_beta(element.names, where)
     table = FloatTable(file, header, element, columns.needed, where)
     kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
     if len(columns.scale) == 2:
@@ -140,22 +148,6 @@ def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
         linear=is_linear(file, header, where),
         instant=instant,
     )
-
-
-def _warn_of_beta(names: Sequence[str], where: object) -> None:
-    """A DataWarning for columns of Deformable Beta Splatting that change the image and are not read."""
-    told = {
-        "colours that depend on the view (sb_params_*)": any(name.startswith("sb_params_") for name in names),
-        "kernels other than Gaussians (beta)": "beta" in names,
-    }
-    lost = [what for what, there in told.items() if there]
-    if lost:
-        warnings.warn(
-            f"{where}: Beta splats: {' and '.join(lost)} are left out; images are those of Gaussians with the"
-            " colours of f_dc, which were not trained as such",
-            DataWarning,
-            stacklevel=4,
-        )
 
 
 def _motion(content: Content) -> tuple[str, float, float] | None:
@@ -262,7 +254,14 @@ def _fill(chunk: np.ndarray, reading: _Layout, rows: SplatRows) -> None:
 
     take(POSITION, rows.means)
     take(_ROTATION, rows.quaternions)
-    take(columns.sh, rows.sh.reshape(len(chunk), -1))
+    if columns.lobes:
+        rows.sh[:, columns.stored :] = 0
+        rows.sh[:, : columns.stored] = chunk[:, [index[n] for n in columns.sh]].reshape(
+            len(chunk), columns.stored, 3
+        )
+        add_lobes(rows.sh, chunk[:, [index[n] for n in columns.lobes]])
+    else:
+        take(columns.sh, rows.sh.reshape(len(chunk), -1))
     scales, opacities = chunk[:, [index[n] for n in columns.scale]], chunk[:, index["opacity"]]
     reading.sample.add([rows.means, scales, opacities, rows.sh[:, 0]])
     if "scales" in reading.activated:
