@@ -7,13 +7,9 @@
 // view matrix, column by column, from the frame of the tileset, and its vertical angle.
 
 import fs from 'fs';
-import http from 'http';
 import path from 'path';
-import { createRequire } from 'module';
-import { pathToFileURL } from 'url';
+import { home, launchChromium, serve } from './_chromium.mjs';
 
-const require = createRequire(path.join(process.cwd(), 'index.js'));
-const { default: puppeteer } = await import(pathToFileURL(require.resolve('puppeteer-core')).href);
 const [tileset, image, error = '2', range = '2.2'] = process.argv.slice(2);
 const cesium = path.join(process.cwd(), 'node_modules', 'cesium', 'Build', 'Cesium');
 
@@ -55,34 +51,17 @@ window.show = async (error, range) => {
 };
 </script>`;
 
-const TYPES = { '.js': 'text/javascript', '.json': 'application/json', '.css': 'text/css', '.wasm': 'application/wasm' };
-const server = http.createServer((request, response) => {
-  const url = decodeURIComponent(request.url.split('?')[0]);
-  try {
-    if (url === '/') {
-      response.setHeader('content-type', 'text/html');
-      response.end(PAGE);
-      return;
-    }
-    const [, root, ...rest] = url.split('/');
-    const file = path.join({ cesium, tileset }[root], ...rest);
-    response.setHeader('content-type', TYPES[path.extname(file)] ?? 'application/octet-stream');
-    response.end(fs.readFileSync(file));
-  } catch {
-    response.statusCode = 404;
-    response.end();
-  }
-}).listen(0);
-const browser = await puppeteer.launch({
-  executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
-  headless: true,
-  protocolTimeout: 900000,
-  args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
+const server = serve(url => {
+  if (url === '/') return { data: PAGE, name: 'index.html' };
+  const [, root, ...rest] = url.split('/');
+  const name = path.join({ cesium, tileset }[root], ...rest);
+  return { data: fs.readFileSync(name), name };
 });
+const browser = await launchChromium();
 const page = await browser.newPage();
 page.on('pageerror', problem => console.error(String(problem)));
 await page.setViewport({ width: 480, height: 360 });
-await page.goto('http://localhost:' + server.address().port + '/');
+await page.goto(home(server) + '/');
 console.log(JSON.stringify(await page.evaluate((e, r) => window.show(e, r), Number(error), Number(range))));
 await page.screenshot({ path: image });
 await browser.close();

