@@ -106,7 +106,7 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> tuple[str, ..
         for gpu, core in zip(found[1], found[2], strict=True)
     ]
     renderer = gpu_engine().gradients_of(mesh.triangles)
-    steps = [*kernels.list_steps(mesh.order), *kernels.mark_steps(), *kernels.place_steps()]
+    steps = [*kernels.tile_steps(mesh.order), *kernels.mark_steps(), *kernels.place_steps()]
     steps += kernels.gradient_steps(0)
     skipped = ("fans",) * (not mesh.filter_px2) + ("groups",) * (mesh.depth_group is None)
     same = all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))

@@ -46,9 +46,10 @@ ROWS = 32_768
 """Workgroups in each row of a dispatch that is larger than one dimension."""
 
 _MARK_STEPS = {
-    order: (*kernels.list_steps(order), *kernels.mark_steps(), *kernels.place_steps())
+    order: (*kernels.tile_steps(order), *kernels.mark_steps(), *kernels.place_steps())
     for order in get_args(Order)
 }
+"""Of colours that were shaded before: once for all windows, and where they are blended from."""
 _MARK_AGAIN_STEPS = (*kernels.mark_again_steps(), *kernels.place_steps())
 _FILTER_STEPS = tuple(kernels.filter_steps())
 _gradient_steps = functools.lru_cache(maxsize=64)(kernels.gradient_steps)

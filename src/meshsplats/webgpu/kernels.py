@@ -104,13 +104,23 @@ RUN_DIGITS = (0, 1, 2, 3)
 def list_steps(order: Order = "fragment") -> list[dict[str, Any]]:
     """The steps from vertices to their colours and sorted tile lists, in their order, as JSON values.
 
-    In the order 'splat', runs are sorted first, and pairs by their tiles alone.
-
     A step ``{"kernel": name, "bind": {binding: buffer}, ...}`` is a dispatch. Its size is ``"count": [name,
     n]``, the quotient of a count and n, rounded up, or ``"indirect": [buffer, byte]``. With ``"if": name`` it
     is left out where that count is 0. A buffer ``digits.i`` is the uniform of 16 bytes from byte 256 i on in
     the buffer ``digits``. A step ``{"clear": buffer, "from": byte}`` fills a buffer with 0.
     """
+    return [*shade_steps(), *tile_steps(order)]
+
+
+def shade_steps() -> list[dict[str, Any]]:
+    """From vertices to their colours in a view; without effect where these do not depend on it."""
+    bind = {"0": "frame", "1": "vertices", "25": "values", "26": "base", "27": "harmonics", "28": "owners"}
+    return [{"kernel": "shade", "bind": bind, "count": ["vertices", 256], "if": "harmonics"}]
+
+
+def tile_steps(order: Order) -> list[dict[str, Any]]:
+    """From vertices and their colours to sorted tile lists. In the order 'splat', runs are sorted first, and
+    pairs by their tiles alone."""
     steps: list[dict[str, Any]] = [{"clear": name, "from": 0} for name in ("counters", "group_bounds")]
 
     def add(kernel: str, bind: dict[int, str], *, only_if: str | None = None, **size: Any) -> None:
@@ -135,8 +145,6 @@ def list_steps(order: Order = "fragment") -> list[dict[str, Any]]:
             source, target = target, source
 
     by_splat = order == "splat"
-    shaded = {0: "frame", 1: "vertices", 25: "values", 26: "base", 27: "harmonics", 28: "owners"}
-    add("shade", shaded, count=["vertices", 256], only_if="harmonics")
     add("project", {0: "frame", 1: "vertices", 6: "projected"}, count=["vertices", 256])
     filtered = {0: "frame", 1: "vertices", 2: "values", 3: "mesh", 4: "fans", 6: "projected"}
     add("widen", filtered, count=["fans", 64], only_if="fans")

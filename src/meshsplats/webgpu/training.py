@@ -28,7 +28,7 @@ SIDE = 16
 """Pixels along each side of a workgroup that compares images."""
 
 _STORE_STEPS, _LOSS_STEPS = tuple(kernels.store_steps()), tuple(kernels.loss_steps())
-_SHADE_STEPS = tuple(step for step in kernels.list_steps() if step.get("kernel") == "shade")
+_SHADE_STEPS = tuple(kernels.shade_steps())
 _ROUND_STEPS = tuple(kernels.round_steps())
 _ADAM_STEPS = (*kernels.filter_steps(), *kernels.adam_steps())
 _window_steps = functools.lru_cache(maxsize=64)(kernels.window_steps)
@@ -122,7 +122,6 @@ class Trainer:
         self._taping = GradientRenderer(device, mesh, TRAINING)
         self._frames = self._taping.frames
         self._limit = limit
-        self._masked = False
         assert not self._frames.counts["groups"]
         count = len(mesh.vertices)
         self._frames.upload("vertices", start.vertices)
@@ -184,14 +183,15 @@ class Trainer:
                     waiting += halves(area, settings.order)
                     continue
                 tape.windows.append(window)
-                self._write_step(tape, window.area, 0, background, rates)
+                self._write_step(tape, window.area, 0, background, rates, masked=mask is not None)
                 self._run_for(_STORE_STEPS, tape, window.area)
             self._run_for(_LOSS_STEPS, tape, tape.windows[-1].area)
             self._frames.clear("gradients")
             for window in tape.windows:
                 self._taping.mark_again(tape, window)
                 counts = self._taping.make_room(tape, window)
-                self._write_step(tape, window.area, counts["tiles"], background, rates)
+                tiles, masked = counts["tiles"], mask is not None
+                self._write_step(tape, window.area, tiles, background, rates, masked=masked)
                 steps = _window_steps(window.rounds)
                 self._frames.run(steps, "color", counts | self._image_counts(camera), window.settings)
             last = tape.windows[-1]
@@ -252,7 +252,6 @@ class Trainer:
         self._frames.allocate("losses", 16 * groups)
         self._frames.allocate("target", 16 * pixels)
         self._frames.write("target", np.ascontiguousarray(target, np.float32))
-        self._masked = mask is not None
         if mask is not None:
             self._frames.write("target", mask.astype(np.float32), 12 * pixels)
 
@@ -282,6 +281,8 @@ class Trainer:
         tiles: int,
         background: Sequence[float],
         rates: Rates,
+        *,
+        masked: bool,
     ) -> None:
         """Writes the uniform ``Step`` of a window."""
         data = np.zeros(28, np.float32)
@@ -292,6 +293,6 @@ class Trainer:
         data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilons[0]
         data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]
         data[20:22] = rates.harmonics, MAX_COLOR if self._frames.counts["harmonics"] else 1
-        words[22:24] = self._masked, self._frames.counts["harmonic_splats"]
+        words[22:24] = masked, self._frames.counts["harmonic_splats"]
         data[24] = rates.opacity_kept
         self._frames.write("step", data)
