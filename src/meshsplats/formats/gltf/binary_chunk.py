@@ -78,12 +78,16 @@ class BinaryChunk:
         nodes: list[dict[str, Any]],
         meshes: list[dict[str, Any]],
         materials: list[dict[str, Any]] | None = None,
+        *,
+        extensions: dict[str, list[str]] | None = None,
     ) -> dict[str, Any]:
-        """The JSON part of a file of what was appended; the first of ``nodes`` is the scene."""
+        """The JSON part of a file of what was appended; the first of ``nodes`` is the scene. ``extensions``:
+        extensionsUsed and extensionsRequired that are to stand in front of what grows."""
         from meshsplats import __version__
 
         return {
             "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
+            **(extensions or {}),
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": nodes,

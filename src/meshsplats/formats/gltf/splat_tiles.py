@@ -63,7 +63,7 @@ def write_splat_tile(cloud: GaussianCloud, path: Path, up: np.ndarray) -> None:
     chunk.accessors = [{"count": len(cloud), **accessor} for accessor in accessors]
     nodes = [{"mesh": 0, "matrix": (matrix.T.ravel() + 0.0).tolist()}]
     extensions = {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
-    document = {"asset": {}, **extensions} | chunk.document(nodes, [{"primitives": [primitive]}])
+    document = chunk.document(nodes, [{"primitives": [primitive]}], extensions=extensions)
     with atomic_path(path, needs=chunk.length) as temporary:
         write_binary(temporary, document, chunk, what=f"{path}: the splats", advice="")
 

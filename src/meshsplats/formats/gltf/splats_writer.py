@@ -43,8 +43,7 @@ def splats_part(cloud: GaussianCloud, *, beside_meshes: bool = False) -> tuple[d
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
     nodes = [{"name": "splats", "mesh": 0, **_place(cloud, beside_meshes)}]
     meshes = [{"name": "splats", "primitives": [primitive], **_note(cloud, beside_meshes)}]
-    document: dict[str, Any] = {"asset": {}, "extensionsUsed": [EXTENSION]}  # in front of what grows
-    return document | chunk.document(nodes, meshes), chunk
+    return chunk.document(nodes, meshes, extensions={"extensionsUsed": [EXTENSION]}), chunk
 
 
 def _attributes(cloud: GaussianCloud) -> dict[str, np.ndarray]:

@@ -100,8 +100,8 @@ class _Columns:
     def needed(self) -> tuple[str, ...]:
         """All properties that are read."""
         moving = self.motion.needed if self.motion else ()
-        lobes = (*self.lobes, *self.filter)
-        return (*POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *lobes, *moving)
+        named = (*POSITION, *_ROTATION, *self.scale, "opacity", *self.sh)
+        return (*named, *self.lobes, *self.filter, *moving)
 
 
 def is_float_splat(header: PlyHeader) -> bool:
