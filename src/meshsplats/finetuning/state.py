@@ -77,9 +77,10 @@ class State:
         else:
             unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self._vertices, lr=1.0, scale=unit, eps=position_epsilon)
-        self._of_splats = None if mesh.harmonics is None else mesh.harmonics.copy()
-        flat = None if self._of_splats is None else self._flat_harmonics
-        self._harmonics = None if flat is None else adam(flat, lr=1.0, eps=color_epsilon)
+        self._sh = None if mesh.harmonics is None else mesh.harmonics.copy()
+        self._harmonics = None
+        if self._sh is not None:
+            self._harmonics = adam(self._flat_harmonics, lr=1.0, eps=color_epsilon)
         brightest = 1 if mesh.harmonics is None else MAX_COLOR
         self._colors = adam(self._rgba, lr=1.0, bounds=(0, brightest), eps=color_epsilon)
         # Depends on the triangles alone, so that a resumed run finds the same boundary.
@@ -116,13 +117,13 @@ class State:
     def harmonics(self) -> np.ndarray | None:
         """(s, k, 3) float32; None for a mesh without."""
         self._fetch()
-        return self._of_splats
+        return self._sh
 
     @property
     def _flat_harmonics(self) -> np.ndarray:
         """(s, 3 k) view of ``harmonics``."""
-        assert self._of_splats is not None
-        return self._of_splats.reshape(len(self._of_splats), -1)
+        assert self._sh is not None
+        return self._sh.reshape(len(self._sh), -1)
 
     @classmethod
     def begin(
@@ -362,7 +363,7 @@ class State:
             Moments(self._colors.mean, self._colors.square),
             self._positions.scale,
             self._boundary,
-            self._of_splats,
+            self._sh,
             None if self._harmonics is None else Moments(self._harmonics.mean, self._harmonics.square),
         )
 

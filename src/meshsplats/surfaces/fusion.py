@@ -105,7 +105,7 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     Returns:
         (n, 3) float64 vertices in grid steps, (m, 3) int32 triangles.
     """
-    label, marching_cubes, simplify = libraries()
+    label, marching_cubes, _ = libraries()
     part = label(field < 0, connectivity=1)
     sizes = np.bincount(part.ravel())
     if len(sizes) == 1 or sizes[0] == 0:  # all exterior, or all interior
@@ -123,19 +123,22 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     if not known.all():
         vertices, triangles = large_parts(vertices, triangles)
     if 0 < faces < len(triangles):
-        vertices, triangles = simplify(vertices, triangles, target_count=faces)
+        return _reduced(vertices, triangles, faces)
     return vertices.astype(np.float64), triangles.astype(np.int32)
 
 
 def coarser(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A mesh, (n, 3) vertices and (m, 3) triangles, with about a quarter of its triangles."""
-    simplify = libraries()[2]
-    points, triangles = simplify(
-        vertices.astype(np.float32),
-        faces.astype(np.int32),
-        target_count=max(4, len(faces) // LEVEL_FACTOR**2),
+    return _reduced(
+        vertices.astype(np.float32), faces.astype(np.int32), max(4, len(faces) // LEVEL_FACTOR**2)
     )
-    return points.astype(np.float64), triangles.astype(np.int32)
+
+
+def _reduced(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh with about ``count`` triangles: (n, 3) float64 vertices, (m, 3) int32 triangles."""
+    simplify = libraries()[2]
+    points, kept = simplify(vertices, triangles, target_count=count)
+    return points.astype(np.float64), kept.astype(np.int32)
 
 
 def large_parts(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
