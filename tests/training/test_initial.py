@@ -9,10 +9,11 @@ import pytest
 from _balls import ball_view, cameras_around
 
 from meshsplats.datasets.points import ScenePoints
+from meshsplats.datasets.silhouettes import has_silhouettes
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.rendering import render
 from meshsplats.training import hull, initial
-from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
+from meshsplats.training.hull import carve, in_silhouettes
 from meshsplats.training.initial import (
     colored,
     fans_of,

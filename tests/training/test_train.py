@@ -26,10 +26,12 @@ from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.run import TrainingLoop, run_start
 from meshsplats.finetuning.state import State
+from meshsplats.finetuning.step import ONE_SAMPLE_SHARE, with_sample_share
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
+from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training.as_splats import splats_of_fans
 from meshsplats.training.growth import (
@@ -432,6 +434,30 @@ def test_photographs_have_one_sample_a_pixel_at_first(ball, start, monkeypatch):
         start, ball, make_config(steps=2, one_sample_share=0.5, samples=3), run=RunOptions(report_every=0)
     )
     assert drawn == [1, 1, 2, 2, 3, 3]
+
+
+def test_by_default_photographs_without_alpha_have_one_sample_a_pixel_at_first(ball, room):
+    for data, share in ((ball, 0.0), (room, ONE_SAMPLE_SHARE)):
+        assert with_sample_share(train_config(), data.train).one_sample_share == share
+        assert with_sample_share(make_config(), data.train).one_sample_share == 0
+        assert with_sample_share(train_config(one_sample_share=0.3), data.train).one_sample_share == 0.3
+
+
+@pytest.mark.usefixtures("start_found_once")
+def test_steps_and_growth_draw_as_many_samples(room, monkeypatch):
+    drawn = []
+
+    def noted(self, *arguments, **options):
+        if len(arguments) > 2:  # the first colours are found without options
+            drawn.append(arguments[2].samples)
+        return tape(self, *arguments, **options)
+
+    tape = CpuEngine.tape
+    changes = {**SMALL, "steps": 10, "growth_events": 1, "growth_end": 0.5, "sh_degree": 0}
+    monkeypatch.setattr(CpuEngine, "tape", noted)
+    train(Dataset(room.train), train_config(**changes))
+    judged = len(room.train)
+    assert drawn == [1] * (9 + judged) + [2]
 
 
 def test_the_unit_of_the_scene_does_not_matter(start):

@@ -141,9 +141,10 @@ class FinetuneConfig:
     """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
     pixel without averaging. 0: train on means only."""
-    one_sample_share: Annotated[float, Range(0, 1), Advanced] = 0.0
+    one_sample_share: Annotated[float | None, Range(0, 1), Advanced] = 0.0
     """For photographs: for this initial fraction of the run, draw one sample per pixel, which takes half the
-    time."""
+    time. None: 0.85, or 0 for photographs with alpha, whose sharp outlines before a plain background lose by
+    it."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of the order of the views and of random backgrounds. The same seed gives the same bits, with any
     number of threads, unless the length is given in minutes."""
@@ -268,7 +269,7 @@ class FinetuneChanges(TypedDict, total=False):
     soft_share: float
     soft_phase: float
     point_share: float
-    one_sample_share: float
+    one_sample_share: float | None
     seed: int
 
 

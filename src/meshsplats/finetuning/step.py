@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
+from meshsplats.datasets.silhouettes import has_silhouettes
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.draw_order import DrawOrder
@@ -23,6 +24,8 @@ from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.engine import Need, Taped, WholeSteps
 from meshsplats.rendering.shading import shaded
 
+Config = TypeVar("Config", bound=FinetuneConfig)
+
 TRAINING_MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
 """Early termination: a pixel stops below this transmittance, and the background gets the rest. It saves a
 tenth to a sixth of the time and changes images by 0.0002 (rms). The limit is lower in linear light, since
@@ -34,6 +37,10 @@ one in two, on the background that images are evaluated on."""
 
 AREA_SAMPLES = 2
 """Samples along each side of a pixel when the target is the mean over each pixel's area."""
+
+ONE_SAMPLE_SHARE = 0.85
+"""``one_sample_share`` for photographs without alpha. Bonsai, 300 steps: 26.23 dB in two thirds of the time
+in which 2 x 2 samples throughout have 26.26."""
 
 
 class Plan(NamedTuple):
@@ -132,7 +139,16 @@ def samples_of(view: View, config: FinetuneConfig, fraction: float = 1.0) -> int
         return config.samples
     if isinstance(view.source, RenderedSplats):
         return 1 if view.source.look == "splats" else AREA_SAMPLES
-    return 1 if fraction < config.one_sample_share else AREA_SAMPLES
+    return 1 if fraction < (config.one_sample_share or 0.0) else AREA_SAMPLES
+
+
+def with_sample_share(config: Config, views: Sequence[View]) -> Config:
+    """``config`` with a number as ``one_sample_share``: by default that for ``views``, if they are
+    photographs."""
+    if config.one_sample_share is not None:
+        return config
+    masked = any(isinstance(view.source, RenderedSplats) for view in views) or has_silhouettes(views)
+    return replace(config, one_sample_share=0.0 if masked else ONE_SAMPLE_SHARE)
 
 
 def tape_options(state: State, background: Sequence[float], plan: Plan) -> TapeOptions:

@@ -36,6 +36,7 @@ class TrainConfig(FinetuneConfig):
         Literal["mesh", "display", "linear"], Fixed("while training: fine-tune the result with another")
     ] = "mesh"
     order: Literal["mesh", "fragment", "splat"] = "mesh"
+    one_sample_share: float | None = None
     opacity_decay: float = 0.003
     epsilon: float = 1e-8
     """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a

@@ -81,7 +81,7 @@ class Growing:
         if stray.any() and not stray.all():
             state = select_fans(state, np.flatnonzero(~stray))
         target = budget(config, self._events, self._first_fans)
-        found = score(state, self.views(moment.views, clock.fraction), self._events)
+        found = score(state, self.views(moment.views, clock.fraction), self._events, clock.fraction)
         return self, grow(state, found, target)
 
     def result(self, state: State) -> SplatMesh:

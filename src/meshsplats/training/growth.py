@@ -53,8 +53,9 @@ class Scores(NamedTuple):
     """(n,) bool: whether the centre lies in the image of any view."""
 
 
-def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
-    """Judges the fans of ``state`` in up to ``JUDGED_VIEWS`` of ``views``, others in each ``turn``."""
+def score(state: State, views: Sequence[View], turn: int = 0, fraction: float = 1.0) -> Scores:
+    """Judges the fans of ``state`` in up to ``JUDGED_VIEWS`` of ``views``, others in each ``turn``, after
+    ``fraction`` of the run."""
     mesh = state.result()
     corners = corners_of(mesh)
     n = fan_count(mesh)
@@ -66,9 +67,8 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
     step = -(-len(views) // JUDGED_VIEWS)
     for index in range(turn % step, len(views), step):
         view = views[index]
-        options = TapeOptions(
-            view.background, samples_of(view, state.config), TRAINING_MIN_TRANSMITTANCE[mesh.blending]
-        )
+        samples = samples_of(view, state.config, fraction)
+        options = TapeOptions(view.background, samples, TRAINING_MIN_TRANSMITTANCE[mesh.blending])
         rendering = drawing.tape(triangles, view.camera, options)
         image = rendering.color
         if state.exposures is not None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.datasets.image_files import PhotoFile
+from meshsplats.datasets.silhouettes import OPAQUE, has_alpha
 from meshsplats.datasets.views import View
 
 FIRST_LEVEL = 32
@@ -22,8 +22,6 @@ MISPLACED = 0.75
 and takes no further part."""
 ASTRAY = 0.04
 """Share of the views that may have a point outside of their silhouettes."""
-OPAQUE = 0.5
-"""Alpha from which a pixel belongs to the silhouette."""
 SEEN_SHARE = 0.5
 """Share of the views that must have a cell in their image."""
 SILHOUETTE_BYTES = 1 << 30
@@ -99,22 +97,6 @@ def _reduced(inside: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.ascontiguousarray(inside)
 
 
-def has_silhouettes(views: Sequence[View]) -> bool:
-    """Whether the image of any of ``views`` has alpha that leaves out a part of it."""
-    for view in filter(_has_alpha, views):
-        alpha = view.alpha
-        if alpha is not None and bool((alpha < OPAQUE).any()) and bool((alpha >= OPAQUE).any()):
-            return True
-    return False
-
-
-def _has_alpha(view: View) -> bool:
-    """Whether the image has alpha. Photographs are not read for that."""
-    if isinstance(view.source, PhotoFile):
-        return view.source.has_alpha
-    return view.load().alpha is not None
-
-
 def silhouette_factor(views: Sequence[View]) -> float:
     """Size of silhouettes relative to the images of ``views``, at most 1, for ``SILHOUETTE_BYTES``."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
@@ -123,7 +105,7 @@ def silhouette_factor(views: Sequence[View]) -> float:
 
 def carving_bytes(views: Sequence[View], cells: int) -> int:
     """Estimated memory of ``carve`` in bytes; 0 where no image can have alpha."""
-    if not any(map(_has_alpha, views)):
+    if not any(map(has_alpha, views)):
         return 0
     pixels = sum(view.camera.width * view.camera.height for view in views)
     # The inside of a ball: a compact subject has most cells inside for those on its surface.
@@ -134,7 +116,7 @@ def in_silhouettes(views: Sequence[View], points: np.ndarray, reach: np.ndarray)
     """(n,) bool: ``points`` (n, 3) that lie within the silhouettes, give or take ``reach`` (n,) scene units,
     of all views that have them in the image but ``ASTRAY`` of them."""
     seen, against = np.zeros(len(points)), np.zeros(len(points))
-    for view in filter(_has_alpha, views):
+    for view in filter(has_alpha, views):
         in_image, empty = _Silhouette(view).test(points, reach)
         seen += in_image
         against += empty
@@ -151,7 +133,7 @@ def carve(
     silhouettes and left out. ``solid`` gives (n,) bool for points (n, 3): cells that it rules out are empty,
     too. None if nothing is left, as for alpha that is not of one subject.
     """
-    views = [view for view in views if _has_alpha(view)]
+    views = [view for view in views if has_alpha(view)]
     factor = silhouette_factor(views)
     outlines = [_Silhouette(view, factor) for view in views]
     low, side = _root(outlines)

@@ -14,12 +14,14 @@ from meshsplats._kinds import need
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import reduced_views
+from meshsplats.datasets.silhouettes import has_silhouettes
 from meshsplats.datasets.views import Dataset, ImageCache
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import HARMONIC_BYTES, SHADED_BYTES, check_bytes, estimate_bytes
 from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
+from meshsplats.finetuning.step import with_sample_share
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
@@ -27,7 +29,7 @@ from meshsplats.spherical_harmonics import TERMS
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.growing import REDUCED_PART, Growing
 from meshsplats.training.growth import SHELL
-from meshsplats.training.hull import carving_bytes, has_silhouettes
+from meshsplats.training.hull import carving_bytes
 from meshsplats.training.initial import colored, fans_of, starting_patches
 from meshsplats.training.patches import Patches, flat_splats
 from meshsplats.training.stereo import matching_bytes
@@ -83,6 +85,7 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
+    config = with_sample_share(config, dataset.train)
     engine(run.device, run.threads).check()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
