@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from dataclasses import replace
 
@@ -742,6 +743,22 @@ def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     for option in ("--blending", "--prune-opacity", "--point-share", "--cutoff", "--soft-share"):
         assert main([*words, "--force", option, "0.5"]) == 2  # options without effect do not exist
     capsys.readouterr()
+
+
+@pytest.mark.parametrize(("minutes", "takes_steps"), [("0.05", True), ("0.0001", False)])
+def test_the_command_takes_steps_while_there_is_time(
+    ball, start, tmp_path, monkeypatch, capsys, minutes, takes_steps
+):
+    monkeypatch.setattr("meshsplats.training.run.starting_fans", lambda *_: start)
+    views = ball.train[:4]
+    folder = write_photographs(
+        tmp_path / "photos", [view.camera for view in views], [straight(view) for view in views]
+    )
+    words = ["train", str(folder), "-o", str(tmp_path / "mesh.npz"), "--minutes", minutes]
+    assert main([*words, "--test-every", "0", "--sh-degree", "0"]) == 0
+    lines = (tmp_path / "mesh.npz.run" / "metrics.jsonl").read_text().splitlines()
+    assert (json.loads(lines[-1])["step"] > 0) == takes_steps
+    assert ("there was no time for steps" in capsys.readouterr().out) != takes_steps
 
 
 def test_a_trained_mesh_outlives_a_failure_to_write_its_splats(ball, tmp_path, monkeypatch):

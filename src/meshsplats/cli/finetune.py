@@ -129,7 +129,7 @@ class Finetune(TrainingCommand):
             return self._trained(on_splats.tuned_as_configured(start, dataset, config, run, show), config)
 
         reserve = on_splats.SAVE_SECONDS * len(mesh.faces)
-        return Plan(mesh, dataset, _summary(mesh, scene), background, optimise, reserve)
+        return Plan(mesh, dataset, _summary(mesh, scene), background, optimise, reserve=reserve)
 
     def _plan_on_splats(
         self,
@@ -158,7 +158,8 @@ class Finetune(TrainingCommand):
             return self._trained(tuning.optimise(options, show), tuning.config)
 
         summary = _summary(tuning.mesh, cloud)
-        return Plan(tuning.mesh, tuning.dataset, summary, None, optimise, tuning.reserve, rates=tuning.rates)
+        mesh, dataset, reserve, rates = tuning.mesh, tuning.dataset, tuning.reserve, tuning.rates
+        return Plan(mesh, dataset, summary, None, optimise, reserve=reserve, rates=rates)
 
     def _trained(self, tuned: on_splats.Tuned, config: FinetuneConfig) -> Trained:
         mesh, order, sizes = tuned

@@ -135,7 +135,7 @@ class Train(TrainingCommand):
 
         needed = check_training_memory(dataset, config, cache_bytes=self.target.cache_bytes)
         summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
-        return Plan(None, dataset, summary, background, optimise, needed)
+        return Plan(None, dataset, summary, background, optimise, needed=needed)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         from meshsplats.formats.gaussians import save_gaussians

@@ -6,7 +6,7 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -105,6 +105,7 @@ class Plan:
     background: Background | None
     """That of photographs; None without them."""
     optimise: Callable[[RunOptions, Display], Trained]
+    _: KW_ONLY
     reserve: float = 0.0
     """Seconds that ``optimise`` and the command need after the last step."""
     rates: Mapping[str, float] = field(default_factory=dict)
@@ -345,7 +346,7 @@ class TrainingCommand(Command):
             most = SCORED_VIEWS if self.has_photographs else min(self.target.held_out, SCORED_VIEWS)
             quality += f", {plural(count, 'view')})" if count < most else ")"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
-        for line in _sizes_in_words(trained.sizes, steps):
+        for line in _result_in_words(trained.sizes, steps if lines else None):
             print(line)
         print(f"preview: {files.preview}" + (f"; metrics: {files.folder}/metrics.jsonl" if lines else ""))
 
@@ -361,20 +362,19 @@ def _sizes_record(sizes: SizeScores | None) -> dict[str, Any]:
     return {"psnr_by_width": rounded, "written": "converted" if sizes.loses else "tuned"}
 
 
-def _sizes_in_words(sizes: SizeScores | None, steps: int) -> Iterator[str]:
-    """At each image width, the conversion against the tuned mesh; and which one was written, if not that."""
-    if sizes is None:
-        return
-    if steps:
+def _result_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[str]:
+    """At each image width, the conversion against the tuned mesh; which one was written, if not that; and
+    whether no step was taken. ``steps``: None if unknown."""
+    if sizes is not None and steps:
         pairs = (
             f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items()
         )
         yield f"converted -> tuned, dB: {', '.join(pairs)}"
-    if sizes.loses:
+    if sizes is not None and sizes.loses:
         where = ", ".join(str(width) for width in sizes.worse_at)
-        yield f"the conversion is written: after {plural(steps, 'step')}, the mesh was worse at {where} px;"
+        yield f"the conversion is written: after {plural(steps or 0, 'step')}, the mesh was worse at {where} px;"
         yield "  a longer run helps, a new one rather than --resume, which keeps the start of a short one"
-    elif not steps:
+    elif steps == 0:
         yield "there was no time for steps: this is the mesh at the start; more --minutes help"
 
 
