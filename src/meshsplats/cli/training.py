@@ -371,8 +371,8 @@ def _result_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[st
         )
         yield f"converted -> tuned, dB: {', '.join(pairs)}"
     if sizes is not None and sizes.loses:
-        where = ", ".join(str(width) for width in sizes.worse_at)
-        yield f"the conversion is written: after {plural(steps or 0, 'step')}, the mesh was worse at {where} px;"
+        where, count = ", ".join(str(width) for width in sizes.worse_at), plural(steps or 0, "step")
+        yield f"the conversion is written: after {count}, the mesh was worse at {where} px;"
         yield "  a longer run helps, a new one rather than --resume, which keeps the start of a short one"
     elif steps == 0:
         yield "there was no time for steps: this is the mesh at the start; more --minutes help"
