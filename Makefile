@@ -54,13 +54,13 @@ CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help dawn demo fuzz fuzz-core test test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
+.PHONY: help dawn demo fuzz fuzz-core test test-slow test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
 	test-memory test-threads test-windows test-arm64 wheels release docs lint format clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo    splats to mesh, GLB, images, a comparison and a page, in $(DEMO)/'
-	@echo 'make test    the tests'
+	@echo 'make test    the tests, but for those that take seconds each, which make test-slow runs'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'
@@ -96,7 +96,10 @@ demo: $(VENV)/installed
 # A worker for each processor; each takes whole files, whose tests share what they make.
 PARALLEL := --numprocesses auto --dist loadfile
 test: $(VENV)/installed-dev dawn
-	$(BIN)/python -m pytest $(PARALLEL)
+	$(BIN)/python -m pytest $(PARALLEL) --tier quick
+
+test-slow: $(VENV)/installed-dev dawn
+	$(BIN)/python -m pytest $(PARALLEL) --tier slow
 
 # Chromium's compiler of WGSL, for tests/webgpu/test_dawn.py: 130 MB. Without npm, these tests are skipped.
 DAWN := build/dawn
@@ -133,7 +136,7 @@ LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py cont
 	$(CORE_TESTS)
 
 test-lowest: $(LOWEST_VENV)/installed
-	MESHSPLATS_SHARED_DATA=left-out $(LOWEST_VENV)/bin/python -m pytest $(PARALLEL) \
+	MESHSPLATS_SHARED_DATA=left-out $(LOWEST_VENV)/bin/python -m pytest $(PARALLEL) --tier quick \
 	  $(LOWEST_LEFT_OUT:%=--ignore=%)
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))

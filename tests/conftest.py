@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from _needs import lacking, skipped_lines
+from _tiers import TIERS, of_tier
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -108,8 +109,43 @@ def make_link(link: Path, target: Path) -> None:
         pytest.skip("symbolic links are not recognised here")
 
 
+LEFT_OUT = pytest.StashKey[int]()
+"""Number of tests of the other tier, by worker processes if there are any, which all collect the same."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--tier", choices=TIERS, default="all", help="the quick tests, the slow ones, or all")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[LEFT_OUT] = 0
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    items[:], others = of_tier(items, config.getoption("tier"))
+    config.stash[LEFT_OUT] = len(others)
+    if others:
+        config.hook.pytest_deselected(items=others)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if (output := getattr(session.config, "workeroutput", None)) is not None:
+        output["left_out"] = session.config.stash[LEFT_OUT]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Of pytest-xdist: a worker has ended."""
+    node.config.stash[LEFT_OUT] = getattr(node, "workeroutput", {}).get("left_out", 0)
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Says what was skipped, and how to get it."""
+    """Says what was left out or skipped, and how to get it."""
+    config = terminalreporter.config
+    if count := config.stash[LEFT_OUT]:
+        other = "slow" if config.getoption("tier") == "quick" else "quick"
+        command = {"slow": "make test-slow", "quick": "make test"}[other]
+        terminalreporter.write_line(f"{count:5} {other} tests left out: {command} runs them")
     skipped = [report.longrepr for report in terminalreporter.stats.get("skipped", [])]
     for line in skipped_lines(str(where[2]) for where in skipped if isinstance(where, tuple)):
         terminalreporter.write_line(line)

@@ -106,6 +106,7 @@ def uses(shared, task):
 # ---- Workers
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_results_of_one_process(scheduler):
     tasks = list(range(20))
     here = dict(Workers().run(squared, tasks))
@@ -119,6 +120,7 @@ def test_a_cluster_gives_the_results_of_one_process(scheduler):
     assert os.getpid() not in processes
 
 
+@pytest.mark.slow
 def test_local_workers_share_the_processors(monkeypatch):
     """As many processes as keep all processors busy with the threads of each task."""
     pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
@@ -177,6 +179,7 @@ def test_tasks_in_threads_of_one_process_keep_their_warnings_apart():
         assert (warnings.showwarning, list(warnings.filters)) == before
 
 
+@pytest.mark.slow
 def test_tasks_share_the_memory_of_their_worker():
     distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
     with distributed.LocalCluster(
@@ -194,6 +197,7 @@ def test_the_tasks_of_a_killed_worker_run_again(scheduler, tmp_path):
     assert found == {i: i for i in range(6)}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_task_that_kills_every_worker_ends_the_run(scheduler):
     with open_workers(scheduler) as workers:
@@ -257,6 +261,7 @@ def build_and_die(folder, build, cell):
     return build(cell)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_tiles_outlive_a_killed_worker(splats, scheduler, tmp_path, monkeypatch):
     build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
@@ -272,6 +277,7 @@ def test_tiles_outlive_a_killed_worker(splats, scheduler, tmp_path, monkeypatch)
     assert results(tmp_path / "there") == results(tmp_path / "here")
 
 
+@pytest.mark.slow
 def test_images_of_a_cluster_have_the_same_bits(splats, scheduler, tmp_path):
     words = ["render", str(splats), "--orbit", "3", "--width", "64", "--depth", "png", "--animation", "none"]
     assert main([*words, "-o", str(tmp_path / "here")]) == 0
@@ -325,6 +331,7 @@ def test_a_configuration_file_names_no_cluster(splats, tmp_path, capsys):
     assert "cluster" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_command_with_workers_is_resumed(splats, tmp_path):
     pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
@@ -376,6 +383,7 @@ except FileNotFoundError:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
 def test_tiles_go_on_after_files_that_could_not_be_written(splats, tmp_path):
     """Files of a limited size, as on a disk with little room: whole tiles only; all after a resumption."""
@@ -406,6 +414,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(folder)], check=True)
 
 
+@pytest.mark.slow
 def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, small_disk, tmp_path):
     pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
     with open_workers("local") as workers, pytest.raises(OSError, match="no space left") as caught:
@@ -442,6 +451,7 @@ def slow_then(folder, task):
     return task
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr("meshsplats.cluster.SECONDS", 8)  # for which the client looks for it
     distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")

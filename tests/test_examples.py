@@ -16,6 +16,7 @@ ARGUMENTS = {"08_photographs": ["12", "64", "20"], "10_surface": ["64"]}
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(example, tmp_path, monkeypatch, capsys):
     # A smaller scene takes less time and runs the same lines.

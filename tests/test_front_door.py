@@ -152,6 +152,7 @@ def snippets() -> dict[str, str]:
     return found
 
 
+@pytest.mark.slow
 def test_documents_and_examples_type_check(tmp_path):
     found = snippets()
     assert len(found) > 8

@@ -238,6 +238,7 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
     assert (out / "level_1.glb").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("least", [50, 10**6])
 def test_levels_are_merged_from_those_above(splats, tmp_path, monkeypatch, least):
     import meshsplats.levels as module
@@ -266,6 +267,7 @@ def test_levels_are_merged_from_those_above(splats, tmp_path, monkeypatch, least
     assert (tmp_path / "other" / "level_2.glb").read_bytes() == expected
 
 
+@pytest.mark.slow
 def test_alpha_modes(splats, tmp_path, capsys):
     def modes(name):
         return [GltfDocument(tmp_path / name / f"level_{i}.glb").json["materials"][0] for i in range(2)]
@@ -285,6 +287,7 @@ def test_alpha_modes(splats, tmp_path, capsys):
     assert "--alpha mask is for .glb files, not .ply" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_levels_with_an_order(splats, tmp_path, capsys):
     """Tuned through it and converted alone: what an independent viewer shows is what the table says."""
     import meshsplats.levels as module

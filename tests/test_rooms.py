@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -60,6 +61,7 @@ def imported(text: str, known: set[str]) -> set[str]:
     return result - {""}
 
 
+@functools.cache
 def graph() -> dict[str, set[str]]:
     found = modules()
     return {name: imported(path.read_text("utf-8"), set(found)) - {name} for name, path in found.items()}

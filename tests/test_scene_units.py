@@ -94,6 +94,7 @@ def usual():
     return made(1.0)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("unit", EXACT)
 def test_powers_of_two_change_no_bit(usual, unit):
     found = made(unit)
@@ -104,6 +105,7 @@ def test_powers_of_two_change_no_bit(usual, unit):
             np.testing.assert_array_equal(found[step], values, step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", UNITS)
 def test_other_units_change_rounding_only(usual, unit):
     found = made(unit)
@@ -117,6 +119,7 @@ def test_other_units_change_rounding_only(usual, unit):
         np.testing.assert_allclose(found[step], usual[step], atol=1e-3, err_msg=step)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("unit", EXACT + UNITS)
 @pytest.mark.parametrize("backdrop", [False, True])
 def test_training_in_other_units(unit, backdrop):
@@ -129,6 +132,7 @@ def test_training_in_other_units(unit, backdrop):
     assert score(unit) == pytest.approx(score(1.0), abs=0.1 if unit in EXACT else 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", EXACT)
 def test_tiles_and_pages_in_other_units(unit, tmp_path):
     def images(unit: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:

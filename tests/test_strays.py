@@ -57,6 +57,7 @@ def camera():
     return ms.orbit(ball(), 1, azimuth=30, width=120, height=120)[0]
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("strays", [*FAR.values(), *LARGE.values()], ids=[*FAR, *LARGE])
 def test_pages_are_as_exact_as_without(strays, camera):
     mesh = ms.convert(beside(ball(), *strays))
@@ -93,6 +94,7 @@ def test_a_splat_of_any_size_is_drawn_as_a_plane(power, camera):
     np.testing.assert_allclose(images[1], images[0], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [40, 80])
 def test_a_splat_of_any_size_on_the_gpu(power, camera):
     need_gpu()
@@ -110,6 +112,7 @@ def test_clean_removes_them_and_nothing_else(strays):
         assert not kept[1500:].any()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("strays", [*FAR.values(), LARGE["e20"]], ids=[*FAR, "e20"])
 def test_tiles_of_the_rest_are_as_fine(strays, camera, tmp_path):
     cloud = beside(ball(9000, 0.02), *strays)

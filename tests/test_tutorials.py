@@ -66,6 +66,7 @@ def test_from_a_splat_file(tmp_path, monkeypatch, capsys):
     assert {"scores", "look", "tuned.npz", "tuned.glb"} <= {p.name for p in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
 def test_from_photographs(tmp_path, monkeypatch, capsys):
     cloud = make_scene(300)
     save_gaussians(cloud, tmp_path / "scene.ply")

@@ -12,12 +12,13 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 from conftest import shared_data
 
-from meshsplats import convert, load_gaussians, orbit, render
+from meshsplats import convert, load_gaussians, orbit, render, save_mesh
 from meshsplats.blender import SceneOptions, draw
-from meshsplats.blender.inside import meshes, objects
+from meshsplats.blender.inside import foreign, frame, meshes, objects, versions
 from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.spherical_harmonics import moved_harmonics
 
 
 def colorful(degree: int):
@@ -75,3 +76,26 @@ def test_an_object_gives_its_harmonics_back(degree):
     assert lit["harmonics"] is None
     assert lit["colors"].max() <= 1
     assert meshes.read_harmonics(obj.data).shape == (len(mesh.vertices), mesh.harmonics.shape[1], 3)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_glb_with_texture_coordinates_has_its_harmonics_after_a_click(
+    degree, tmp_path
+):
+    mesh = replace(colorful(degree), up=np.array([0, 0, 1], np.float32))
+    save_mesh(mesh, tmp_path / "m.glb", harmonics="texcoords")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    versions.enable_cycles()
+    bpy.ops.import_scene.gltf(filepath=str(tmp_path / "m.glb"))
+    bpy.context.view_layer.update()
+    obj = next(obj for obj in bpy.data.objects if obj.type == "MESH")
+    found = foreign.splat_mesh(obj)
+    assert len(found.harmonics) == mesh.splat_count
+    turn = np.array(obj.matrix_world.to_3x3(), np.float64)
+    world = frame.to_blender(np.array(mesh.up, np.float64))
+    expected = moved_harmonics(mesh.harmonics, turn.T @ world)
+    largest = np.abs(mesh.harmonics).max()
+    np.testing.assert_allclose(found.harmonics, expected, atol=0.02 * largest)
+    np.testing.assert_allclose(found.colors, mesh.colors, atol=0.01)
+    objects.dress(obj, lit=False)
+    assert meshes.read_harmonics(obj.data) is not None

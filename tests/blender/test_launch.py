@@ -127,6 +127,7 @@ def _killed(process: subprocess.Popen) -> Iterator[subprocess.Popen]:
             process.kill()
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
 def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, name):

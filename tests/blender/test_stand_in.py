@@ -21,6 +21,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
 
 
+@pytest.mark.slow
 def test_lit_scenes_have_plain_colours():
     mesh = convert(make_scene(400))
     rng = np.random.default_rng(0)
@@ -150,6 +151,7 @@ def test_nothing_solid_has_no_stand_in():
     assert stand_in(mesh, shading_normals(mesh), mesh.colors, resolution=16) is None
 
 
+@pytest.mark.slow
 def test_linear_colors_show_in_linear_light_what_display_blending_shows():
     rng = np.random.default_rng(0)
     cloud, _ = ball_splats(800)

@@ -50,6 +50,7 @@ def splats(tmp_path, monkeypatch):
 # ---- Help
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
     kind = command(name)

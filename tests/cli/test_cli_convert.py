@@ -181,6 +181,7 @@ def test_the_input_is_never_the_output(splats, tmp_path, capsys):
     assert inner.read_bytes() == before
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("options", [[], ["--axes", "y-up"], ["--cameras", "cameras.json"]])
 def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, options, monkeypatch):
     if not options:
@@ -444,6 +445,7 @@ def test_what_an_order_does_not_go_with_is_said_before_the_input_is_read(tmp_pat
     assert not (tmp_path / "m.glb").exists()
 
 
+@pytest.mark.slow
 def test_other_commands_choose_alpha_too(tmp_path):
     mesh = convert(nested_balls(0.95))
     assert alpha_for_viewers(mesh, tmp_path / "a.npz") == {}

@@ -30,12 +30,14 @@ def test_it_makes_a_scene_and_types_the_first_commands(tmp_path, quick, capfd, m
     assert printed.index("$ meshsplats convert") < printed.index("20,000 splats ->") < printed.index("\nNext")
 
 
+@pytest.mark.slow
 def test_without_a_browser_it_says_what_to_open(tmp_path, quick, capfd, monkeypatch):
     monkeypatch.setattr(server, "open_page", lambda url: False)
     assert main(["demo", "-o", str(tmp_path / "first")]) == 0
     assert "scene.html opens in any browser" in capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_what_is_there_stays_unless_it_is_forced(tmp_path, quick, capsys):
     (tmp_path / "scene.glb").write_bytes(b"mine")
     assert main(["demo", "-o", str(tmp_path), "--no-open"]) == 3

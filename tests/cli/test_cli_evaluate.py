@@ -194,6 +194,7 @@ def test_existing_results_stay(scene, tmp_path, capsys):
     assert (out / "results.json").read_text() == "kept"
 
 
+@pytest.mark.slow
 def test_default_views_are_those_that_finetune_holds_out(scene, tmp_path):
     from meshsplats.cli.targets import TargetOptions
 

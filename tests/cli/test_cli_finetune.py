@@ -108,6 +108,7 @@ def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_pa
     assert printed == pytest.approx(scored, abs=0.005)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "options",
     [
@@ -250,6 +251,7 @@ def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path
     assert not (tmp_path / "tuned.npz.run/held_out.cameras.json").exists()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -479,6 +481,7 @@ def test_dense_clouds_begin_as_their_conversion(splats, tmp_path, capsys):
     assert json.loads((tmp_path / "t.npz.run" / "start.json").read_text())["brief_steps"] is None
 
 
+@pytest.mark.slow
 def test_a_timed_run_is_resumed_with_the_mesh_that_it_began_with(splats, tmp_path, capsys, monkeypatch):
     """Though the machine is as fast as a hundred by then."""
     slow, fast = Pace(1e-4, 1e-5, 1e-9), Pace(1e-6, 1e-9, 1e-9)
@@ -517,6 +520,7 @@ def test_meshes_stand_as_asked_however_they_came_about(tmp_path):
         np.testing.assert_allclose(load_mesh(tmp_path / "t.npz").up, (0, 0, 1), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["colors=mean", "detail=cameras", "footprint=cameras"])
 def test_conversion_options_that_need_cameras(splats, tmp_path, option, monkeypatch):
     monkeypatch.setattr("meshsplats.finetuning.on_splats.TIMED_SPLATS", 1)

@@ -34,6 +34,7 @@ def rotation(path) -> list[float]:
     return node.rotation
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_root_node_is_that_of_convert(splats, tmp_path, name):
     pytest.importorskip("skimage") if name == "base.glb" else None

@@ -51,6 +51,7 @@ def test_overview_and_version(capsys):
     assert capsys.readouterr().out == f"meshsplats {meshsplats.__version__}\n"
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help(name, capsys):
     assert main([name, "--help"]) == 0

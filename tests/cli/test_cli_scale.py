@@ -28,6 +28,7 @@ def run(tmp_path, name, *words):
     return main(["convert", *out, *words])
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["b.ply", "b.npz", "b.glb", "b.usdc", "b.obj"])
 def test_meshes_are_scaled_in_every_format(tmp_path, splats, name):
     if name.endswith("usdc"):

@@ -52,6 +52,7 @@ def test_json_without_a_preview(splats, tmp_path, capsys):
     assert not (tmp_path / "small.ply.preview.png").exists()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "name", ["guitar.compressed.ply", "truck.splat", "playcanvas-logo-sog", "monkey_0001.sog"]
 )

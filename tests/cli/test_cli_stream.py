@@ -24,6 +24,7 @@ def run(*arguments) -> int:
     return main(["convert", *map(str, arguments)])
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "options",
     [

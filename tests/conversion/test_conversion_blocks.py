@@ -45,6 +45,7 @@ def assert_same(parts, mesh):
         assert part.filter_px2 == mesh.filter_px2
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("strays", [60, 61])
 @pytest.mark.parametrize(
     "options",

@@ -43,6 +43,7 @@ def scene() -> tuple[GaussianCloud, list[Camera], list[Camera]]:
     return cloud, close, mid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look", ["area", "splats"])
 def test_default_beats_paper_at_no_more_triangles(scene, look):
     cloud, close, mid = scene
@@ -68,6 +69,7 @@ def test_each_ingredient_helps(scene):
     assert likeness(convert(cloud, footprint="none"), cloud, close, "splats") < wide - 0.3
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("count", [300, 8000])
 def test_without_cameras(count):
     """Better than paper on coarse and fine clouds, at the distance of images of the whole and nearer."""
@@ -111,6 +113,7 @@ def test_kernels():
     assert filtered > likeness(convert(surfels, preset="paper"), surfels, cameras, "splats") + 1
 
 
+@pytest.mark.slow
 def test_real_splats():
     """The paper's conversion has the figures that were measured independently; the default beats it."""
     cloud = one_color_each(load_gaussians(shared_data("splats/playbot_lod3_31k_sh2.ply")))

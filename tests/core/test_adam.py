@@ -65,6 +65,7 @@ def test_steps_are_the_formula(columns):
     assert reached.max() == 1.5
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.filterwarnings("ignore:Sparse invariant checks")
 @pytest.mark.parametrize("columns", [3, 4])
 def test_steps_are_those_of_sparse_adam(columns):
@@ -161,6 +162,7 @@ def digest(threads: int | None) -> str:
     return total.hexdigest()
 
 
+@pytest.mark.slow
 def test_threads_and_variants_do_not_change_a_bit():
     from test_rendering_variants import in_another_process
 

@@ -10,6 +10,7 @@ from conftest import script
 fuzz_core = script("tests/fuzz/fuzz_core.py")
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", fuzz_core.CALLS)
 def test_made_up_arrays_give_a_result_or_a_clear_error(name):
     with warnings.catch_warnings():

@@ -70,6 +70,7 @@ def relative(a, b) -> float:
 
 
 # Near white, the variance of float32 images is known to few digits.
+@pytest.mark.slow(keep=20)
 @pytest.mark.parametrize(("white", "tolerance"), [(False, 1e-6), (True, 1e-5)])
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
@@ -242,6 +243,7 @@ def digest(threads: int | None) -> str:
     return total.hexdigest()
 
 
+@pytest.mark.slow
 def test_threads_and_variants_do_not_change_a_bit():
     from test_rendering_variants import in_another_process
 

@@ -473,6 +473,7 @@ def test_commands_take_the_cameras_of_a_data_set(cloud, tmp_path, capsys):
 # ---- Real photographs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("photos", "splats", "downscale", "background", "train", "test", "least"),
     [

@@ -48,6 +48,7 @@ def test_faint_layers_of_one_colour_need_no_order():
     assert choice.options == {"alpha": "blend"}
 
 
+@pytest.mark.slow
 def test_cutoff_below_the_opacities():
     # Many layers of 0.15 are solid together, and each of them is below the usual cutoff.
     layers = [shell(1 - 0.02 * i, 0.15, BLUE if i < 20 else RED) for i in range(40)]
@@ -83,6 +84,7 @@ def test_solid_meshes_are_not_measured(tmp_path, monkeypatch):
     assert len(load_mesh(tmp_path / "mixed.glb").faces) == len(mixed.faces)
 
 
+@pytest.mark.slow
 def test_large_meshes_have_fewer_views(monkeypatch):
     mesh = joined(shell(1, 0.9, BLUE, 50))
     monkeypatch.setattr(viewers, "CLEAR", np.inf)
@@ -112,6 +114,7 @@ def test_no_triangles():
         choose_alpha(SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 4))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "limit", "alpha"),
     [

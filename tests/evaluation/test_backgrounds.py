@@ -177,6 +177,7 @@ def test_evaluate_finds_it_and_says_so_everywhere(capture, tmp_path, capsys):
     assert json.loads((tmp_path / "b" / "report.json").read_text())["background"] == [1, 1, 1]
 
 
+@pytest.mark.slow
 def test_finetune_trains_over_it(capture, tmp_path, capsys):
     arguments = ("finetune", capture / "scene.ply", "--data", capture / "photos", "--steps", "3")
     assert run(*arguments, "-o", tmp_path / "found.npz") == 0

@@ -71,6 +71,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(("name", "change", "reason"), CASES)
 def test_the_reason_is_the_likely_one(name, change, reason):
     cloud, data = captured(name)

@@ -116,6 +116,7 @@ def by_formula(network: str, a: np.ndarray, b: np.ndarray) -> float:
     return total
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("size", [(31, 47), (64, 50)])
 @pytest.mark.parametrize("network", NETWORKS)
 def test_it_is_the_formula(folder, network, size):

@@ -264,6 +264,7 @@ def killed_in_the_preview(
         process.kill()
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("option", [[], ["--skip-existing"]])
 def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, option):
@@ -421,6 +422,7 @@ def test_locks_of_killed_processes_go_with_the_next_file(tmp_path, monkeypatch):
         assert sorted(os.listdir(tmp_path)) == sorted([held.name, "c.glb"])
 
 
+@pytest.mark.slow(keep=2)
 @posix
 @pytest.mark.parametrize(
     "arguments",
@@ -462,6 +464,7 @@ def test_a_reader_that_goes_away(tmp_path, arguments):
         assert done.returncode == 141
 
 
+@pytest.mark.slow(keep=1)
 @posix
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_streams_that_are_closed(tmp_path, closed):

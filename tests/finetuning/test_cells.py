@@ -148,6 +148,7 @@ def test_a_window_is_a_part_of_the_image():
     )
 
 
+@pytest.mark.slow
 def test_frozen_vertices_stay(held, tmp_path):
     """Also where triangles are pruned, and after a run was interrupted."""
     mesh = starting_mesh(held.cloud, [view.camera for view in held.dataset.train])
@@ -207,6 +208,7 @@ def test_cells_are_almost_as_good_as_the_whole(held, whole_run):
     assert found > best - 0.25 * (best - before)
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_bits(held, whole_run, tmp_path):
     pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
     with open_workers("local") as workers:
@@ -240,6 +242,7 @@ def end_once(folder, function, task):
     return function(task)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_cells_outlive_a_killed_worker(held, whole_run, tmp_path):
     pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
@@ -249,6 +252,7 @@ def test_cells_outlive_a_killed_worker(held, whole_run, tmp_path):
     assert digests(run) == digests(whole_run)
 
 
+@pytest.mark.slow
 def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeypatch):
     """Finished cells are not repeated, and a cell goes on from its checkpoint."""
     real = in_cells.finetune
@@ -308,6 +312,7 @@ test_cells.tuned(Path(sys.argv[1]), test_cells.scene(), resume=resume, checkpoin
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_run_is_resumed(whole_run, tmp_path):
     program = RUN.format(path=[p for p in sys.path if p])
@@ -348,6 +353,7 @@ def test_what_is_for_a_whole_scene_is_refused(held, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_the_command_tunes_in_cells(tmp_path, capsys):
     splats, out = tmp_path / "city.ply", tmp_path / "city.npz"
     save_gaussian_blocks(city_blocks(1500, degree=0), splats, 1500)
@@ -380,6 +386,7 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
     assert (cells / "cell-00000.npz").stat().st_mtime_ns > before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["splats", "photographs"])
 def test_the_command_has_the_same_bits_on_a_cluster(kind, tmp_path):
     pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")

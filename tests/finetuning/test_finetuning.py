@@ -165,6 +165,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
         assert np.allclose(ours, theirs.grad, rtol=1e-3, atol=1e-5 * float(theirs.grad.abs().max()))
 
 
+@pytest.mark.slow
 def test_exposures_of_photographs_are_found(scene):
     """Every second image is darker and tinted. Fitting that gives a better mesh than painting it in."""
     _, dataset, mesh = scene
@@ -523,6 +524,7 @@ finetune(convert(cloud), dataset, make_config(steps=40), run=run)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_killed_at_random_moments_nothing_is_lost(tmp_path):
     """SIGKILL, which no program can answer; then the run goes on from its checkpoint to the same bits."""

@@ -62,6 +62,7 @@ def test_the_reported_score_is_that_of_the_cut_mesh(scene):
     assert seen[-1].held_out == pytest.approx(score(tuned, dataset), abs=0.02)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(("soft_share", "opaque_share"), [(0.0, 1.0), (0.3, 1.0), (0.1, 0.2)])
 def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, soft_share, opaque_share):
     dataset, mesh = scene
@@ -133,6 +134,7 @@ def test_a_run_keeps_its_budget(scene, soft_share):
     assert solid + bool(soft_share) <= len(tuned.faces) <= (0.1 + soft_share) * len(mesh.faces)
 
 
+@pytest.mark.slow
 def test_a_budget_costs_less_than_its_triangles(scene):
     """Polygons in place of fans: a fifth of the triangles for less than a dB."""
     dataset, _ = scene
@@ -226,6 +228,7 @@ def is_blended(mesh: SplatMesh) -> np.ndarray:
     return ~solid_faces(mesh)
 
 
+@pytest.mark.slow
 def test_fog_stays_blended(foggy):
     dataset, mesh, solid_splats = foggy
     config = make_config(steps=96, opacity="cutoff")

@@ -32,6 +32,7 @@ def test_the_default_conversion_keeps_its_quality(cloud, look, sh_degree, expect
     assert found.psnr == pytest.approx(expected, abs=TOLERANCE)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("look", "preset", "before", "after"),
     [

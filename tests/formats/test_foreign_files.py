@@ -252,6 +252,7 @@ def test_a_checkpoint_that_cannot_be_unpacked_is_named(tmp_path):
         load_gaussians(path)
 
 
+@pytest.mark.slow
 def test_the_line_for_gsplats_checkpoints_works(tmp_path):
     torch = pytest.importorskip("torch")
     plain = load_gaussians(write_ply(tmp_path / "_source.ply", [splat_table(SPLATS)]))

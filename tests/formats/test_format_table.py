@@ -174,6 +174,7 @@ def test_the_table_in_the_documents_says_what_is_written():
     assert rows == ["; ".join(kind.written_as for kind in FORMATS if kind.written)]
 
 
+@pytest.mark.slow
 def test_every_written_format_has_its_writer_and_is_read_back(tmp_path):
     cloud = few_splats()
     for kind in FORMATS:

@@ -76,6 +76,7 @@ def test_an_array_of_splats_that_is_declared_comes_back(tmp_path, monkeypatch, s
                 load_mesh(path)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".usdc", ".usda", ".obj"])
 def test_the_filter_of_the_splats_stays(tmp_path, suffix):
     """Programs that draw without it get a warning, and .obj files cannot hold it."""

@@ -425,6 +425,7 @@ def our_mesh(extras=True):
     return replace(mesh, vertices=mesh.vertices / 100, origin=FAR + 0.1, up=(0.1, -0.9, 0.3))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("suffix", [".npz", ".ply", ".glb", ".usdc", ".usda"])
 def test_our_meshes_come_back_exactly(tmp_path, suffix):
     if suffix.startswith(".usd"):

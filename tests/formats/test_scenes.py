@@ -33,6 +33,7 @@ def need_usd(suffix):
         pytest.importorskip("pxr")
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("suffix", [".glb", ".usdc", ".usda"])
 @pytest.mark.parametrize("away", [0, 4.5e6])
 def test_each_reader_finds_its_part(tmp_path, suffix, away):

@@ -66,6 +66,7 @@ def said(path, **options):
     return [str(warning.message) for warning in found]
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("span", [1, 255])
 @pytest.mark.parametrize(
     "which",
@@ -101,6 +102,7 @@ def test_few_splats_are_no_reason(tmp_path, count):
     said(saved(tmp_path / "a.ply", activated(ball(count=count), "scales", "opacities", "colors")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1, 300])
 def test_captures_are_not_doubted(tmp_path, scale):
     """Real scenes, also in a unit in which all logarithms are above 0."""

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("resource", reason="the fuzzer limits its memory, which this system cannot")
 
 
+@pytest.mark.slow
 def test_mutated_files_give_an_answer(tmp_path):
     command = [
         sys.executable,

@@ -302,6 +302,7 @@ def test_streamed_sog(tmp_path, name):
     check(tmp_path / "scene", message)
 
 
+@pytest.mark.slow
 def test_parts_that_each_unpack_far_do_not_do_so_together(tmp_path):
     """50 parts of a few kilobytes, each of which may have 260,000 equal splats."""
     side, count = 512, 50
@@ -325,6 +326,7 @@ def test_parts_that_each_unpack_far_do_not_do_so_together(tmp_path):
     refused(tmp_path / "lod-meta.json", "the splats of 'p[0-9]+/meta.json' would take the data beyond", 600e6)
 
 
+@pytest.mark.slow
 def test_many_names_of_one_part_do_not_multiply_its_splats(tmp_path):
     index = {"tree": {"children": [tree()] * 100_000}}
     for file_name, data in streamed(**index).items():

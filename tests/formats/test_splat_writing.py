@@ -77,6 +77,7 @@ def loss(cloud, other):
 # ---- What is kept
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("suffix", EXACT)
 @pytest.mark.parametrize("degree", [0, 3])
 def test_float_formats_keep_everything(tmp_path, suffix, degree):
@@ -209,6 +210,7 @@ def test_harmonics_keep_what_their_format_has_bits_for(tmp_path):
     assert error.max() < 0.05
 
 
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize("suffix", [*EXACT, *QUANTISED])
 @pytest.mark.parametrize("n", [1, 2, 257])
 def test_any_number_of_splats_and_the_ends_of_ranges(tmp_path, suffix, n):
@@ -491,6 +493,7 @@ def test_linear_usd_has_linear_colours(tmp_path):
 # ---- Real splats
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["playbot_lod3_31k_sh2.ply", "guitar_sh0.ply"])
 def test_real_splats_lose_little(tmp_path, name):
     cloud = ms.load_gaussians(shared_data(f"splats/{name}"))

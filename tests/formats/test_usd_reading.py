@@ -41,6 +41,7 @@ def read(folder: Path, text: str) -> tuple[dict[str, np.ndarray], dict]:
         return dict(arrays), report
 
 
+@pytest.mark.slow(keep=1)
 @needs_usd
 @pytest.mark.parametrize(
     ("suffix", "mesh", "lit"),
@@ -229,6 +230,7 @@ def test_what_happens_to_the_other_process_is_an_error_here(tmp_path, monkeypatc
         load_mesh(tmp_path / "m.usda")
 
 
+@pytest.mark.slow
 @needs_usd
 def test_instances_of_instances_do_not_eat_memory(tmp_path):
     """2^40 triangles in a file of 5 kB."""

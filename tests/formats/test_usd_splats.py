@@ -53,6 +53,7 @@ def test_transforms_place_the_splats(tmp_path):
     np.testing.assert_allclose(cloud.scales, plain.scales * 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_as_the_schema_says(tmp_path):
     cloud = read(tmp_path, drop=("opacities", "orientations", "scales"))
     assert (cloud.opacities == 1).all()
@@ -65,6 +66,7 @@ def test_what_is_missing_is_as_the_schema_says(tmp_path):
         read(tmp_path, drop=("positions",))
 
 
+@pytest.mark.slow
 def test_colours_are_linear_only_where_the_file_says_so(tmp_path):
     plain = read(tmp_path)
     np.testing.assert_array_equal(read(tmp_path, colors="srgb_rec709_scene").sh, plain.sh)
@@ -81,6 +83,7 @@ def test_harmonics_beyond_degree_3_are_left_out_with_a_word(tmp_path):
     np.testing.assert_allclose(cloud.sh, expected_cloud(values)["sh"][:, :16], atol=1e-5)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -103,6 +106,7 @@ def test_what_is_invisible_is_not_read(tmp_path):
         read(tmp_path, xform='token visibility = "invisible"')
 
 
+@pytest.mark.slow
 def test_packages_are_read_by_their_first_file(tmp_path):
     from pxr import Sdf
 

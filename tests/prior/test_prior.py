@@ -296,6 +296,7 @@ def test_any_base_will_do(kind):
         assert (np.einsum("ij,ij->i", normals, prior.mesh.vertices)[at_corner] > 0.8).all()
 
 
+@pytest.mark.slow
 def test_a_million_faces():
     n = 708
     x, y = np.meshgrid(np.arange(n + 1, dtype=np.float32), np.arange(n + 1, dtype=np.float32))

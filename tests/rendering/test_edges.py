@@ -69,6 +69,7 @@ def test_a_larger_area_shows_more_of_the_triangle():
     assert np.abs(found[:, 2] - inward).max() < 0.02 * np.abs(inward).max()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("seed", [None, 1, 2])
 def test_gradients_are_differences_of_the_area_means(seed):
     view = VIEW if seed is None else turned(VIEW, seed)

@@ -64,6 +64,7 @@ def runaway(path, count=20_000):
     return cloud
 
 
+@pytest.mark.slow
 def test_nobody_waits_for_the_preview_of_a_runaway_scene(tmp_path, capsys):
     runaway(tmp_path / "a.ply")
     start = time.process_time()

@@ -59,6 +59,7 @@ def painted(mesh, order, view, towards, samples=1, **options):
     return image.color, *found
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_equal_to_float64(name, samples):
@@ -73,6 +74,7 @@ def test_equal_to_float64(name, samples):
         assert np.linalg.norm(a - b) < 2e-3 * np.linalg.norm(b), np.linalg.norm(a - b) / np.linalg.norm(b)
 
 
+@pytest.mark.slow
 def test_the_reference_agrees_with_differences():
     mesh, view = fans(), orbit(fans(), 1, width=24, height=20)[0]
     order = drawing_order(mesh, nodes=2)

@@ -100,6 +100,7 @@ def test_solved_is_better_than_quick_and_quick_than_the_index(mesh):
     assert scores[0] > scores[1] + 1 > index + 1, (scores, index)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes", [1, 4])
 def test_an_independent_viewer_draws_the_file_alike(mesh, tmp_path, nodes):
     order = drawing_order(mesh, nodes=nodes)

@@ -54,6 +54,7 @@ def test_a_ramp_of_a_pixel_is_the_covered_share():
     assert np.abs(soft - exact)[edge].mean() < 0.05
 
 
+@pytest.mark.slow(keep=9)
 @pytest.mark.parametrize("samples", [1, 2])
 @pytest.mark.parametrize("leak", [0.0, 0.05])
 @pytest.mark.parametrize("shape", [(0.2, 0.3, 4.0, 1.0), (0.4, 0.5, 1e6, 3.0), (0.3, 0.4, 2.0, 0.0)])

@@ -100,6 +100,7 @@ def error(found, truth, least: float = 0) -> float:
     return float((found.double() - truth).norm() / max(truth.norm(), least * truth.numel() ** 0.5))
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", SCENES)
 def test_equal_to_float64(name):
     mesh, cameras, options = scene(name)
@@ -277,6 +278,7 @@ def test_calls_at_the_same_time_do_not_disturb_each_other():
         assert list(pool.map(digest_of, numbers)) == [alone[number] for number in numbers]
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("variant", library.VARIANTS)
 def test_same_gradients_on_every_instruction_set(variant, tmp_path):
     """But for rounding: fused multiply-adds are used where there are some. (Images: the same bits.)"""

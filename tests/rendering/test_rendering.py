@@ -177,6 +177,7 @@ def test_ties_where_planes_cross(count):
     assert differs[8]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depths", ["apart", "the same", "nearly the same"])
 def test_five_thousand_layers(depths):
     rng = np.random.default_rng(2)

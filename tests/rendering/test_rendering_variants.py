@@ -69,6 +69,7 @@ def in_another_process(code: str, **environment: str) -> str:
     return result.stdout.strip()
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("number", range(9))
 def test_threads_do_not_change_a_bit(number):
     scene = list(scenes())[number]
@@ -78,6 +79,7 @@ def test_threads_do_not_change_a_bit(number):
         assert_same_bits(one, scene(threads=threads))
 
 
+@pytest.mark.slow
 def test_variants_do_not_change_a_bit():
     variants = library.available_variants()
     if len(variants) < 2:

@@ -75,6 +75,7 @@ def scenes() -> dict[str, tuple[SplatMesh, dict]]:
 SCENES = scenes()
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("extras", [{}, EXTRAS], ids=["color", "all outputs"])
 def test_equal_to_float64(name, extras):
@@ -228,6 +229,7 @@ def test_threads_and_tapes_change_no_gradient(name):
 torch_scenes = [name for name in SCENES if name != "opaque"]
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", torch_scenes)
 def test_gradients_equal_to_float64(name):
     torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[torch]'")

@@ -94,6 +94,7 @@ def test_texels_take_the_colours_of_the_images():
     assert after > 28
 
 
+@pytest.mark.slow
 @needs_scipy
 def test_a_ball_of_the_wrong_size_is_fitted_to_images():
     truth = ball()

@@ -230,6 +230,7 @@ def test_a_collider_lies_where_the_mesh_is_in_other_programs(tmp_path):
     assert len(collider.faces) == pytest.approx(200, abs=2)
 
 
+@pytest.mark.slow
 @needs_extra
 def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
@@ -251,6 +252,7 @@ def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
     assert "mesh.npz: a mesh, not splats" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @needs_extra
 def test_a_base_of_real_splats_looks_like_them():
     from meshsplats import orbit, render, render_splats

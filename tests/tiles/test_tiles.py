@@ -125,6 +125,7 @@ def walk(file, most_error):
             todo.append((child, depth + 1))
 
 
+@pytest.mark.slow
 def test_every_splat_is_in_one_leaf_and_every_box_holds_its_tiles(splats, tileset):
     tiles = list(walk(tileset / "tileset.json", np.inf))
     assert len(tiles) > 20
@@ -191,12 +192,14 @@ def test_the_geometric_error_is_how_far_splats_are_moved(splats, tmp_path):
 # ---- Determinism, interruptions
 
 
+@pytest.mark.slow
 def test_threads_and_blocks_do_not_matter(splats, tileset, tmp_path):
     for i, (threads, block) in enumerate([(1, 777), (2, 50_000)]):
         build_tiles(stream_gaussians(splats, block=block), tmp_path / str(i), SMALL, threads=threads)
         assert digest(tmp_path / str(i)) == digest(tileset)
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_anywhere_is_resumed(splats, tileset, tmp_path, monkeypatch):
     """An error at one file after the other, until a run comes to its end."""
     out = tmp_path / "tiles"
@@ -237,6 +240,7 @@ def materials(folder):
     return [read_glb(path)[0]["materials"][0] for path in sorted(folder.rglob("*.glb"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", ["blend", "mask"])
 def test_one_alpha_mode_is_chosen_for_all_tiles(splats, tmp_path, monkeypatch, alpha):
     chosen = AlphaChoice(alpha, 0.3, 20.0, 19.0 if alpha == "blend" else 21.0)
@@ -277,6 +281,7 @@ def test_one_alpha_mode_is_chosen_for_all_tiles(splats, tmp_path, monkeypatch, a
         np.testing.assert_array_equal(mesh.vertices[: len(farthest.vertices)], farthest.vertices)
 
 
+@pytest.mark.slow
 def test_alpha_modes_that_are_asked_for(splats, tmp_path, monkeypatch):
     monkeypatch.setattr(building, "choose_by_views", None)
     for alpha in ("blend", "mask", "opaque"):
@@ -308,6 +313,7 @@ building.build_tiles(
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_run_is_resumed(splats, tileset, tmp_path):
     out = tmp_path / "tiles"
@@ -597,6 +603,7 @@ def test_a_tileset_file_is_read_once(tileset, monkeypatch):
 # ---- Commands
 
 
+@pytest.mark.slow
 def test_commands(splats, tileset, tmp_path, capsys):
     out = tmp_path / "tileset"
     assert main(["tiles", str(splats), "-o", str(out), "--max-triangles", "4096", "--json"]) == 0

@@ -77,6 +77,7 @@ def test_opaque_tiles_have_them_too(splats, tmp_path):
     assert root.sh_degree == 1
 
 
+@pytest.mark.slow
 def test_they_are_left_out_unless_asked_for(splats, tileset, tmp_path, capsys):
     base, none = tmp_path / "base", tmp_path / "none"
     assert main(["tiles", str(splats), "-o", str(base), "--max-triangles", "4096", "--alpha", "mask"]) == 0

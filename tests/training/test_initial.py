@@ -81,6 +81,7 @@ def test_silhouettes_need_alpha_that_leaves_something_out(ball, room):
     assert not has_silhouettes([replace(view, source=full)])
 
 
+@pytest.mark.slow
 def test_one_view_with_alpha_is_enough_for_silhouettes(ball, room):
     """Whichever it is; the others take no part."""
     assert has_silhouettes([room[0], ball[1]])
@@ -107,6 +108,7 @@ def test_large_silhouettes_are_made_smaller(ball, monkeypatch):
         assert np.quantile(radius, 0.9) < 1.15 + surface.side
 
 
+@pytest.mark.slow
 def test_a_hull_has_a_largest_number_of_cells(ball, monkeypatch):
     fine = carve(ball, 4000)
     monkeypatch.setattr(hull, "MOST_CELLS", 100_000)
@@ -143,6 +145,7 @@ def test_ranges_of_depth_hold_the_points(room):
     assert np.isfinite(ranges_of_points([turned, *room[1:]], few)[0]).all()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("masked", [True, False])
 def test_the_start_has_the_scale_of_the_scene(masked):
     starts = []
@@ -205,6 +208,7 @@ def test_known_points_are_part_of_the_start(room):
     assert (np.abs(patches.colors - [1, 0, 1]).max(axis=1) < 0.1).sum() >= 2
 
 
+@pytest.mark.slow
 def test_colours_are_those_of_the_photographs(ball):
     patches, _ = starting_patches(ball, 1500)
     mesh = fans_of(flat_splats(patches), 6)
@@ -218,6 +222,7 @@ def test_colours_are_those_of_the_photographs(ball):
     assert np.array_equal(tinted.colors[:, 3], grey.colors[:, 3])
 
 
+@pytest.mark.slow
 def test_colours_are_corrected_by_their_errors(ball, monkeypatch):
     patches, _ = starting_patches(ball, 1500)
     mesh = fans_of(flat_splats(patches), 6)

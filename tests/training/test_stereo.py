@@ -107,6 +107,7 @@ def test_points_and_normals_lie_on_the_plane():
     assert np.median(np.abs(patches.axes[:, 2] @ normal)) > 0.99
 
 
+@pytest.mark.slow
 def test_outlines_are_not_widened():
     """A square in front of a wall: what is confirmed lies on one of them, and the wall right beside the
     square hardly takes its depth."""
@@ -330,6 +331,7 @@ print(load_core().ms_variant().decode(), digest(depths))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", available_variants())
 def test_every_instruction_set_gives_the_same_bits(variant):
     here = Path(__file__).resolve().parent

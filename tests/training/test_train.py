@@ -135,6 +135,7 @@ def test_a_ball_is_recovered_from_its_photographs(ball, start, trained):
     assert after > before + 4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_a_scene_without_masks_is_recovered_too(room):
     config = train_config(steps=100, start_splats=1500, max_splats=2000, growth_events=2)
@@ -144,6 +145,7 @@ def test_a_scene_without_masks_is_recovered_too(room):
     assert not mesh.attributes
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_growth_is_worth_its_fans(ball, trained):
     still = train(ball, train_config(steps=120, **SMALL | {"growth_events": 0}))
@@ -151,6 +153,7 @@ def test_growth_is_worth_its_fans(ball, trained):
     assert psnr_of(trained, ball) > psnr_of(still, ball) + 0.5
 
 
+@pytest.mark.slow
 def test_the_budget_holds(ball, trained):
     assert fan_count(trained) == trained.splat_count <= 600
     tight = train(ball, train_config(steps=20, start_splats=600, max_splats=100))
@@ -169,6 +172,7 @@ def test_the_start_fills_the_budget():
     assert train_config(max_splats=1).first_splats(True) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["ball", "room"])
 def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
     """The others still give a mesh, and none of them is named, not even blurred ones."""
@@ -185,6 +189,7 @@ def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
     assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_changing_light_is_fitted(ball):
     """Each photograph has a gain of its own; held-out views have their mean."""
@@ -199,6 +204,7 @@ def test_changing_light_is_fitted(ball):
     assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_photographs_that_fit_are_not_named(ball, recwarn):
     train(ball, train_config(steps=60, **SMALL))
@@ -405,6 +411,7 @@ def test_shapes_decay_in_each_step_as_the_learning_rate_falls(ball, start):
     np.testing.assert_allclose(mesh.vertices, ellipses.reshape(-1, 3) + left * distance, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_fans_of_a_training_are_nearly_ellipses(trained, ball):
     def distance(mesh: SplatMesh) -> float:
@@ -493,6 +500,7 @@ def test_the_schedule_grows_images_and_budget():
 # ---- Runs
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads(ball):
     config = train_config(steps=12, **SMALL)
     meshes = [train(ball, config, run=RunOptions(threads=n)) for n in (1, 2)]
@@ -500,6 +508,7 @@ def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads(ball):
     assert not same(meshes[0], train(ball, replace(config, seed=1)))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_a_resumed_run_ends_with_the_same_bits(ball, tmp_path):
     """Stopped before, between and after growth, with exposures; each time the mesh so far is there."""
@@ -576,6 +585,7 @@ def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_training_on_the_gpu_is_that_of_the_processor(ball, monkeypatch):
     """Steps stay there: arrays come back when fans grow, and at the end."""
     need_gpu()
@@ -722,6 +732,7 @@ def test_other_meshes_do_not_become_splats(trained):
 # ---- The command
 
 
+@pytest.mark.slow
 def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     views = ball.train[:12]
     images = [straight(view) for view in views]

@@ -89,6 +89,7 @@ def moved(before: tuple, after: tuple) -> float:
 # ---- The view
 
 
+@pytest.mark.slow
 def test_dragging_orbits_around_the_pivot(page):
     before = pose(page)
     page.drag(100, 80, 40, 0)
@@ -147,6 +148,7 @@ def test_the_wheel_and_plus_and_minus_zoom(page):
     assert moved(before, pose(page)) < 0.02
 
 
+@pytest.mark.slow
 def test_letters_fly_and_shift_flies_faster(page):
     directions = {
         "w": (0, 0, 1),
@@ -283,6 +285,7 @@ def layered_splats(camera: ms.Camera) -> ms.SplatMesh:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [False, True], ids=["fans", "shared vertices"])
 def test_webgl_draws_meshes_in_the_order_of_their_splats(browser, write_page, cameras, shared):
     mesh = layered_splats(cameras[0])
@@ -389,6 +392,7 @@ def test_background_and_exposure(page):
     assert (bright[drawn].mean(axis=0) > blue[drawn].mean(axis=0) + 20).all()
 
 
+@pytest.mark.slow
 def test_the_crop_box_hides_what_is_outside_and_shows_its_edges(page, mesh):
     whole = page.screenshot().astype(int)
     count = len(mesh.faces)
@@ -433,6 +437,7 @@ def test_statistics_say_what_is_drawn(page, mesh, cloud):
     assert re.fullmatch(r"[\d.]+ bytes a triangle", rows["data"])
 
 
+@pytest.mark.slow
 def test_the_panel_closes_and_everything_can_be_hidden(browser, url):
     page = open_page(browser, url, 1000, 700)
     shown = "getComputedStyle(document.querySelector('#{}')).display !== 'none'"
@@ -463,6 +468,7 @@ def test_the_panel_closes_and_everything_can_be_hidden(browser, url):
     page.close()
 
 
+@pytest.mark.slow
 def test_every_control_has_a_name_and_is_reached_by_tab(browser, url):
     page = open_page(browser, url, 1000, 700)
     page.run("for (const d of document.querySelectorAll('details')) d.open = true")
@@ -492,6 +498,7 @@ def test_every_control_has_a_name_and_is_reached_by_tab(browser, url):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_phone_gets_the_scene_first_and_large_controls(browser, url):
     page = open_page(browser, url, 390, 844, mobile=True, ratio=2)
     assert page.run("document.querySelector('#panel').classList.contains('closed')")
@@ -509,6 +516,7 @@ def test_a_phone_gets_the_scene_first_and_large_controls(browser, url):
     page.close()
 
 
+@pytest.mark.slow
 def test_cameras_are_flown_to_unless_motion_is_unwelcome(browser, url):
     for reduced in (False, True):
         page = open_page(browser, url, reduced_motion=reduced)
@@ -643,6 +651,7 @@ def drawn_at_rest(page: Page) -> list[list]:
     return page.run("window.drawn")
 
 
+@pytest.mark.slow
 def test_many_triangles_are_drawn_in_parts_by_their_indices(large_page):
     page, mesh, camera = large_page
     counts = [count for name, count in drawn_at_rest(page) if name == "drawElements"]
@@ -654,6 +663,7 @@ def test_many_triangles_are_drawn_in_parts_by_their_indices(large_page):
     assert ms.psnr(image, ms.render(mesh, camera, samples=2).color) > 26
 
 
+@pytest.mark.slow
 def test_a_movement_ends_the_drawing_of_what_is_no_longer_wanted(large_page):
     page, mesh, _ = large_page
     drawn_at_rest(page)
@@ -686,6 +696,7 @@ new MutationObserver(() => {
 """
 
 
+@pytest.mark.slow
 def test_the_coarse_level_comes_first_and_moves_and_the_fine_one_rests(browser, two_levels, mesh, cameras):
     address, coarse = two_levels
     page = open_page(browser, address, cameras[0].width, cameras[0].height, before=COUNTING + LEVELS)
@@ -723,6 +734,7 @@ def test_the_crop_box_crops_both_levels(browser, two_levels, mesh):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_phone_draws_the_coarse_level_and_unpacks_the_fine_one_when_asked(browser, two_levels, mesh):
     address, coarse = two_levels
     page = open_page(browser, address, 390, 844, mobile=True, ratio=2)
@@ -746,6 +758,7 @@ def test_a_phone_draws_the_coarse_level_and_unpacks_the_fine_one_when_asked(brow
     page.close()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(("width", "height", "mobile"), [(390, 844, False), (820, 1180, True)])
 def test_small_screens_and_tablets_are_no_phones(browser, two_levels, width, height, mobile):
     screen = f"for (const [k, v] of [['width', {width}], ['height', {height}]])"
@@ -755,6 +768,7 @@ def test_small_screens_and_tablets_are_no_phones(browser, two_levels, width, hei
     page.close()
 
 
+@pytest.mark.slow
 def test_a_page_without_a_coarse_level_has_no_choice_of_levels(browser, url):
     page = open_page(browser, url, 390, 844, mobile=True)
     assert page.run("document.querySelector('#detailLine').hidden")

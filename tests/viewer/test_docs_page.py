@@ -34,6 +34,7 @@ def site(tmp_path, mesh, cloud):
         server.shutdown()
 
 
+@pytest.mark.slow
 def test_the_scene_is_drawn_within_the_site(browser, site):
     page = browser.page(site, 640, 560)
     inside = "document.querySelector('iframe').contentDocument.body"

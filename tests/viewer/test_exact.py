@@ -69,6 +69,7 @@ def test_the_image_is_that_of_render(page, mesh, cameras):
     assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
 
 
+@pytest.mark.slow
 def test_samples_are_those_of_render(page, mesh, cameras):
     page.choose("#samples", "2")
     page.still(PATIENCE)
@@ -83,6 +84,7 @@ def test_cameras_of_the_list_are_reached_exactly(page, mesh, cameras):
     assert_within_one_level(page, ms.render(mesh, cameras[2]).color)
 
 
+@pytest.mark.slow
 def test_background_and_exposure(page, mesh, cameras):
     page.choose("#background", "#204060")
     page.still(PATIENCE)
@@ -98,6 +100,7 @@ def test_background_and_exposure(page, mesh, cameras):
     assert np.abs(page.screenshot().astype(int) - expected).max() <= 2
 
 
+@pytest.mark.slow
 def test_the_crop_box_leaves_the_same_triangles_as_the_option(page, mesh, cameras):
     page.choose("#crop-x0", "90")
     page.still(PATIENCE)
@@ -161,6 +164,7 @@ def layered(cloud: ms.GaussianCloud, camera: ms.Camera) -> ms.SplatMesh:
     )
 
 
+@pytest.mark.slow
 def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud, cameras):
     odd = replace(layered(cloud, cameras[0]), blending="linear", filter_px2=0.5)
     expected = levels(image_of(odd, cameras[0], (1, 1, 1))[0])
@@ -178,6 +182,7 @@ def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud
     page.close()
 
 
+@pytest.mark.slow
 def test_meshes_in_the_order_of_their_splats(browser, write_page, cloud, cameras):
     """With thick splats, whose planes cross, and with depth groups, which have no effect."""
     splats = cloud.take(np.arange(0, len(cloud), 2))
@@ -198,6 +203,7 @@ def test_meshes_in_the_order_of_their_splats(browser, write_page, cloud, cameras
     page.close()
 
 
+@pytest.mark.slow
 def test_strays_cost_the_others_nothing(browser, write_page, cloud, cameras):
     """One splat far away, one of a giant's size that cuts the scene, and the splats beside them."""
     wild = ms.GaussianCloud(
@@ -236,6 +242,7 @@ def limited(most: int) -> str:
     """
 
 
+@pytest.mark.slow
 def test_bindings_never_exceed_the_limit_of_the_device_and_the_image_is_the_same(
     browser, write_page, mesh, cloud, cameras
 ):
@@ -251,6 +258,7 @@ def test_bindings_never_exceed_the_limit_of_the_device_and_the_image_is_the_same
     page.close()
 
 
+@pytest.mark.slow
 def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(browser, write_page, cameras):
     many = ms.convert(make_scene(3000).of_degree(2))
     address = write_page(many, "parts", cameras=cameras)
@@ -289,6 +297,7 @@ def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(
     page.close()
 
 
+@pytest.mark.slow
 def test_levels_in_the_exact_image(browser, write_page, mesh, cloud, cameras):
     coarse = ms.convert(ms.simplify(cloud, 60))
     page = open_page(browser, write_page(mesh, "exact-levels", coarse=coarse, cameras=cameras))
@@ -315,6 +324,7 @@ def glowing(cloud: ms.GaussianCloud, terms: int) -> ms.SplatMesh:
     return replace(mesh, colors=mesh.colors * [1.5, 1.5, 1.5, 1], harmonics=harmonics)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("renderer", ["exact", "sorted"])
 @pytest.mark.parametrize("terms", [3, 8, 15])
 def test_colours_depend_on_the_view(browser, write_page, cloud, cameras, terms, renderer):

@@ -213,6 +213,7 @@ def test_the_same_mesh_gives_the_same_bytes():
     assert quantise_mesh(mesh).data == quantise_mesh(mesh).data
 
 
+@pytest.mark.slow
 def test_the_size_is_estimated_from_a_part():
     cloud = make_scene(40_000)
     mesh = ms.convert(cloud)

@@ -21,6 +21,7 @@ def address(tmp_path_factory):
     return write_page(tmp_path_factory.mktemp("screens"))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", SCREENS)
 def test_the_screen_is_that_of_the_reference(browser, address, name):
     with Image.open(REFERENCES / f"{name}.png") as image:

@@ -97,6 +97,7 @@ def test_views_of_a_room_look_in_several_directions_from_the_start(found):
     assert np.linalg.norm(gazes(found.cameras).mean(axis=0)) < 0.8
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_bit(found):
     again = find_cameras(room(), COUNT, threads=1)
     for a, b in zip(found.cameras, again.cameras, strict=True):
@@ -106,12 +107,14 @@ def test_threads_do_not_change_a_bit(found):
     assert found.ground == again.ground
 
 
+@pytest.mark.slow
 def test_fewer_views_are_the_first_of_more(found):
     fewer = find_cameras(room(), 5, threads=2)
     for a, b in zip(fewer.cameras, found.cameras[:5], strict=True):
         assert np.array_equal(a.world_to_camera, b.world_to_camera)
 
 
+@pytest.mark.slow
 def test_cameras_move_with_the_scene(found):
     # A quarter turn around the vertical (the default of up stays) and a power of two round nothing.
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
@@ -122,6 +125,7 @@ def test_cameras_move_with_the_scene(found):
     assert np.abs(gazes(found.cameras) @ turn.T - gazes(there.cameras)).max() < 0.001
 
 
+@pytest.mark.slow
 def test_a_given_up_is_kept(found):
     tilted = np.array([0.0, -1, 0.2]) / np.linalg.norm([0, 1, 0.2])
     answer = find_cameras(replace(room(4000), up=tilted), 2, threads=2)
@@ -150,6 +154,7 @@ def test_the_widest_lens_of_a_good_picture(found):
     assert view.with_lens(2, 800, 600).fx == pytest.approx(found.cameras[0].fx * 2 * 600 / 400)
 
 
+@pytest.mark.slow
 def test_targets_of_a_room_are_its_inside():
     auto = splat_dataset(room(), train=4, test=2, width=32, threads=2)
     for view in (*auto.train, *auto.test):
@@ -160,6 +165,7 @@ def test_targets_of_a_room_are_its_inside():
         splat_dataset(room(2000, 10), placement="outside")
 
 
+@pytest.mark.slow
 def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys):
     pytest.importorskip("PIL")
     save_gaussians(room(4000, 600), tmp_path / "room.ply")
@@ -175,6 +181,7 @@ def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys):
     assert main(["cameras", str(tmp_path / "room.ply"), "-o", str(tmp_path / "c.txt")]) == 2
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("name", "kinds"),
     [

@@ -77,6 +77,7 @@ OPTIONS = [
 ]
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda options: ", ".join(options) or "default")
 def test_steps_are_those_of_the_cpu(scene, options):
     need_gpu()
@@ -106,6 +107,7 @@ def dark_with_harmonics(mesh, terms: int):
     return replace(mesh, colors=mesh.colors * np.array([0.5, 0.5, 0.5, 1], np.float32), harmonics=harmonics)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("terms", [3, 8, 15])
 @pytest.mark.parametrize("options", [{}, {"harmonics_rate": 0.0}, {"position_rate": 0.0, "epsilon": 1e-3}])
 def test_steps_with_harmonics_are_those_of_the_cpu(scene, terms, options):
@@ -168,6 +170,7 @@ def test_steps_in_the_order_of_the_splats_are_those_of_the_cpu(scene):
     assert np.linalg.norm(known.colors - exact.colors) > 20 * CHANGES * change  # the order matters here
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("options", [{}, {"exposure": True}], ids=["default", "exposure"])
 def test_the_default_loss_as_a_function_has_the_steps_of_the_gpus_own(scene, options):
     need_gpu()
@@ -264,6 +267,7 @@ def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
     assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
+@pytest.mark.slow
 def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
     need_gpu()
     expected, known = steps(scene, "gpu")
@@ -326,6 +330,7 @@ def test_the_same_bits_every_time(scene):
     assert one.colors.tobytes() == two.colors.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"opacity_decay": 0.01}], ids=lambda options: ", ".join(options))
 def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch, options):
     """Also where it stops between an image that has too many fragments and one that has not."""
@@ -365,6 +370,7 @@ def test_a_broken_limit_of_windows_is_refused(scene, value):
         )
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("terms", [0, 15])
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path, terms):
     need_gpu()
@@ -487,6 +493,7 @@ def test_without_wgpu_there_is_an_error_and_nothing_is_written(scene, tmp_path, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.npz"]
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path):
     need_gpu()
     from meshsplats import load_mesh, save_gaussians

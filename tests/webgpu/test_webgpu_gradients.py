@@ -118,6 +118,7 @@ def bits(arrays) -> list[bytes]:
     return [array.tobytes() for array in arrays]
 
 
+@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize("name", SCENES)
 def test_equal_to_the_core(name):
     mesh, view, options = scene(name)
@@ -174,6 +175,7 @@ def test_the_image_is_that_of_render():
     assert taped.fragments == image.fragments
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["piercing", "many layers"])
 def test_the_same_bits_every_time(name):
     mesh, view, options = scene(name)
@@ -192,6 +194,7 @@ def renderer_of(mesh: SplatMesh) -> GradientRenderer:
     return GPU.gradients_of(mesh.triangles)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("queues", [(4, 4), (24, 8)])
 def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     mesh, view, _ = scene("many layers")
@@ -206,6 +209,7 @@ def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     assert found(DrawSettings(queue=queues[0], long_queue=queues[1])) == usual
 
 
+@pytest.mark.slow
 def test_in_windows_where_a_tape_does_not_fit(monkeypatch):
     mesh, view, _ = scene("across tiles")
     gradient = random_gradient(view)

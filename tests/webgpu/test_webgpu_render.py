@@ -245,6 +245,7 @@ def test_no_triangles_and_none_in_view():
 # Bounded work and memory
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("queues", [(4, 4), (8, 24), (24, 8)])
 def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     mesh, view = many_triangles()
@@ -258,6 +259,7 @@ def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     assert again.work == usual.work
 
 
+@pytest.mark.slow
 def test_hundreds_of_layers_behind_each_other_are_walked_again():
     mesh, view = layers(np.full(700, 2.0), 0.003), camera(11, 9)
     images = draw(mesh, view, DrawSettings(queue=4, long_queue=8))
@@ -381,6 +383,7 @@ def test_the_plane_of_a_depth_group_is_that_of_its_largest_triangle():
 # Real scenes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["playbot_lod5_3k_sh2.ply", "guitar_sh0.ply"])
 def test_real_scenes(name):
     mesh = convert(load_gaussians(shared_data(f"splats/{name}")))

@@ -36,6 +36,7 @@ def fans_behind_each_other() -> tuple[SplatMesh, Camera]:
 # Images
 
 
+@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("extras", [{}, EXTRAS], ids=["color", "all outputs"])
 def test_equal_to_the_core(name, extras):
@@ -224,6 +225,7 @@ def test_gradients_have_the_same_bits_every_time_and_with_any_budget(monkeypatch
     assert result == usual
 
 
+@pytest.mark.slow
 def test_gradients_in_windows_where_a_tape_does_not_fit(monkeypatch):
     mesh, view = fans_behind_each_other()
     gradient = random_gradient(view)

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 from typing import Any
 
 import numpy as np
 
 from meshsplats.blender.inside import frame
 from meshsplats.colors import linear_to_srgb
+from meshsplats.formats.gltf.view_colors import put_back, stored_colors
 from meshsplats.mesh import Blending, SplatMesh
+from meshsplats.spherical_harmonics import moved_harmonics
 
 _OPACITIES = ("displayOpacity",)
 """Attributes that hold opacity apart from colour, as in USD."""
 _OWNERS = ("face_splat", "splat")
 """Face attributes that may hold the index of the splat."""
+_LONGEST_NOTE = 100_000
+_FROM_GLTF = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
+"""Rotation by which Blender's importer turns the vertices of a .glb."""
 
 
 def splat_mesh(obj: Any) -> SplatMesh:
@@ -42,26 +48,65 @@ def splat_mesh(obj: Any) -> SplatMesh:
         if name in data.attributes and data.attributes[name].data_type == "FLOAT":
             colors[:, 3] = _at_vertices(data, data.attributes[name], "value", 1, faces)[:, 0]
     colors = np.nan_to_num(np.clip(colors, 0, 1))
-    blending = _blending(data)
+    note = _note(data)
+    blending: Blending = "linear" if note.get("blending") == "linear" else "display"
     if blending == "display":
         colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
-    return SplatMesh(
-        vertices.reshape(-1, 3),
-        faces.reshape(-1, 3),
-        colors,
-        face_splat=_owner(data),
-        up=frame.up_of(obj),
-        blending=blending,
-    )
+    arrays = {
+        "vertices": vertices.reshape(-1, 3),
+        "faces": faces.reshape(-1, 3),
+        "colors": colors,
+        "face_splat": _owner(data),
+    }
+    arrays |= _view_colors(data, note, arrays)
+    return SplatMesh(**arrays, up=frame.up_of(obj), blending=blending)
 
 
-def _blending(data: Any) -> Blending:
-    """Blending as noted in our .glb files. Blender keeps the note with the mesh: as properties, or, where an
+def _note(data: Any) -> dict[str, Any]:
+    """Our note in a .glb; empty without one. Blender keeps it with the mesh: as properties, or, where an
     integer is too large for one, as Python's text of it."""
     note = data.get("meshsplats")
-    if isinstance(note, str):
-        return "linear" if "'blending': 'linear'" in note else "display"
-    return "linear" if hasattr(note, "get") and note.get("blending") == "linear" else "display"
+    if isinstance(note, str) and len(note) <= _LONGEST_NOTE:
+        try:
+            note = ast.literal_eval(note)
+        except (ValueError, SyntaxError, RecursionError, MemoryError):
+            return {}
+    elif hasattr(note, "to_dict"):
+        note = note.to_dict()
+    return note if isinstance(note, dict) else {}
+
+
+def _view_colors(data: Any, note: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
+    """The ``arrays`` that colours which depend on the view replace or add, where a .glb held them as texture
+    coordinates: Blender's importer drops the attributes that they otherwise are."""
+    try:
+        stored = stored_colors(note, ValueError)
+    except ValueError:
+        return {}
+    layers = data.uv_layers
+    if stored is None or stored.packing != "texcoords" or len(layers) < len(stored.names):
+        return {}
+    tables = {}
+    for name, layer in zip(stored.names, layers, strict=False):
+        flat = np.empty(2 * len(data.loops), np.float32)
+        layer.uv.foreach_get("vector", flat)
+        table = np.zeros((len(arrays["vertices"]), 2), np.float32)
+        table[arrays["faces"].ravel()] = flat.reshape(-1, 2)
+        table[:, 1] = 1 - table[:, 1]  # Blender's start at the lower edge of the image
+        tables[name] = table
+    own = {name: arrays[name].copy() for name in ("faces", "colors")}
+    own["face_splat"] = _fans(own["faces"]) if arrays["face_splat"] is None else arrays["face_splat"]
+    if not put_back(stored, tables, own):
+        return {}
+    if own.get("harmonics") is not None:
+        own["harmonics"] = moved_harmonics(own["harmonics"], _FROM_GLTF)
+    return own
+
+
+def _fans(faces: np.ndarray) -> np.ndarray:
+    """(f,) int32: successive triangles that share a vertex are of one splat."""
+    shared = (faces[1:, :, None] == faces[:-1, None, :]).any(axis=(1, 2))
+    return np.concatenate([[0], np.cumsum(~shared)]).astype(np.int32)
 
 
 def _at_vertices(data: Any, attribute: Any, name: str, width: int, corners: np.ndarray) -> np.ndarray:
