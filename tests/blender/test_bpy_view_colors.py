@@ -79,9 +79,7 @@ def test_an_object_gives_its_harmonics_back(degree):
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_a_glb_with_texture_coordinates_has_its_harmonics_after_a_click(
-    degree, tmp_path
-):
+def test_a_glb_with_texture_coordinates_has_its_harmonics_after_a_click(degree, tmp_path):
     mesh = replace(colorful(degree), up=np.array([0, 0, 1], np.float32))
     save_mesh(mesh, tmp_path / "m.glb", harmonics="texcoords")
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -25,6 +25,7 @@ from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.phase import Moment
+from meshsplats.finetuning.reports import Reports
 from meshsplats.finetuning.run import TrainingLoop, run_start
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import ONE_SAMPLE_SHARE, with_sample_share
@@ -466,6 +467,38 @@ def test_steps_and_growth_draw_as_many_samples(room, monkeypatch):
     train(Dataset(room.train), train_config(**changes))
     judged = len(room.train)
     assert drawn == [1] * (9 + judged) + [2]
+
+
+@pytest.mark.usefixtures("start_found_once")
+@pytest.mark.parametrize("order", ["mesh", "splat"])
+def test_fans_are_blended_whole_at_first_and_in_their_final_order_then(room, monkeypatch, order):
+    drawn, scored = [], []
+
+    def noted(self, triangles, *more, **options):
+        if more[1:]:
+            drawn.append(triangles.order)
+        return tape(self, triangles, *more, **options)
+
+    def noted_scores(self, mesh, *more):
+        scored.append(mesh.order)
+        return scores(self, mesh, *more)
+
+    tape, scores = CpuEngine.tape, Reports.scores
+    monkeypatch.setattr(CpuEngine, "tape", noted)
+    monkeypatch.setattr(Reports, "scores", noted_scores)
+    changes = {
+        **SMALL,
+        "steps": 10,
+        "growth_events": 0,
+        "sh_degree": 0,
+        "by_splat_share": 0.6,
+        "order": order,
+    }
+    mesh = train(room, train_config(**changes), run=RunOptions(report_every=5))
+    last = "splat" if order == "splat" else "fragment"
+    assert drawn == ["splat"] * 6 + [last] * 4
+    assert scored == [last] * 3
+    assert mesh.order == last
 
 
 def test_the_unit_of_the_scene_does_not_matter(start):

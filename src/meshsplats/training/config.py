@@ -63,6 +63,9 @@ class TrainConfig(FinetuneConfig):
     """First share of the run, in which images have a quarter of the photographs' sides."""
     half_share: Annotated[float, Range(0, 1), Advanced] = 0.6
     """Share of the run until which they have half of them; then they have all."""
+    by_splat_share: Annotated[float, Range(0, 1), Advanced] = 0.6
+    """First share of the run, in which fans are blended whole, by their centres, which takes two thirds of
+    the time of exact order; then they are in the order of the result. No difference with order 'splat'."""
     background: BackgroundMode = "mixed"
     """Background of the images. random: a new colour in every step, which masked photographs show around the
     subject, and others where nothing covers it. mixed: random in every fourth step, otherwise that of the

@@ -100,6 +100,7 @@ def train(
         save_mesh(mesh, journal.folder / START)
     clock, views = start.clock(run), start.dataset.train
     phase = Growing(config, mesh, views, clock.fraction, run.cache_bytes)
+    start = replace(start, state=phase.ordered(start.state, clock.fraction))
     loop = TrainingLoop(start, clock, phase, run, on_progress)
     del start
     try:
