@@ -36,6 +36,7 @@ from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training.as_splats import splats_of_fans
+from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growth import (
     HALF,
     NearFields,
@@ -203,6 +204,24 @@ def test_changing_light_is_fitted(ball):
         train(dataset, train_config(steps=120, exposure=e, sh_degree=0, **SMALL)) for e in (False, True)
     )
     assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
+
+
+@pytest.mark.usefixtures("start_found_once")
+def test_exposures_are_fitted_where_photographs_differ(ball, room):
+    rng = np.random.default_rng(5)
+    for data in (room, ball):
+        mesh = starting_fans(data, train_config(steps=1, start_splats=1500, max_splats=2000))
+        assert not exposures_differ(mesh, data.train)
+        warm = [[gain, gain, 0.8] for gain in rng.uniform(0.6, 1.0, len(data.train))]
+        for gains in (np.array(warm, np.float32), rng.uniform(0.6, 1.0, len(data.train))):
+            changed = [lit(view, gain) for view, gain in zip(data.train, gains, strict=True)]
+            assert exposures_differ(mesh, changed)
+            assert not exposures_differ(mesh, changed[:2])  # too few to tell
+    darker = Dataset(tuple(changed))
+    with pytest.warns(DataWarning, match="differ in exposure or white balance"):
+        fitted = train(darker, train_config(steps=3, sh_degree=0, **SMALL))
+    asked = train(darker, train_config(steps=3, sh_degree=0, exposure=True, **SMALL))
+    assert np.array_equal(fitted.colors, asked.colors)
 
 
 @pytest.mark.slow

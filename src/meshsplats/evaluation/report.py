@@ -253,19 +253,25 @@ def masked_ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None, threads: 
 
 
 def fit_exposure_to(image: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """``image`` (h, w, 3) with a gain and an offset per channel, clipped to [0, 1].
+    """``image`` (h, w, 3) with the gain and the offset of ``exposure_between``, clipped to [0, 1]."""
+    gain, offset = exposure_between(image, target, mask)
+    return np.clip(image * gain + offset, 0, 1)
 
-    They are the least-squares fit to ``target`` over ``mask``. A channel without contrast gets an offset
-    only.
-    """
+
+def exposure_between(
+    image: np.ndarray, target: np.ndarray, mask: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) gains and (3,) offsets, float32, by which ``image`` (h, w, 3) fits ``target`` best over ``mask``:
+    least squares. A channel without contrast has an offset only."""
     counted = np.ones(image.shape[:2], bool) if mask is None else mask
-    result = np.empty_like(image)
+    fit = np.empty((2, 3))
     for channel in range(3):
         x, y = (p[..., channel][counted].astype(np.float64) for p in (image, target))
         variance = x.var()
         gain = float(np.mean((x - x.mean()) * (y - y.mean())) / variance) if variance > 1e-12 else 1.0
-        result[..., channel] = image[..., channel] * gain + (y.mean() - gain * x.mean())
-    return np.clip(result, 0, 1)
+        fit[:, channel] = gain, y.mean() - gain * x.mean()
+    gains, offsets = fit.astype(np.float32)
+    return gains, offsets
 
 
 class _GroundTruth(NamedTuple):

@@ -92,9 +92,10 @@ class FinetuneConfig:
     """Share of its opacity that a vertex loses in each step whose view reaches it. It falls as the colour
     learning rate does. Opacities stay high only where the views keep them there: what floats in front of
     surfaces fades, and what is hidden behind others gets gradients. For opacity 'blended'."""
-    exposure: Annotated[bool, With(opacity="blended")] = False
+    exposure: Annotated[bool | None, With(opacity="blended")] = False
     """For photographs: fit a gain and an offset per colour channel for each training image, so that exposure
-    differences are not baked into the mesh. Their means over all images stay 1 and 0."""
+    differences are not baked into the mesh. Their means over all images stay 1 and 0. None, for ``train``:
+    where photographs are found to differ."""
     exposure_rate: Annotated[float, Range(1e-9, 1), With("exposure"), Advanced] = 0.002
     """Adam's learning rate of these gains and offsets."""
     prune_epochs: Annotated[float, Range(0, 1e6), Advanced] = 5.0
@@ -252,7 +253,7 @@ class FinetuneChanges(TypedDict, total=False):
     l2_weight: float
     background: BackgroundMode
     opacity_decay: float
-    exposure: bool
+    exposure: bool | None
     exposure_rate: float
     prune_epochs: float
     prune_opacity: float

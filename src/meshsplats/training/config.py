@@ -37,6 +37,7 @@ class TrainConfig(FinetuneConfig):
     ] = "mesh"
     order: Literal["mesh", "fragment", "splat"] = "mesh"
     one_sample_share: float | None = None
+    exposure: bool | None = None
     opacity_decay: float = 0.003
     epsilon: float = 1e-8
     """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a

@@ -27,6 +27,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.spherical_harmonics import TERMS
 from meshsplats.training.config import TrainConfig, with_train_changes
+from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growing import REDUCED_PART, Growing
 from meshsplats.training.growth import SHELL
 from meshsplats.training.hull import carving_bytes
@@ -93,6 +94,15 @@ def train(
         mesh = _stored_start(journal)
     else:
         mesh = starting_fans(dataset, config, points, run.threads)
+    if config.exposure is None:
+        config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
+        if config.exposure:
+            warnings.warn(
+                "the photographs differ in exposure or white balance: a gain and an offset of each are fitted"
+                " (--exposure False: not)",
+                DataWarning,
+                stacklevel=2,
+            )
     run = replace(run, spent=run.spent + time.perf_counter() - began)
     start = run_start(mesh, dataset, config, run, journal)
     if journal is not None and not run.resume:
