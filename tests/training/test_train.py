@@ -208,9 +208,9 @@ def test_changing_light_is_fitted(ball):
 
 @pytest.mark.usefixtures("start_found_once")
 def test_exposures_are_fitted_where_photographs_differ(ball, room):
-    rng = np.random.default_rng(5)
+    rng, size = np.random.default_rng(5), {"start_splats": 1500, "max_splats": 2000}
     for data in (room, ball):
-        mesh = starting_fans(data, train_config(steps=1, start_splats=1500, max_splats=2000))
+        mesh = starting_fans(data, train_config(steps=1, **size))
         assert not exposures_differ(mesh, data.train)
         warm = [[gain, gain, 0.8] for gain in rng.uniform(0.6, 1.0, len(data.train))]
         for gains in (np.array(warm, np.float32), rng.uniform(0.6, 1.0, len(data.train))):
@@ -219,8 +219,8 @@ def test_exposures_are_fitted_where_photographs_differ(ball, room):
             assert not exposures_differ(mesh, changed[:2])  # too few to tell
     darker = Dataset(tuple(changed))
     with pytest.warns(DataWarning, match="differ in exposure or white balance"):
-        fitted = train(darker, train_config(steps=3, sh_degree=0, **SMALL))
-    asked = train(darker, train_config(steps=3, sh_degree=0, exposure=True, **SMALL))
+        fitted = train(darker, train_config(steps=3, sh_degree=0, **size))
+    asked = train(darker, train_config(steps=3, sh_degree=0, exposure=True, **size))
     assert np.array_equal(fitted.colors, asked.colors)
 
 
