@@ -32,13 +32,16 @@ from meshsplats.demo_scene.city import city_blocks
 from meshsplats.training.run import starting_fans
 
 SCENES = {name: PHOTOGRAPHED[name] for name in ("lego", "snowmiku")} | {
-    name: Scene(name, "", f"photos/{name}") for name in ("bonsai", "saharov")
+    name: Scene(name, "", f"photos/{name}") for name in ("bonsai", "saharov", "dtu65")
 }
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "no growth": {"growth_events": 0},
     "all images at full size": {"quarter_share": 0.0, "half_share": 0.0},
     "40,000 fans at the start": {"start_splats": 40_000},
+    "2 x 2 samples throughout": {"one_sample_share": 0.0},
+    "exact order throughout": {"by_splat_share": 0.0},
+    "order of the fans to the end": {"order": "splat"},
     "4 sides": {"sides": 4},
     "8 sides": {"sides": 8},
     "position rates of short runs": {"rate_steps": 250},
