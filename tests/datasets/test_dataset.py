@@ -91,6 +91,45 @@ def test_images_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, monk
     assert all(view.load().color.dtype == np.uint8 for view in dataset.train)
 
 
+def test_masks_of_a_subject_cut_it_out(tmp_path):
+    folder = simple_colmap(tmp_path, 3)
+    rng = np.random.default_rng(0)
+    opaque, translucent = (
+        rng.integers(0, 256, (8, 12, 3), np.uint8),
+        rng.integers(0, 256, (8, 12, 4), np.uint8),
+    )
+    save(folder / "images/p00.png", opaque)
+    save(folder / "images/p01.png", translucent)
+    mask = np.zeros((8, 12), np.uint8)
+    mask[:, :5] = 255
+    for name in ("p00", "p01"):
+        save(folder / f"masks/{name}.png", mask)
+    with pytest.warns(ms.DataWarning, match="1 images have no mask"):
+        data = load_dataset(folder, masks="subject", test_every=0)
+    cut, mixed, whole = sorted(data.train, key=lambda view: view.name)
+    inside = (mask > 0).astype(np.float32)
+    assert (cut.mask, mixed.mask, whole.mask, whole.alpha) == (None, None, None, None)
+    assert np.array_equal(cut.alpha, inside)
+    np.testing.assert_allclose(cut.load().over((0, 0, 0)), inside[..., None] * opaque / 255, atol=1e-3)
+    np.testing.assert_allclose(mixed.alpha, inside * translucent[..., 3] / 255, atol=1e-3)
+    for view in data.train:
+        assert view.load().nbytes == view.source.nbytes
+    with pytest.warns(ms.DataWarning, match="1 images have no mask"):
+        half = load_dataset(folder, masks="subject", test_every=0, downscale=2)
+    half_cut = min(half.train, key=lambda view: view.name)
+    np.testing.assert_allclose(half_cut.alpha, [[1, 1, 0.5, 0, 0, 0]] * 4)
+    color = (inside[..., None] * opaque / 255).reshape(4, 2, 6, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(half_cut.load().over((0, 0, 0)), color, atol=1e-3)
+
+
+def test_a_subject_needs_masks(tmp_path):
+    folder = simple_colmap(tmp_path, 2)
+    with pytest.raises(ms.FileFormatError, match="no masks, so none of a subject"):
+        load_dataset(folder, masks="subject")
+    with pytest.raises(ValueError, match="masks must be 'count' or 'subject', got 'alpha'"):
+        load_dataset(folder, masks="alpha")
+
+
 def test_memory_is_known_before_and_right(tmp_path):
     folder = simple_colmap(tmp_path, 3)
     save(folder / "images/p01.png", np.zeros((8, 12, 4), np.uint8))

@@ -825,6 +825,27 @@ def test_the_command_takes_steps_while_there_is_time(
     assert ("there was no time for steps" in capsys.readouterr().out) != takes_steps
 
 
+def test_masks_of_an_object_are_noticed_and_cut_it_out(ball, room, tmp_path, capsys):
+    views = list(zip(ball.train[:6], room.train[:6], strict=True))
+    folder = write_photographs(
+        tmp_path / "photos", [ball_view.camera for ball_view, _ in views], [view.image for _, view in views]
+    )
+    (folder / "masks").mkdir()
+    for name, (view, _) in zip(sorted(p.name for p in (folder / "images").iterdir()), views, strict=True):
+        inside = view.alpha > 0.5
+        inside[:20] = False  # less than half of the pixels
+        Image.fromarray(np.uint8(255 * inside)).save(folder / "masks" / name)
+    words = ["train", str(folder), "-o", str(tmp_path / "mesh.npz"), "--steps", "1", "--start-splats", "100"]
+    words += ["--max-splats", "100", "--test-every", "0", "--force"]
+    assert main(words) == 0
+    assert "--masks subject cuts out an object" in capsys.readouterr().err
+    assert main([*words, "--masks", "subject"]) == 0
+    assert "masks leave" not in capsys.readouterr().err
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    corner = render(mesh, views[0][0].camera, background=(1, 1, 1)).alpha[:4, :4]
+    assert corner.max() < 0.1, "nothing is around the object"
+
+
 def test_a_trained_mesh_outlives_a_failure_to_write_its_splats(ball, tmp_path, monkeypatch):
     from meshsplats.formats import gaussians
 

@@ -67,6 +67,14 @@ Missing = Annotated[
     tyro.conf.arg(help="With --data: images that are missing are an error, or their views are left out."),
 ]
 
+MeaningOfMasks = Annotated[
+    Literal["count", "subject"],
+    tyro.conf.arg(
+        help="With --data: only pixels inside of masks count, or what is outside is clear, as in photographs"
+        " that were cut out."
+    ),
+]
+
 _AXES = (
     "Direction of the y axis in the file; auto: as its format prescribes, up in"
     f" {listed(y_up_suffixes(), 'and')}, else down. After reading, y points down. Some programs write SPZ"
@@ -250,12 +258,16 @@ def optional_color(text: str | None) -> tuple[float, float, float] | None:
     return None if text is None else parse_color(text)
 
 
-def check_data(data: Path | None, missing: Missing, cameras: Path | None = None) -> None:
-    """UsageError for --missing without --data, and for --cameras with it."""
+def check_data(
+    data: Path | None, missing: Missing, cameras: Path | None = None, masks: MeaningOfMasks = "count"
+) -> None:
+    """UsageError for --missing and --masks without --data, and for --cameras with it."""
     if cameras is not None and data is not None:
         raise UsageError("give --cameras or --data, not both")
     if missing != "error" and data is None:
         raise UsageError("--missing has no effect without --data")
+    if masks != "count" and data is None:
+        raise UsageError("--masks has no effect without --data")
 
 
 def check_mesh_suffix(path: Path) -> None:

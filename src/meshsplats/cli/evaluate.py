@@ -22,6 +22,7 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    MeaningOfMasks,
     Missing,
     Output,
     SplatOptions,
@@ -118,6 +119,7 @@ class Evaluate(Command):
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
     missing: Missing = "error"
+    masks: MeaningOfMasks = "count"
     protocol: Annotated[
         Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
         tyro.conf.arg(metavar="{" + ",".join(BENCHMARKS) + "}", help_behavior_hint=""),
@@ -205,7 +207,7 @@ class Evaluate(Command):
                 raise UsageError(f"{flag(name)} has no effect with --data")
         if self.data is None and self.downscale is not None:
             raise UsageError("--downscale has no effect without --data")
-        check_data(self.data, self.missing)
+        check_data(self.data, self.missing, masks=self.masks)
 
     def _check_outputs(self, folder: Path) -> None:
         names = (RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION)
@@ -226,6 +228,7 @@ class Evaluate(Command):
                 downscale=self.downscale or 1,
                 test_every=self.test_every,
                 missing=self.missing,
+                masks=self.masks,
                 origin=origin,
             )
         background = WHITE if self.background is None else parse_color(self.background)

@@ -254,6 +254,7 @@ class Finetune(TrainingCommand):
             words += ["--downscale", target.downscale] if target.downscale != 1 else []
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
             words += ["--missing", target.missing] if target.missing != "error" else []
+            words += ["--masks", target.masks] if target.masks != "count" else []
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
             words += ["--look", dataset.look] if dataset.look != "area" else []

@@ -17,6 +17,7 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    MeaningOfMasks,
     Missing,
     Number,
     Origin,
@@ -71,6 +72,7 @@ class Surface(Command):
     data: Folder = None
     """Data set of photographs to fit shape and texture to, in place of images of the scene."""
     missing: Missing = "error"
+    masks: MeaningOfMasks = "count"
     cameras: File = None
     """Camera file: from where images are made, in place of --views."""
     unlit: bool = False
@@ -110,7 +112,9 @@ class Surface(Command):
         check_outputs(outputs, self.force, inputs=[self.input])
         scene = load_scene(self.input, self.reading)
         origin = scene.origin
-        data = None if self.data is None else load_dataset(self.data, missing=self.missing, origin=origin)
+        data = None
+        if self.data is not None:
+            data = load_dataset(self.data, missing=self.missing, masks=self.masks, origin=origin)
         cameras = None if self.cameras is None else load_cameras(self.cameras, origin=origin)
         sources = sources_of(scene, data, cameras, options, self.threads)
         with progress_display() as display:
@@ -163,7 +167,7 @@ class Surface(Command):
         files.check_writing(self.output, unlit=self.unlit, image=self.image, collision=self.collision)
         if suffix in files.PRINTED and self.surface.shape == "open":
             raise UsageError(f"{suffix} is for printing, which wants a solid: --shape closed")
-        check_data(self.data, self.missing, self.cameras)
+        check_data(self.data, self.missing, self.cameras, self.masks)
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise UsageError(f"--scale must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}

@@ -15,6 +15,7 @@ from meshsplats.cli.arguments import spelled
 from meshsplats.cli.common import Count, File, Folder, LookOfSplats, Missing, Text, parse_up
 from meshsplats.cli.messages import UsageError
 from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.image_files import Masks
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning.config import FEWEST_VIEWS
 from meshsplats.gaussians import GaussianCloud
@@ -35,6 +36,8 @@ class TargetOptions:
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
     missing: Missing = "error"
+    masks: tyro.conf.Fixed[Masks] = "count"
+    """With --data: only pixels inside of masks count, or (subject) what is outside is clear."""
     views: Count = None
     """Without --data: number of training images. Default: one per second, or per two --steps, from 200 to
     1000."""
@@ -68,7 +71,7 @@ class TargetOptions:
     def check(self) -> None:
         """UsageError for options without effect."""
         idle = ("views", "held_out", "width", *PLACING, "below", "cameras", "look", "sh_degree")
-        of_data = ("downscale", "test_every", "missing")
+        of_data = ("downscale", "test_every", "missing", "masks")
         names, source = (idle, "--data") if self.data is not None else (of_data, "splats")
         for name in names:
             if self._is_set(name):
@@ -111,6 +114,7 @@ class TargetOptions:
                 background=background,
                 cache_bytes=self.cache_bytes,
                 missing=self.missing,
+                masks=self.masks,
                 origin=scene.origin,
             )
             if not dataset.train:

@@ -48,6 +48,8 @@ class PhotographOptions:
     """Every n-th view is held out for scores, if the data set has no split; 0: none."""
     missing: Literal["error", "skip"] = "error"
     """Photographs that are missing are an error, or their cameras are left out."""
+    masks: Literal["count", "subject"] = "count"
+    """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
     estimate_cameras: bool = False
     """Find the cameras of the photographs though the folder holds some of a kind that is not read."""
     cache: float = 2.0
@@ -73,8 +75,8 @@ class Train(TrainingCommand):
     """
 
     COMMON = (
-        *("input", "output", "minutes", "steps", "max_splats", "downscale", "test_every", "exposure"),
-        *("as_splats", "threads", "resume", "force"),
+        *("input", "output", "minutes", "steps", "max_splats", "downscale", "test_every", "masks"),
+        *("exposure", "as_splats", "threads", "resume", "force"),
     )
     EXCLUSIVE = (LENGTHS,)
 
@@ -123,6 +125,9 @@ class Train(TrainingCommand):
             if found is not None and found.source != self.input / CAMERAS:  # those of an earlier run
                 raise UsageError(f"--estimate-cameras has no effect: {found.source} has cameras")
         dataset, background = self._dataset(config)
+        mask = dataset.train[0].mask
+        if mask is not None and mask.mean() < 0.5:
+            say("masks leave most pixels out, which may become anything: --masks subject cuts out an object")
         points = load_points(self.input, origin=dataset.origin)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 
@@ -165,6 +170,7 @@ class Train(TrainingCommand):
         words += ["--downscale", target.downscale] if target.downscale != 1 else []
         words += ["--test-every", target.test_every] if target.test_every != 8 else []
         words += ["--missing", target.missing] if target.missing != "error" else []
+        words += ["--masks", target.masks] if target.masks != "count" else []
         if plan.background is not None:
             words += ["--background", plan.background.name]
         words += ["--samples", samples_of(plan.dataset.train[0], config), "-o", f"{folder}-evaluation"]
@@ -174,7 +180,7 @@ class Train(TrainingCommand):
         from meshsplats.datasets.folder import load_dataset
 
         options: dict[str, Any] = {"downscale": self.target.downscale, "test_every": self.target.test_every}
-        options["missing"] = self.target.missing
+        options |= {"missing": self.target.missing, "masks": self.target.masks}
         dataset = load_dataset(self.input, cache_bytes=self.target.cache_bytes, **options)
         if len(dataset.train) < 2:
             raise ValueError(

@@ -15,7 +15,7 @@ from meshsplats._foreign import what_it_is
 from meshsplats._kinds import need_path
 from meshsplats._origin import choose_origin
 from meshsplats.datasets.colmap import read_model
-from meshsplats.datasets.image_files import Album, Frame, Missing, Taken, split
+from meshsplats.datasets.image_files import Album, Frame, Masks, Missing, PhotoFile, Taken, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
 from meshsplats.datasets.llff import read_poses_bounds
 from meshsplats.datasets.transforms import read_transforms
@@ -26,7 +26,9 @@ Views = tuple[list[View], list[View]]
 MAX_LIST_BYTES = 16 << 20
 
 
-def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache, missing: Missing) -> Views:
+def read_folder(
+    path: Path, downscale: int, test_every: int, store: ImageCache, missing: Missing, masks: Masks = "count"
+) -> Views:
     """Training and test views of the data set at ``path``; see ``load_dataset``."""
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such data set", str(path))
@@ -36,7 +38,7 @@ def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache, 
             what = what_it_is(path)
             raise FileFormatError(f"{path}: {what or 'a data set is a folder, or its transforms.json'}")
         raise FileFormatError(f"{path}: {what_is_there(path)}")
-    album = Album(layout.root, downscale, store, missing, layout.images)
+    album = Album(layout.root, downscale, store, missing, layout.images, masks)
     if layout.name == "COLMAP":
         return _colmap(layout, album, test_every)
     if layout.name == "LLFF":
@@ -145,6 +147,7 @@ def load_dataset(
     background: Sequence[float] = WHITE,
     cache_bytes: int = CACHE_BYTES,
     missing: Missing = "error",
+    masks: Masks = "count",
     origin: Sequence[float] | np.ndarray | None = None,
 ) -> Dataset:
     """The photographs and cameras in a folder.
@@ -176,6 +179,8 @@ def load_dataset(
             each time.
         missing: what images that are missing mean: an ``'error'``, or that their views are left out
             (``'skip'``), with a DataWarning.
+        masks: what masks say: which pixels ``'count'``, or what the ``'subject'`` is: pixels outside are then
+            clear, as in photographs that were cut out.
         origin: (3,) point of the world that cameras shall be relative to, such as that of splats or a mesh of
             the same scene. By default one that suits their positions, zero wherever float32, in which
             everything is that is made of them, is fine enough.
@@ -199,10 +204,15 @@ def load_dataset(
         raise ValueError(f"background must be three numbers in [0, 1], got {background!r}")
     if missing not in get_args(Missing):
         raise ValueError(f"missing must be 'error' or 'skip', got {missing!r}")
+    if masks not in get_args(Masks):
+        raise ValueError(f"masks must be 'count' or 'subject', got {masks!r}")
     if test_every == 1:
         raise ValueError("test_every must be 0 (no test views) or at least 2: 1 leaves nothing to train with")
     store = ImageCache(cache_bytes)
-    train, test = read_folder(Path(path), int(downscale), int(test_every), store, missing)
+    train, test = read_folder(Path(path), int(downscale), int(test_every), store, missing, masks)
+    photographs = [view.source for view in (*train, *test) if isinstance(view.source, PhotoFile)]
+    if masks == "subject" and not any(photograph.cut_out for photograph in photographs):
+        raise FileFormatError(f"{path}: no masks, so none of a subject: leave out masks='subject'")
     dataset = Dataset(tuple(train), tuple(test), Path(os.path.abspath(path)).name).over(color.tolist())
     if origin is None:
         origin = choose_origin(np.array([view.camera.center for view in dataset.views]))

@@ -182,6 +182,8 @@ class PhotoFile:
     mask: Path | None
     has_alpha: bool
     store: ImageCache = field(repr=False)
+    cut_out: bool = False
+    """Whether the mask is the subject's outline: what is outside is clear."""
 
     def load(self) -> ViewImage:
         image = self.store.find(self)
@@ -192,44 +194,42 @@ class PhotoFile:
 
     @property
     def nbytes(self) -> int:
-        masked = self.mask is not None or not self.lens.is_pinhole
+        masked = (self.mask is not None and not self.cut_out) or not self.lens.is_pinhole
         return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
 
     def _read(self) -> ViewImage:
         pixels = load_image(self.path)
-        color, alpha = pixels[..., :3], pixels[..., 3] if pixels.shape[2] == 4 else None
+        color = pixels[..., :3]
+        share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
         size = (self.lens.width, self.lens.height)
-        if alpha is None:
+        if self.cut_out:
+            inside = _resized(self._light(), (color.shape[1], color.shape[0]))
+            share = inside if share is None else share * inside
+        if share is None:
             color = _resized(color, size)
         else:
             # Colours of clear pixels mean nothing: mixing must see each as much as it is opaque.
-            share = alpha.astype(np.float32) / 255
-            mixed = np.empty((size[1], size[0], 4), np.float16)
-            for i in range(3):
-                mixed[..., i] = _resized(color[..., i].astype(np.float32) / 255 * share, size)
-            mixed[..., 3] = _resized(share, size)
-            color = mixed
-        mask = None if self.mask is None else self._read_mask(size)
+            layers = [*(color[..., i].astype(np.float32) / 255 * share for i in range(3)), share]
+            color = np.stack([_resized(layer, size) for layer in layers], axis=-1).astype(np.float16)
+        mask = None if self.mask is None or self.cut_out else _resized(self._light(), size) >= WHOLE
         if not self.lens.is_pinhole:
             color, seen = undistort(color, self.lens, self.pinhole)
             if mask is not None:
                 counts = undistort(mask.astype(np.float32)[..., None], self.lens, self.pinhole)[0]
-                mask = counts[..., 0] >= WHOLE  # 0 where nothing was seen
-            else:
-                mask = seen
-        if alpha is None:
+                seen = counts[..., 0] >= WHOLE  # 0 where nothing was seen
+            mask = seen
+        if share is None:
             return ViewImage(color, None, mask)
         return ViewImage(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
 
-    def _read_mask(self, size: tuple[int, int]) -> np.ndarray:
-        """(h, w) bool. A pixel counts if the mask is light (128 of 255 or more), and opaque where it has
-        alpha, all over it."""
+    def _light(self) -> np.ndarray:
+        """(h, w) float32: 1 where the mask is light (128 of 255 or more) and, with alpha, opaque; else 0."""
         assert self.mask is not None
         pixels = load_image(self.mask)
         light = pixels[..., :3].max(axis=2)
         if pixels.shape[2] == 4:
             light = np.minimum(light, pixels[..., 3])
-        return _resized((light >= 128).astype(np.float32), size) >= WHOLE
+        return (light >= 128).astype(np.float32)
 
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -247,6 +247,7 @@ Taken = list[tuple[Camera, PhotoFile]]
 
 
 Missing = Literal["error", "skip"]
+Masks = Literal["count", "subject"]
 
 
 @dataclass
@@ -260,6 +261,7 @@ class Album:
     on_missing: Missing = "error"
     images: str = ""
     """Folder of the images in it, where names of their own lead nowhere; empty: ``folder`` itself."""
+    masks: Masks = "count"
     missing: list[str] = field(default_factory=list)
     no_mask: list[str] = field(default_factory=list)
     renamed: list[str] = field(default_factory=list)
@@ -292,7 +294,9 @@ class Album:
             lens = frame.lens.scaled(width, height)
             taken = []
             for pinhole in pinholes(lens):
-                source = PhotoFile(frame.name, path, lens, pinhole, mask, header.has_alpha, self.store)
+                cut_out = mask is not None and self.masks == "subject"
+                has_alpha = header.has_alpha or cut_out
+                source = PhotoFile(frame.name, path, lens, pinhole, mask, has_alpha, self.store, cut_out)
                 taken.append((_camera(frame, pinhole, label), source))
             result.append(taken)
         return result
