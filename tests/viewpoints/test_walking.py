@@ -130,6 +130,6 @@ def test_views_that_are_no_film_are_those_found(place):
 
 
 def test_an_orbit_that_says_where_it_is_stays_a_circle(place):
-    frames = ViewOptions(orbit=6, elevation=15.0).make(place, Path("x.ply"), count=8, side=20)
+    frames = ViewOptions(orbit=18, elevation=15.0).make(place, Path("x.ply"), count=8, side=20)
     apart = np.linalg.norm(places_of(frames) - places_of(frames).mean(axis=0), axis=1)
     assert np.allclose(apart, apart[0], rtol=1e-6)
