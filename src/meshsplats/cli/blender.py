@@ -156,7 +156,7 @@ class Blender(Command):
         else:
             scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
             coarser = [level.relative_to(scene.origin) for level in coarser]
-        cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800)
+        cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800, film=not suffix)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
         images = self._images(suffix, len(cameras))

@@ -32,7 +32,8 @@ class ViewOptions:
     """Cameras and image size. Orbit, dome, look-around, cameras and data exclude each other."""
 
     orbit: Count = None
-    """N views on a circle around the subject."""
+    """N views on a circle around the subject; in splats of a place, on a round through views found in it,
+    unless --elevation, --azimuth, --distance, --look-at, --fov or --focal-length is given."""
     dome: Count = None
     """N views spread evenly over the upper half of a sphere around the subject."""
     look_around: Count = None
@@ -74,7 +75,7 @@ class ViewOptions:
     @property
     def _placed(self) -> bool:
         """Whether an option says where cameras stand or what lens they have."""
-        placing = ("orbit", "dome", "elevation", "azimuth", "distance", "look_at", "fov", "focal_length")
+        placing = ("dome", "elevation", "azimuth", "distance", "look_at", "fov", "focal_length")
         defaults = {f.name: f.default for f in fields(self)}
         return any(getattr(self, name) != defaults[name] for name in placing)
 
@@ -94,9 +95,11 @@ class ViewOptions:
         count: int,
         side: int,
         photographs: Dataset | None = None,
+        film: bool = False,
     ) -> list[Camera]:
         """The cameras, relative to the origin of ``scene``; by default ``count`` views of an orbit, ``side``
-        pixels wide. ``photographs``: the result of ``photographs()``, if it is at hand."""
+        pixels wide. ``photographs``: the result of ``photographs()``, if it is at hand. ``film``: the default
+        views follow each other smoothly, as those of --orbit do."""
         self.check()
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -127,7 +130,9 @@ class ViewOptions:
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
         if not self._placed and cameras_beside(source, scene.origin) is None:
             told = None if self.up is None else lens["up"]
-            if views := views_of_a_place(scene, count, lens | {"up": told}):
+            number = count if self.orbit is None else self.orbit
+            film = (film or self.orbit is not None) and number > 1
+            if views := views_of_a_place(scene, number, lens | {"up": told}, film):
                 return views
         lens["fov"] = 45.0 if fov is None else fov
         target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
@@ -199,21 +204,25 @@ class DrawOptions:
 
 
 def views_of_a_place(
-    scene: GaussianCloud | SplatMesh, count: int, lens: dict[str, Any]
+    scene: GaussianCloud | SplatMesh, count: int, lens: dict[str, Any], film: bool = False
 ) -> list[Camera] | None:
-    """``count`` views of splats that are no object, as ``find_cameras`` finds them; says what was found.
-    ``lens``: width, height, and up or None."""
+    """``count`` views of splats that are no object, as ``find_cameras`` finds them, or with ``film`` on a
+    round through some; says what was found. ``lens``: width, height, and up or None."""
     from meshsplats.rendering.layers import fragments
     from meshsplats.rendering.previews import FRAGMENTS, preview_camera
     from meshsplats.viewpoints.finding import find_cameras
+    from meshsplats.viewpoints.walking import keys_of, walk
 
     if not isinstance(scene, GaussianCloud) or not len(scene):
         return None
     if fragments(scene, preview_camera(scene), 1) > FRAGMENTS:
         return None  # splats as large as the scene: there is nothing to find, and it would take long
-    found = find_cameras(scene, count, **lens)
+    found = find_cameras(scene, keys_of(count) if film else count, **lens)
     if found.kind == "object":
         return None
+    if film:
+        say(f"{found.in_words()}: seen on a round through {len(found.cameras)} views that were found")
+        return walk(found.cameras, count, found.up)
     say(f"{found.in_words()}: seen from views that were found")
     return list(found.cameras)
 

@@ -122,7 +122,9 @@ class Render(Command):
         self._check_scene(scene)
         photographs = self.views.photographs(scene.origin)
         count = 1 if single else 60
-        cameras = self.views.make(scene, self.input, count=count, side=800, photographs=photographs)
+        cameras = self.views.make(
+            scene, self.input, count=count, side=800, photographs=photographs, film=not single
+        )
         if tileset is None:
             places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
             if hidden := hiding_near_plane(cameras, places):
