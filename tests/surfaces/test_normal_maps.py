@@ -103,7 +103,7 @@ def test_a_surface_with_fewer_triangles_than_voxels_gives_has_a_map():
     how = {"views": 12, "size": 64, "resolution": 24, "threads": 1, "rounds": 0, "texture": 128}
     light: BaseMesh = make_surface(ball, faces=300, **how)
     assert light.normal_map is not None
-    assert light.normal_map.shape == (64, 64, 3)
+    assert light.normal_map.shape == (32, 32, 3)
     assert make_surface(ball, faces=300, normal_map=False, **how).normal_map is None
     assert make_surface(ball, faces=0, **how).normal_map is None, "nothing is left out of the fine surface"
     with pytest.raises(ValueError, match="normal_map has no effect without texture"):

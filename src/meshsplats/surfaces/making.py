@@ -41,7 +41,7 @@ ProgressOf = Callable[[str, int, int], object]
 
 _COARSE = 2
 """The first rounds compare images, and have textures, whose sides are smaller by this factor."""
-_MAP = 2
+_MAP = 4
 """Sides of normal maps are smaller than those of textures by this factor: voxels are coarser than texels."""
 _LATER = 0.3
 """Steps of the vertices in the last round, relative to those before."""
