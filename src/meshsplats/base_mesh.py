@@ -80,6 +80,9 @@ class BaseMesh:
     face_texture: np.ndarray | None = None
     """(m,) int32 index of each face's texture; -1: none."""
     textures: tuple[Texture, ...] = field(default=())
+    normal_map: np.ndarray | None = None
+    """(h, w, 3) uint8 normals in the tangent space of ``uv``, for a mesh with one texture: -1 to 1 along u,
+    against v and along the smooth normal as 0 to 255, as in glTF; None: the smooth normals alone."""
     up: np.ndarray = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
     """(3,) float32 direction that points up."""
     origin: np.ndarray = field(default_factory=zero_origin)
@@ -89,6 +92,7 @@ class BaseMesh:
         parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} faces"]
         parts += ["colours"] if self.colors is not None else []
         parts += [f"{len(self.textures)} textures"] if self.textures else []
+        parts += ["normal map"] if self.normal_map is not None else []
         parts += [f"origin {in_words(self.origin)}"] if self.origin.any() else []
         return f"BaseMesh({', '.join(parts)})"
 
@@ -115,6 +119,10 @@ class BaseMesh:
                     f" got {index.min()} to {index.max()}"
                 )
             arrays["face_texture"] = index
+        if self.normal_map is not None:
+            if self.uv is None:
+                raise ValueError("normal_map needs uv")
+            arrays["normal_map"] = checked_array("normal_map", self.normal_map, np.uint8, (None, None, 3))
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import struct
 import zipfile
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from _glb import read_glb
+from PIL import Image
 
 from meshsplats import BaseMesh, load_base, load_mesh, save_base
 from meshsplats.base_mesh import Texture
@@ -241,9 +244,94 @@ def test_the_validator_finds_nothing(tmp_path, gltf_issues):
         (tetrahedron(noise=True), {}),
         (tetrahedron(origin=(5e5, 4.5e6, 100)), {"unlit": True}),
         (tetrahedron(textured=False), {}),
+        (with_relief(), {}),
+        (with_relief(), {"image": "webp"}),
     ]
     files = [tmp_path / f"{i}.glb" for i in range(len(cases))]
     for (base, options), file in zip(cases, files, strict=True):
         save_base(base, file, **options)
     for issues in gltf_issues(*files):
         assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
+
+
+def accessor(document, chunk, index) -> np.ndarray:
+    """The values of an accessor, a row for each."""
+    found = document["accessors"][index]
+    view = document["bufferViews"][found["bufferView"]]
+    kind = {5123: "<u2", 5125: "<u4", 5126: "<f4"}[found["componentType"]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[found["type"]]
+    count = found["count"] * width
+    return np.frombuffer(chunk, kind, count, view.get("byteOffset", 0)).reshape(-1, width)
+
+
+def with_relief() -> BaseMesh:
+    base = tetrahedron()
+    pixels = np.random.default_rng(1).integers(0, 256, (32, 32, 3), np.uint8)
+    return replace(base, normal_map=pixels)
+
+
+def test_tangents_lie_along_u_and_bitangents_up_the_image(tmp_path):
+    base = with_relief()
+    save_base(base, tmp_path / "a.glb")
+    document, chunk = read_glb(tmp_path / "a.glb")
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    tangents, normals, uv, points = (
+        accessor(document, chunk, attributes[name])
+        for name in ("TANGENT", "NORMAL", "TEXCOORD_0", "POSITION")
+    )
+    np.testing.assert_allclose(np.linalg.norm(tangents[:, :3], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose((tangents[:, :3] * normals).sum(axis=1), 0, atol=1e-6)
+    primitive = document["meshes"][0]["primitives"][0]
+    for corners in accessor(document, chunk, primitive["indices"]).reshape(-1, 3):
+        steps, moves = uv[corners[1:]] - uv[corners[0]], points[corners[1:]] - points[corners[0]]
+        along, against = np.linalg.solve(steps.astype(float), moves.astype(float))
+        for corner in corners:
+            tangent, sign, normal = tangents[corner, :3], tangents[corner, 3], normals[corner]
+            across = along - normal * (along @ normal)
+            if np.linalg.norm(across) < 1e-6:  # u runs along the normal: any tangent will do
+                continue
+            np.testing.assert_allclose(tangent, across / np.linalg.norm(across), atol=1e-5)
+            assert sign * np.cross(normal, tangent) @ -against > -1e-6, "y of the map is against v"
+    assert load_base(tmp_path / "a.glb").textured
+
+
+def test_normal_maps_are_written_where_light_falls(tmp_path):
+    base = with_relief()
+    for name, options in (("lit.glb", {}), ("webp.glb", {"image": "webp"}), ("unlit.glb", {"unlit": True})):
+        save_base(base, tmp_path / name, **options)
+        document, chunk = read_glb(tmp_path / name)
+        names = [image["name"] for image in document["images"]]
+        assert names == (["surface"] if options.get("unlit") else ["surface", "normals"])
+        assert ("normalTexture" in document["materials"][0]) == (len(names) == 2)
+        if len(names) == 2:
+            view = document["bufferViews"][document["images"][1]["bufferView"]]
+            data = chunk[view["byteOffset"] :][: view["byteLength"]]
+            found = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+            np.testing.assert_array_equal(found, base.normal_map)
+    save_base(base, tmp_path / "a.obj")
+    assert "norm a_normal.png" in (tmp_path / "a.mtl").read_text().splitlines()
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a_normal.png")), base.normal_map)
+    assert set(tmp_path.glob("a*")) - {tmp_path / "a.obj"} <= set(companions(tmp_path / "a.obj"))
+    with pytest.raises(ValueError, match="normal_map needs uv"):
+        BaseMesh(base.vertices, base.faces, normal_map=base.normal_map)
+
+
+@needs_usd
+@pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
+def test_usd_has_the_normal_map(tmp_path, suffix):
+    from pxr import Usd, UsdShade
+
+    for unlit in (False, True):
+        path = tmp_path / f"{unlit}{suffix}"
+        save_base(with_relief(), path, unlit=unlit)
+        stage = Usd.Stage.Open(str(path))
+        normals = UsdShade.Shader(stage.GetPrimAtPath("/Splats/Material/Normals"))
+        assert bool(normals) == (not unlit)
+        if unlit:
+            continue
+        assert normals.GetInput("file").Get().resolvedPath
+        assert normals.GetInput("sourceColorSpace").Get() == "raw"
+        assert tuple(normals.GetInput("scale").Get()) == (2, 2, 2, 1)
+        assert tuple(normals.GetInput("bias").Get()) == (-1, -1, -1, 0)
+        surface = UsdShade.Shader(stage.GetPrimAtPath("/Splats/Material/Surface"))
+        assert surface.GetInput("normal").GetConnectedSources()[0][0].source.GetPath() == normals.GetPath()

@@ -6,14 +6,25 @@ import importlib.util
 import json
 import re
 import sys
+import zipfile
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from _glb import read_glb
 from conftest import shared_data
 
-from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, look_at, psnr, save_gaussians
+from meshsplats import (
+    GaussianCloud,
+    SplatMesh,
+    load_gaussians,
+    load_mesh,
+    look_at,
+    psnr,
+    save_base,
+    save_gaussians,
+)
 from meshsplats.cli import main
 from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
@@ -23,6 +34,8 @@ from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.manifold import split_pinches
 from meshsplats.surfaces.options import SurfaceOptions, level_options
 
+_TAGS = {"vertex": "xyz", "triangle": ("v1", "v2", "v3")}
+"""Elements of a model in 3MF, and their numbers."""
 QUICK = {"texture": 0, "rounds": 0, "views": 24, "size": 96, "resolution": 32, "threads": 1}
 needs_extra = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("skimage", "fast_simplification")),
@@ -106,6 +119,27 @@ def test_the_surface_of_a_ball():
     assert np.abs(base.colors[upper] - [0.9, 0.1, 0.1, 1]).max() < 0.1
     assert np.abs(base.colors[lower] - [0.1, 0.1, 0.9, 1]).max() < 0.1
     np.testing.assert_allclose(base.up, [0, 0, 1], atol=1e-6)
+
+
+@needs_extra
+@pytest.mark.parametrize("suffix", [".stl", ".3mf"])
+def test_a_print_is_a_solid_for_another_library(tmp_path, suffix):
+    trimesh = pytest.importorskip("trimesh")
+    save_base(make_surface(ball(2), **QUICK), tmp_path / f"a{suffix}")
+    if suffix == ".stl":
+        solid = trimesh.load(tmp_path / "a.stl", force="mesh")
+    else:  # its reader needs more packages
+        with zipfile.ZipFile(tmp_path / "a.3mf") as package:
+            model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+        tags = {tag: [e.attrib for e in model.iter() if e.tag.endswith(f"}}{tag}")] for tag in _TAGS}
+        points, faces = ([[float(e[k]) for k in keys] for e in tags[tag]] for tag, keys in _TAGS.items())
+        solid = trimesh.Trimesh(points, np.array(faces, int), process=False)
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert solid.is_volume
+    assert solid.body_count == 1
+    assert solid.volume == pytest.approx(4 / 3 * np.pi * 8, rel=0.08)
+    assert solid.bounds[0] == pytest.approx([0, 0, 0], abs=1e-5)
 
 
 @needs_extra
@@ -323,6 +357,30 @@ def test_a_wall_that_is_seen_from_one_side_is_open():
     # Closed, the same is a slab.
     solid = make_surface(mesh, cameras=cameras, shape="closed", **options)
     assert open_edges(solid.faces) == 0
+
+
+@needs_extra
+def test_photographs_from_one_side_are_where_depth_is_taken_from():
+    from meshsplats import Dataset, orbit
+    from meshsplats.datasets.views import View, ViewImage
+    from meshsplats.surfaces.views import from_one_side, sources_of
+
+    mesh = ball()
+    front = [
+        look_at((x, y, -4), (0, 0, 0), up=(0, -1, 0), width=32, height=32)
+        for x in (-2, 0, 2)
+        for y in (-2, 2)
+    ]
+    around = orbit(mesh, 8, width=32, height=32)
+    image = ViewImage(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.uint8))
+    options = SurfaceOptions(shape="closed", views=12, size=32)
+    for cameras, one_side in ((front, True), (around, False)):
+        assert from_one_side(cameras) == one_side
+        data = Dataset([View(camera, image) for camera in cameras], [])
+        found = sources_of(mesh, data, None, options, 1)
+        assert found.closed
+        assert len(found.depth) == (len(cameras) if one_side else 12)
+    assert len(sources_of(mesh, None, front, options, 1).depth) == len(front)
 
 
 def box(low) -> tuple[np.ndarray, np.ndarray]:

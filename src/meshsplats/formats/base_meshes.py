@@ -112,6 +112,8 @@ def save_base(
     - `.obj`: with a material library and a texture beside, of the same name. `.ply`: with a texture beside,
       as MeshLab has it.
     - `.npz`: of this project; without the texture.
+    - A normal map is in `.glb`, with tangents, and USD unless they are unlit, and in `.obj` as ``norm``, a
+      file NAME_normal.png beside; other formats leave it out.
     - `.stl`, `.3mf`: the shape alone, for printing: z up, from 0 on, a scene unit is a millimetre.
 
     Args:
@@ -194,6 +196,8 @@ def companions(path: Path, image: TextureImage | None = None) -> list[Path]:
     suffix = path.suffix.lower()
     kinds = ("png",) if suffix in _SHADED else ("png", "jpg")
     pictures = [path.with_suffix(f".{kind}") for kind in ((image,) if image else kinds)]
+    if suffix != ".ply":
+        pictures.append(path.with_name(f"{path.stem}_normal.{'webp' if image == 'webp' else 'png'}"))
     return ([path.with_suffix(".mtl")] if suffix == ".obj" else []) + (pictures if suffix in _BESIDE else [])
 
 

@@ -123,21 +123,19 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     if not known.all():
         vertices, triangles = large_parts(vertices, triangles)
     if 0 < faces < len(triangles):
-        return _reduced(vertices, triangles, faces)
+        return collapsed(vertices, triangles, faces)
     return vertices.astype(np.float64), triangles.astype(np.int32)
 
 
 def coarser(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A mesh, (n, 3) vertices and (m, 3) triangles, with about a quarter of its triangles."""
-    return _reduced(
-        vertices.astype(np.float32), faces.astype(np.int32), max(4, len(faces) // LEVEL_FACTOR**2)
-    )
+    return collapsed(vertices, faces, max(4, len(faces) // LEVEL_FACTOR**2))
 
 
-def _reduced(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def collapsed(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """A mesh with about ``count`` triangles: (n, 3) float64 vertices, (m, 3) int32 triangles."""
     simplify = libraries()[2]
-    points, kept = simplify(vertices, triangles, target_count=count)
+    points, kept = simplify(vertices.astype(np.float32), triangles.astype(np.int32), target_count=count)
     return points.astype(np.float64), kept.astype(np.int32)
 
 

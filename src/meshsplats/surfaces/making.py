@@ -23,10 +23,11 @@ from meshsplats.rendering import render
 from meshsplats.surfaces.atlas import cells, cells_side, unwrap
 from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors
-from meshsplats.surfaces.fusion import coarser, grid_around, isosurface, signed_distances
+from meshsplats.surfaces.fusion import coarser, collapsed, grid_around, isosurface, signed_distances
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
 from meshsplats.surfaces.manifold import split_pinches
+from meshsplats.surfaces.normal_maps import Relief, normal_map, relief_of
 from meshsplats.surfaces.options import SurfaceOptions, level_options
 from meshsplats.surfaces.views import Sources, reduced, smaller, sources_of
 
@@ -40,6 +41,8 @@ ProgressOf = Callable[[str, int, int], object]
 
 _COARSE = 2
 """The first rounds compare images, and have textures, whose sides are smaller by this factor."""
+_MAP = 4
+"""Sides of normal maps are smaller than those of textures by this factor: voxels are coarser than texels."""
 _LATER = 0.3
 """Steps of the vertices in the last round, relative to those before."""
 _BOX_SIDE = 128
@@ -112,15 +115,18 @@ def surfaces_from(
     """
     levels = level_options(chosen, count)
     said = progress or (lambda *_: None)
-    vertices, faces = _fused(scene, sources, chosen, threads, said)
+    vertices, faces, relief = _fused(scene, sources, chosen, threads, said)
     result = []
     for number, level in enumerate(levels):
         if number:
             vertices, faces = coarser(vertices, faces)
         views = tuple(reduced(view, level.size) for view in sources.views)
-        base, vertices = _surface_of(
-            scene, vertices, faces, replace(sources, views=views), level, threads, said
-        )
+        seen = replace(sources, views=views)
+        base, fitted, uv = _surface_of(scene, vertices, faces, seen, level, threads, said)
+        if level.texture and relief is not None:
+            side = -(-level.texture // _MAP)
+            base = replace(base, normal_map=normal_map(vertices, faces, uv, side, relief))
+        vertices = fitted
         result.append(base)
     return result
 
@@ -133,19 +139,20 @@ def _surface_of(
     chosen: SurfaceOptions,
     threads: int | None,
     progress: ProgressOf,
-) -> tuple[BaseMesh, np.ndarray]:
-    """The surface of these triangles with their texture, and where fitting put the vertices."""
+) -> tuple[BaseMesh, np.ndarray, np.ndarray]:
+    """The surface of these triangles with their texture, and where fitting put the vertices; the texture
+    coordinates (f, 3, 2) of the triangles as given."""
     surface = Surface(vertices, faces, *_blank_texture(vertices, faces, chosen.texture))
     if chosen.texture or chosen.rounds:
         surface = _fitted(surface, sources, chosen, threads, progress)
-    fitted = surface.vertices
+    fitted, uv = surface.vertices, surface.uv
     if sources.closed:
         sheets = split_pinches(surface.vertices, faces, surface.uv)
         faces = sheets.faces
         surface = surface._replace(vertices=sheets.vertices, uv=sheets.corners.astype(np.float32))
     base = BaseMesh(surface.vertices.astype(np.float32), faces, up=guess_up(scene), origin=scene.origin)
     if not chosen.texture:
-        return replace(base, colors=_vertex_colors(base, sources.views, threads)), fitted
+        return replace(base, colors=_vertex_colors(base, sources.views, threads)), fitted, uv
     pixels = np.full((*surface.texels.shape[:2], 4), 255, np.uint8)
     pixels[..., :3] = np.rint(255 * surface.texels)
     textured = replace(
@@ -154,7 +161,7 @@ def _surface_of(
         face_texture=np.zeros(len(faces), np.int32),
         textures=(Texture(pixels, ("clamp", "clamp")),),
     )
-    return textured, fitted
+    return textured, fitted, uv
 
 
 def _blank_texture(vertices: np.ndarray, faces: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -171,8 +178,9 @@ def _fused(
     options: SurfaceOptions,
     threads: int | None,
     progress: ProgressOf,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The surface in the depth images: vertices (v, 3) float64, triangles (f, 3) int32."""
+) -> tuple[np.ndarray, np.ndarray, Relief | None]:
+    """The surface in the depth images: vertices (v, 3) float64, triangles (f, 3) int32; with all of its
+    triangles, where a normal map wants them."""
     mesh = scene
     if isinstance(mesh, GaussianCloud):
         # As wide as viewers draw splats: gaps between them would be holes in the surface.
@@ -191,14 +199,19 @@ def _fused(
         threads=threads,
         each=lambda *_: done(),
     )
-    vertices, faces = isosurface(field, options.faces)
+    vertices, faces = isosurface(field)
     if not len(faces):
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
+    relief = None
+    if 0 < options.faces < len(faces):
+        if options.normal_map and options.texture:
+            relief = relief_of(grid.low + grid.voxel * vertices, faces)
+        vertices, faces = collapsed(vertices, faces, options.faces)
     if not sources.closed:
         vertices, faces = close_holes(vertices, faces)
-    return grid.low + grid.voxel * vertices, faces
+    return grid.low + grid.voxel * vertices, faces, relief
 
 
 def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, threads: int | None) -> Grid:

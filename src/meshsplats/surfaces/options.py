@@ -26,6 +26,8 @@ class SurfaceOptions:
     """Approximate largest number of triangles; 0: as many as the voxels give."""
     texture: Annotated[int, Range(0, MAX_TEXTURE)] = 2048
     """Side of the texture in texels; 0: colours of vertices instead."""
+    normal_map: Annotated[bool, With("texture")] = True
+    """Keep the relief of the finest triangles as a normal map, of a quarter of the texture's side."""
     shape: Shape = "auto"
     """closed: a solid that can be seen from all sides; what no image sees becomes interior. open: only what
     images see, for rooms, streets and gardens. auto: closed for objects, open for places."""
@@ -86,6 +88,7 @@ class SurfaceChanges(TypedDict, total=False):
 
     faces: int
     texture: int
+    normal_map: bool
     shape: Shape
     resolution: int
     views: int

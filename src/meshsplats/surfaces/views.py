@@ -22,6 +22,10 @@ from meshsplats.surfaces.images import SAMPLES
 from meshsplats.surfaces.options import SurfaceOptions
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
+_ONE_SIDE = 0.7
+"""Length of the mean of the directions of cameras from which they see one side: 0.5 is that of cameras all
+over a hemisphere, 0.7 of those within 66 degrees of one direction."""
+
 
 @dataclass(frozen=True)
 class Sources:
@@ -70,7 +74,8 @@ def sources_of(
             seen = list(found.cameras[HELD_OUT:])
         photos = _drawn(scene, seen, surrounded and not closed, options, threads)
     if given is None:
-        given = _around(scene, options) if closed else [view.camera for view in photos]
+        around = closed and not (data is not None and from_one_side([view.camera for view in photos]))
+        given = _around(scene, options) if around else [view.camera for view in photos]
     return Sources(tuple(given), tuple(photos), closed, found)
 
 
@@ -80,6 +85,13 @@ def place_of(scene: GaussianCloud | SplatMesh, sources: Sources) -> FoundCameras
         return None
     found = find_cameras(scene, 1) if sources.found is None else sources.found
     return None if found.kind == "object" else found
+
+
+def from_one_side(cameras: Sequence[Camera]) -> bool:
+    """Whether cameras look in about one direction: what photographs show from one side only has a back that
+    is made up, and depth images of that would cut into the front."""
+    mean = np.mean([camera.world_to_camera[2, :3] for camera in cameras], axis=0)
+    return float(np.linalg.norm(mean)) > _ONE_SIDE
 
 
 def _around(scene: GaussianCloud | SplatMesh, options: SurfaceOptions) -> list[Camera]:

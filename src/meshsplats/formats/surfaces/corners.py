@@ -8,6 +8,7 @@ import numpy as np
 
 from meshsplats._geometry import vertex_normals
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.formats.surfaces.tangents import corner_frames
 from meshsplats.images.writing import encode_image
 from meshsplats.mesh import SplatMesh
 
@@ -28,6 +29,8 @@ class Corners(NamedTuple):
     """(w, 2) float32, v down."""
     colors: np.ndarray | None
     """(w, 4) float32 display RGBA."""
+    tangents: np.ndarray | None = None
+    """(w, 4) float32, for a normal map: unit vectors along u, and the sign of the bitangent."""
 
 
 def corners_of(base: BaseMesh) -> Corners:
@@ -45,12 +48,18 @@ def corners_of(base: BaseMesh) -> Corners:
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order))
     rows = place[first[order]]
+    tangents = None
+    if base.normal_map is not None:
+        frames = corner_frames(base.vertices, base.faces, base.uv, base.up)
+        every = np.concatenate([frames.tangents, frames.signs[..., None]], axis=2, dtype=np.float32)
+        tangents = every.reshape(-1, 4)[first[order]]
     return Corners(
         base.vertices[rows],
         normals[rows],
         rank[inverse.reshape(-1)].reshape(-1, 3),
         base.uv.reshape(-1, 2)[first[order]],
         None if base.colors is None else base.colors[rows],
+        tangents,
     )
 
 
@@ -69,6 +78,14 @@ def texture_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]
             return ".png", content
         suffix = ".jpg"
     return suffix, encode_image(f"a{suffix}", pixels)
+
+
+def normal_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]:
+    """The suffix and the content of the file of the normal map of ``base``, beside a texture of the kind
+    ``suffix``: WebP with WebP, else PNG, as the errors of JPEG would be relief."""
+    assert base.normal_map is not None
+    suffix = suffix if suffix == ".webp" else ".png"
+    return suffix, encode_image(f"a{suffix}", base.normal_map.astype(np.float32) / 255)
 
 
 def plain_mesh(base: BaseMesh) -> SplatMesh:

@@ -10,7 +10,7 @@ import numpy as np
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
-from meshsplats.formats.surfaces.corners import corners_of, texture_file
+from meshsplats.formats.surfaces.corners import corners_of, normal_file, texture_file
 
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
 _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987
@@ -32,16 +32,25 @@ def write_surface_glb(
     if shape.uv is not None:
         attributes["TEXCOORD_0"] = chunk.attribute(shape.uv)
         suffix, content = texture_file(base, image)
-        view = chunk.view(np.frombuffer(content, np.uint8))
         pbr["baseColorTexture"] = {"index": 0}
-        texture: dict[str, Any] = {"sampler": 0, "source": 0}
+        pictures = [("surface", suffix, content)]
+        if shape.tangents is not None and not unlit:
+            attributes["TANGENT"] = chunk.attribute(shape.tangents)
+            material["normalTexture"] = {"index": 1}
+            pictures.append(("normals", *normal_file(base, image)))
         if suffix == ".webp":
-            texture = {"sampler": 0, "extensions": {_WEBP: {"source": 0}}}
             used.append(_WEBP)
             more["extensionsRequired"] = [_WEBP]
         more |= {
-            "textures": [texture],
-            "images": [{"bufferView": view, "mimeType": _TYPES[suffix], "name": "surface"}],
+            "textures": [_texture(number, kind) for number, (_, kind, _) in enumerate(pictures)],
+            "images": [
+                {
+                    "bufferView": chunk.view(np.frombuffer(data, np.uint8)),
+                    "mimeType": _TYPES[kind],
+                    "name": name,
+                }
+                for name, kind, data in pictures
+            ],
             "samplers": [
                 {"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP},
             ],
@@ -66,3 +75,10 @@ def write_surface_glb(
     mesh = {"name": name, "primitives": [primitive], "extras": {"meshsplats": note}}
     document = chunk.document([placed_node(name, base, mesh=0)], [mesh], [material]) | more
     write_binary(path, document, chunk, what="the surface", advice="; choose fewer faces")
+
+
+def _texture(source: int, suffix: str) -> dict[str, Any]:
+    """The texture of an image of this kind."""
+    if suffix == ".webp":
+        return {"sampler": 0, "extensions": {_WEBP: {"source": source}}}
+    return {"sampler": 0, "source": source}

@@ -11,7 +11,7 @@ from meshsplats._origin import in_words
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats.obj.mesh import write_obj, write_rows
 from meshsplats.formats.ply.mesh import write_mesh_ply
-from meshsplats.formats.surfaces.corners import plain_mesh, smooth_normals, texture_file
+from meshsplats.formats.surfaces.corners import normal_file, plain_mesh, smooth_normals, texture_file
 
 
 def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
@@ -24,6 +24,11 @@ def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | Non
     material, picture = target.with_suffix(".mtl"), target.with_suffix(suffix)
     write_bytes(picture, content)
     lines = ["newmtl surface", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {picture.name}"]
+    if base.normal_map is not None:
+        kind, content = normal_file(base, image)
+        relief = target.with_name(f"{target.stem}_normal{kind}")
+        write_bytes(relief, content)
+        lines.append(f"norm {relief.name}")
     write_bytes(material, "\n".join([*lines, ""]).encode())
     coordinates = base.uv.reshape(-1, 2).astype(np.float64)
     coordinates[:, 1] = 1 - coordinates[:, 1]

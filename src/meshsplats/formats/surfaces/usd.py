@@ -12,8 +12,8 @@ from meshsplats._files.atomic import write_bytes
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats.surfaces.corners import smooth_normals, texture_file
-from meshsplats.formats.usd.materials import preview_material, primvar_reader, texture_reader
+from meshsplats.formats.surfaces.corners import normal_file, smooth_normals, texture_file
+from meshsplats.formats.usd.materials import normal_reader, preview_material, primvar_reader, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed
 from meshsplats.formats.usd.stage import make_collider, placed_mesh
 
@@ -26,22 +26,29 @@ def write_surface_usd(
         import pxr  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
-    suffix, content = texture_file(base, image or ".png") if base.textured else ("", b"")
-    picture = target.with_suffix(suffix) if base.textured else None
+    stem = target.stem if target.suffix.lower() != ".usdz" else "surface"
+    pictures: dict[str, bytes] = {}
+    if base.textured:
+        suffix, content = texture_file(base, image or ".png")
+        pictures[f"{stem}{suffix}"] = content
+    if base.textured and base.normal_map is not None and not unlit:
+        suffix, content = normal_file(base, image)
+        pictures[f"{stem}_normal{suffix}"] = content
     if target.suffix.lower() != ".usdz":
-        if picture is not None:
-            write_bytes(picture, content)
-        export(_stage(base, unlit, picture.name if picture else None, collision), path)
+        for name, content in pictures.items():
+            write_bytes(target.with_name(name), content)
+        export(_stage(base, unlit, list(pictures), collision), path)
         return
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".meshsplats-") as folder:
         inner = Path(folder) / "surface.usdc"
-        if picture is not None:
-            inner.with_suffix(suffix).write_bytes(content)
-        export(_stage(base, unlit, f"surface{suffix}" if picture else None, collision), inner)
+        for name, content in pictures.items():
+            inner.with_name(name).write_bytes(content)
+        export(_stage(base, unlit, list(pictures), collision), inner)
         packed(inner, path)
 
 
-def _stage(base: BaseMesh, unlit: bool, picture: str | None, collision: str | None) -> Any:
+def _stage(base: BaseMesh, unlit: bool, pictures: list[str], collision: str | None) -> Any:
+    """The stage; ``pictures``: the names of the files of texture and normal map, as far as there are any."""
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
     types, at = Sdf.ValueTypeNames, "/Splats/Material"
@@ -50,12 +57,12 @@ def _stage(base: BaseMesh, unlit: bool, picture: str | None, collision: str | No
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     if collision is not None:
         make_collider(shape, drawn=collision == "drawn")
-    if picture is not None and base.uv is not None:
+    if pictures and base.uv is not None:
         uv = base.uv.copy()
         uv[..., 1] = 1 - uv[..., 1]  # USD's v is up
         st = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", types.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
         st.Set(Vt.Vec2fArray.FromNumpy(uv.reshape(-1, 2)))
-        texture = texture_reader(stage, at, f"./{picture}", ("clamp", "clamp"))
+        texture = texture_reader(stage, at, f"./{pictures[0]}", ("clamp", "clamp"))
         color: Any = texture.CreateOutput("rgb", types.Float3)
     elif base.colors is not None:
         linear = np.ascontiguousarray(srgb_to_linear(base.colors[:, :3]), np.float32)
@@ -63,7 +70,8 @@ def _stage(base: BaseMesh, unlit: bool, picture: str | None, collision: str | No
         color = primvar_reader(stage, f"{at}/Color", "displayColor", types.Float3, (0.5, 0.5, 0.5))
     else:
         color = Gf.Vec3f(0.2)
-    material = preview_material(stage, at, color, lit=not unlit)
+    normal = normal_reader(stage, at, f"./{pictures[1]}") if len(pictures) > 1 else None
+    material = preview_material(stage, at, color, lit=not unlit, normal=normal)
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
     note: dict[str, Any] = {"version": 1, "blending": "display", "up": Gf.Vec3d(*map(float, base.up))}
     if base.origin.any():
