@@ -69,10 +69,7 @@ Missing = Annotated[
 
 MeaningOfMasks = Annotated[
     Literal["count", "subject"],
-    tyro.conf.arg(
-        help="With --data: only pixels inside of masks count, or what is outside is clear, as in photographs"
-        " that were cut out."
-    ),
+    tyro.conf.arg(help="With --data: only pixels inside of masks count, or masks cut out a subject."),
 ]
 
 _AXES = (
