@@ -1,4 +1,4 @@
-"""Sixty mutated files of each format; tests/fuzz/fuzz_readers.py runs any number."""
+"""Mutated files of each format, sixty in the slow tests; tests/fuzz/fuzz_readers.py runs any number."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import pytest
 pytest.importorskip("resource", reason="the fuzzer limits its memory, which this system cannot")
 
 
-@pytest.mark.slow
-def test_mutated_files_give_an_answer(tmp_path):
+@pytest.mark.slow(keep=1)
+@pytest.mark.parametrize("count", [2, 60])
+def test_mutated_files_give_an_answer(count, tmp_path):
     command = [
         sys.executable,
         Path(__file__).parents[1] / "fuzz" / "fuzz_readers.py",
         "--count",
-        "60",
+        str(count),
         "--keep",
         tmp_path,
     ]
