@@ -13,20 +13,19 @@ from meshsplats.cameras.trajectories import look_at
 
 MOST_KEYS = 12
 """Views that a round passes, at most: through more of them it hurries."""
-FRAMES = 6
-"""Least number of frames from one of them to the next."""
 
 
 def keys_of(count: int) -> int:
     """Number of views that a round of ``count`` frames passes."""
-    return max(1, min(MOST_KEYS, count // FRAMES))
+    return min(MOST_KEYS, count)
 
 
 def walk(cameras: Sequence[Camera], count: int, up: Sequence[float] | np.ndarray) -> list[Camera]:
     """``count`` cameras on a smooth closed path through all ``cameras``, level and at an even pace.
 
     Position, direction, focal length and near plane change together; the path begins at the first camera and
-    comes back to it. It does not know of walls between the cameras.
+    comes back to it. As few frames as cameras are these themselves, in the order of the path. It does not
+    know of walls between them.
 
     Args:
         cameras: at least one, each with a near plane, none of which looks straight along ``up``.
@@ -48,6 +47,8 @@ def walk(cameras: Sequence[Camera], count: int, up: Sequence[float] | np.ndarray
     angles = np.arccos(np.clip(gaze @ gaze.T, -1, 1))
     lengths = np.hypot(np.linalg.norm(places[:, None] - places, axis=2) / spread, angles)
     tour = short_round(lengths)
+    if count == len(cameras):
+        return [replace(cameras[k], name=f"view_{i:04d}") for i, k in enumerate(tour)]
     azimuth = np.arctan2(gaze @ second, gaze @ first)[tour]
     turns = np.diff(azimuth, append=azimuth[0])
     turns = (turns + np.pi) % (2 * np.pi) - np.pi  # the shorter way round
