@@ -324,7 +324,7 @@ def glowing(cloud: ms.GaussianCloud, terms: int) -> ms.SplatMesh:
     return replace(mesh, colors=mesh.colors * [1.5, 1.5, 1.5, 1], harmonics=harmonics)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["exact", "sorted"])
 @pytest.mark.parametrize("terms", [3, 8, 15])
 def test_colours_depend_on_the_view(browser, write_page, cloud, cameras, terms, renderer):
