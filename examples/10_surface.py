@@ -35,6 +35,7 @@ clay = replace(
     faces=np.arange(corners[..., 0].size).reshape(-1, 3),
     colors=np.concatenate([np.repeat(light, 3, axis=1), np.ones_like(light)], axis=1),
     uv=None,
+    normal_map=None,
     face_texture=None,
     textures=(),
 )
