@@ -256,7 +256,7 @@ def optional_color(text: str | None) -> tuple[float, float, float] | None:
 
 
 def check_data(
-    data: Path | None, missing: Missing, cameras: Path | None = None, masks: MeaningOfMasks = "count"
+    data: Path | None, missing: Missing, cameras: Path | None = None, masks: str = "count"
 ) -> None:
     """UsageError for --missing and --masks without --data, and for --cameras with it."""
     if cameras is not None and data is not None:

@@ -346,8 +346,7 @@ class TrainingCommand(Command):
             most = SCORED_VIEWS if self.has_photographs else min(self.target.held_out, SCORED_VIEWS)
             quality += f", {plural(count, 'view')})" if count < most else ")"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
-        known = lines or trained.sizes is not None
-        for line in _result_in_words(trained.sizes, steps if known else None):
+        for line in _result_in_words(trained.sizes, steps if lines or trained.sizes else None):
             print(line)
         print(f"preview: {files.preview}" + (f"; metrics: {files.folder}/metrics.jsonl" if lines else ""))
 
