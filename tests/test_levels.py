@@ -56,6 +56,7 @@ def test_likeness_is_that_of_the_means():
     assert likeness(mesh, cloud, [camera]) > likeness(empty, cloud, [camera]) + 10
 
 
+@pytest.mark.slow
 def test_tuning_makes_a_level_better():
     pytest.importorskip("torch")
     pytest.importorskip("safetensors")

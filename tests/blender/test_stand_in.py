@@ -145,6 +145,7 @@ def test_a_ground_below_a_scene_with_a_street_leaves_the_street_in_the_light():
     assert ground_height(0.05, heights, -facing, 0.3) == 0.05, "undersides do not count"
 
 
+@pytest.mark.slow
 def test_nothing_solid_has_no_stand_in():
     cloud, _ = ball_splats(200)
     mesh = convert(replace(cloud, opacities=np.full(200, 0.05)), mode="flat")

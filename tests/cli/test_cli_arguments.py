@@ -103,6 +103,7 @@ def content(path: str) -> bytes:
         return file.read()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("arguments", "result"),
     [

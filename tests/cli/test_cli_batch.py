@@ -118,6 +118,7 @@ def test_mistakes_are_reported_first(scans, tmp_path, capsys, arguments, code, w
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_inputs_of_one_name_keep_their_endings(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     os.makedirs("scans/same")
@@ -144,6 +145,7 @@ def test_names_do_not_depend_on_the_case_of_letters(tmp_path):
     assert [job.outputs[0].name for job in made] == ["Same.ply.glb", "same.sog.glb", "a.glb"]
 
 
+@pytest.mark.slow
 def test_results_in_the_folder_of_the_inputs_are_no_inputs(scans):
     os.remove("scans/broken.ply")
     save_mesh(convert(few_splats()), "scans/mesh.npz")
@@ -157,6 +159,7 @@ def test_results_in_the_folder_of_the_inputs_are_no_inputs(scans):
     assert {"mesh.npz.ply", "mesh.glb.ply"} <= set(os.listdir("scans"))
 
 
+@pytest.mark.slow
 def test_a_folder_that_was_interrupted(scans, tmp_path, capsys):
     os.remove("scans/broken.ply")
     assert run("scans", "-o", "out") == 0
@@ -213,6 +216,7 @@ def test_a_further_format_beside_what_is_there(scans, capsys):
     assert os.stat("out/a.glb").st_mtime_ns == stamp
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skip", [[], ["--skip-existing"]])
 def test_records_of_another_run_stay(scans, capsys, skip):
     """Where the mesh itself is gone, they are all that is left of it."""

@@ -111,6 +111,7 @@ def test_json(splats, tmp_path, capsys):
     assert not (tmp_path / "mesh.npz.preview.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "look"),
     [([], "area"), (["--look", "splats"], "splats"), (["--set", "footprint=filter"], "splats")],

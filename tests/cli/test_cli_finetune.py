@@ -145,6 +145,7 @@ def test_order_is_tuned_recorded_and_drawn(tmp_path, capsys):
     assert "order 'splat' is for opacity 'blended'" in capsys.readouterr().err
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("kernel", "options", "filtered"),
     [
@@ -272,6 +273,7 @@ def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
     assert "No option differs, so the files themselves have changed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
     """Its views and its starting mesh stay, though so long a run would have more; its time counts, too."""
     arguments = [splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "32", "--json"]
@@ -354,6 +356,7 @@ def test_too_little_memory_is_reported_before_the_work(splats, tmp_path, capsys,
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
     program = (
         "import sys\n"
@@ -406,6 +409,7 @@ def test_two_runs_of_one_name(splats, tmp_path, capsys):
     assert not (folder / ".lock").exists()
 
 
+@pytest.mark.slow
 def test_time_before_the_run_counts(splats, tmp_path):
     start = time.perf_counter()
     assert run(splats, "-o", tmp_path / "t.npz", *SMALL, "--minutes", "0.05") == 0
@@ -435,6 +439,7 @@ def test_a_mesh_for_engines(splats, tmp_path, capsys):
     assert "cutoff has no effect without opacity 'cutoff'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_hybrid_mesh_for_engines(splats, tmp_path):
     options = (*SMALL, "--steps", "8", "--opacity", "cutoff", "--soft-share", "0.3", "--json")
     for suffix in ("glb", "npz"):
@@ -445,6 +450,7 @@ def test_a_hybrid_mesh_for_engines(splats, tmp_path):
     assert len(np.unique(one.colors[:, 3])) > 2
 
 
+@pytest.mark.slow
 def test_the_result_is_never_below_the_conversion(splats, tmp_path, capsys):
     """Rates that ruin a mesh: what is written is what ``convert`` makes, with its score and a sentence."""
     out, ruinous = tmp_path / "t.npz", ("--set", "color_rate=1", "--set", "position_rate=9")
@@ -510,6 +516,7 @@ def test_the_setup_is_shown_in_phases(splats, tmp_path, capsys):
     assert lines[0] == phases[0]
 
 
+@pytest.mark.slow
 def test_meshes_stand_as_asked_however_they_came_about(tmp_path):
     """Tuned from fans, begun as the conversion, and replaced by it."""
     save_gaussians(make_scene(300), tmp_path / "s.ply")
@@ -529,6 +536,7 @@ def test_conversion_options_that_need_cameras(splats, tmp_path, option, monkeypa
     assert run(*words, "--minutes", "0.02") == 0
 
 
+@pytest.mark.slow
 def test_a_refused_resumption_changes_nothing(splats, tmp_path, capsys):
     words = (splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "32", "--force")
     assert run(*words, "--views", "20", "--steps", "3") == 0

@@ -317,6 +317,7 @@ def test_a_tileset_is_resumed_where_it_stands(scenes, tmp_path, monkeypatch):
     np.testing.assert_array_equal(Tileset(tmp_path / "t").origin, ORIGIN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".glb", ".npz", ".ply"])
 def test_origin_options(scenes, capsys, suffix):
     """keep, local, and a point that several scenes can share."""

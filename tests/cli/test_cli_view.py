@@ -125,6 +125,7 @@ def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, ca
         assert ("merged from" in settings(page)["statistics"]) == (triangles < 1600)
 
 
+@pytest.mark.slow
 def test_large_meshes_get_a_coarse_level_of_their_splats(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(content, "COARSE_TRIANGLES", 400)
     page = tmp_path / "page.html"

@@ -306,6 +306,7 @@ class TestInvariance:
         np.testing.assert_allclose(before.vertices * factor, after.vertices, rtol=1e-5, atol=1e-5 * factor)
         np.testing.assert_allclose(before.colors, after.colors, atol=2e-6)
 
+    @pytest.mark.slow
     @given(seed=st.integers(0, 10**6), which=st.integers(0, 3))
     def test_permuting_splats_permutes_fans(self, seed, which):
         cloud = many(40, seed)

@@ -53,6 +53,7 @@ def test_default_beats_paper_at_no_more_triangles(scene, look):
     assert likeness(default, cloud, mid, look) > likeness(paper, cloud, mid, look) + 1.5
 
 
+@pytest.mark.slow
 def test_each_look_is_what_its_conversion_is_best_at(scene):
     cloud, close, _ = scene
     area, viewer = (convert(cloud, cameras=close, look=look) for look in ("area", "splats"))
@@ -60,6 +61,7 @@ def test_each_look_is_what_its_conversion_is_best_at(scene):
     assert likeness(viewer, cloud, close, "splats") > likeness(area, cloud, close, "splats") + 2
 
 
+@pytest.mark.slow
 def test_each_ingredient_helps(scene):
     cloud, close, _ = scene
     full = likeness(convert(cloud, cameras=close), cloud, close)

@@ -379,6 +379,7 @@ class TestPictures:
         merged = simplify(cloud, count, cameras=cameras)
         assert likeness(merged, cloud, cameras) > likeness(dropped, cloud, cameras) + 5
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("name", "least"),
         [("guitar_sh0.ply", 37.5), ("playbot_lod3_31k_sh2.ply", 26), ("monkey_0001.sog", 28.5)],

@@ -24,6 +24,7 @@ def angles(mesh, normals, true):
     return np.degrees(np.arccos(np.clip((found * true[mesh.face_splat[first]]).sum(axis=1), -1, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "mean", "worst"), [(0.0, 2.0, 8.0), (0.35, 6.0, 30.0)])
 def test_normals_of_a_ball_point_outwards_and_are_smooth(noise, mean, worst):
     cloud, true = ball_splats(noise=noise)
@@ -33,6 +34,7 @@ def test_normals_of_a_ball_point_outwards_and_are_smooth(noise, mean, worst):
     assert found.max() < worst
 
 
+@pytest.mark.slow
 def test_normals_turn_with_the_scene():
     cloud, _ = ball_splats(800)
     mesh = convert(cloud)

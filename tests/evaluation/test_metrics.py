@@ -111,6 +111,7 @@ def test_zero_padding_by_hand():
     assert ssim(a, b, convention="3dgs") == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @given(seed=st.integers(0, 1000), height=st.integers(11, 40), width=st.integers(11, 40))
 def test_ssim_laws(convention, seed, height, width):

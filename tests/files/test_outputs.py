@@ -223,6 +223,7 @@ def test_force_takes_back_the_promise(tmp_path):
         pass  # and outside of a command, files are replaced
 
 
+@pytest.mark.slow
 @posix
 def test_two_processes_one_output(tmp_path):
     save_gaussians(make_scene(3000), tmp_path / "scene.ply")
@@ -282,6 +283,7 @@ def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, opti
     assert main(arguments) == 3  # complete
 
 
+@pytest.mark.slow
 @posix
 def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, monkeypatch):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
@@ -311,6 +313,7 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys):
     assert not _temporaries(tmp_path)
 
 
+@pytest.mark.slow
 @posix
 def test_a_run_that_is_killed_in_its_preview_is_resumed_whole(tmp_path):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
@@ -374,6 +377,7 @@ sys.exit(meshsplats.cli.main(["hang"]))
 """
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_signals_leave_nothing(tmp_path, name):

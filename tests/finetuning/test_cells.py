@@ -197,6 +197,7 @@ def test_each_splat_comes_from_the_cell_that_owns_it(held, whole_run):
     assert {tuple(v) for v in mesh.vertices.tolist()} == parts
 
 
+@pytest.mark.slow
 def test_cells_are_almost_as_good_as_the_whole(held, whole_run):
     """Everywhere, and near the borders of cells."""
     start = starting_mesh(held.cloud, [view.camera for view in held.dataset.train])

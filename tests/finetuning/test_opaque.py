@@ -44,6 +44,7 @@ def score(mesh: SplatMesh, dataset: Dataset) -> float:
     return evaluate(mesh, dataset, samples=2).method("mesh").mean("psnr")
 
 
+@pytest.mark.slow
 def test_it_beats_a_blended_mesh_that_is_cut(scene):
     dataset, mesh = scene
     tuned = finetune(mesh, dataset, make_config(steps=96, opacity="cutoff"))
@@ -240,6 +241,7 @@ def test_fog_stays_blended(foggy):
     assert score(hybrid, dataset) > score(opaque, dataset) + 1
 
 
+@pytest.mark.slow
 def test_a_viewer_that_does_not_sort_draws_a_hybrid_mesh(foggy):
     dataset, mesh, _ = foggy
     hybrid = finetune(mesh, dataset, steps=48, opacity="cutoff", soft_share=0.2).of_degree(0)
@@ -397,6 +399,7 @@ def test_only_fans_that_beat_opaque_triangles_stay_blended():
     assert not is_blended(with_soft_splats(core, start, views, 0.5)).any()
 
 
+@pytest.mark.slow
 def test_opaque_triangles_move_to_where_their_edges_belong(monkeypatch):
     view = camera(96, 72, fx=90.0, fy=80.0)
     corners = np.array([(-0.5, -0.4, 2), (0.5, -0.3, 2), (0, 0.5, 2)])

@@ -21,6 +21,7 @@ def cloud():
     return make_scene(4000)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("look", "sh_degree", "expected"),
     [("area", None, 31.87), ("area", 0, 32.13), ("splats", None, 30.14), ("splats", 0, 30.35)],

@@ -197,6 +197,7 @@ def test_splats_without_up_take_that_of_the_mesh(tmp_path):
     np.testing.assert_allclose(ms.load_gaussians(tmp_path / "a.glb").up, UP, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".glb", ".usdc"])
 def test_convert_puts_a_mesh_and_a_collider_beside_splats(tmp_path, suffix, capsys):
     need_usd(suffix)

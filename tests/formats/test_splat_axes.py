@@ -203,6 +203,7 @@ def images_agree(a, b, *, means, covariance, color):
     assert np.abs(a.opacities - b.opacities).max() < color
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("one", "other"),
     [

@@ -104,6 +104,7 @@ def assert_same(blocks, cloud):
     assert {b.kernel for b in blocks} == {cloud.kernel}
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("name", FILES)
 def test_blocks_are_the_splats_of_the_file(tmp_path, small_chunks, name):
     FILES[name](tmp_path / name)
@@ -224,6 +225,7 @@ def test_unusable_splats_are_counted_once(tmp_path, small_chunks):
         list(stream_gaussians(tmp_path / "b.ply", block=50))
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", [name for name in FILES if not name.endswith((".splat", ".sog", ".glb"))])
 @pytest.mark.parametrize("share", [0.3, 0.9])
 def test_truncated_files_are_refused(tmp_path, small_chunks, name, share):

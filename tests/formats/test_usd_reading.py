@@ -192,6 +192,7 @@ def test_stages_that_are_refused(tmp_path, text, match):
         read(tmp_path, text)
 
 
+@pytest.mark.slow
 @needs_usd
 @pytest.mark.parametrize(
     ("data", "match"),

@@ -33,6 +33,7 @@ def test_a_field_is_read_as_it_stands(tmp_path):
     assert format_of(tmp_path / "a.usda") == "usd"
 
 
+@pytest.mark.slow
 def test_y_up_and_z_up_both_become_y_down(tmp_path):
     turned = {up: read(tmp_path, up=up, axes="auto") for up in "YZ"}
     x, y, z = expected_cloud(VALUES)["means"].T
@@ -45,6 +46,7 @@ def test_halves_are_read_where_there_are_no_floats(tmp_path):
     assert_same_cloud(read(tmp_path, half=names), expected_cloud(VALUES), 4e-3)
 
 
+@pytest.mark.slow
 def test_transforms_place_the_splats(tmp_path):
     xform = "double3 xformOp:translate = (100, 0, 0)\n double3 xformOp:scale = (2, 2, 2)\n"
     xform += ' uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]'

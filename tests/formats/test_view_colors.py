@@ -110,6 +110,7 @@ def test_other_programs_see_plain_colours(tmp_path, suffix, plain):
     assert plain or (mesh.colors > 1).any()
 
 
+@pytest.mark.slow
 def test_trimesh_sees_plain_colours(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     mesh = mesh_of(2)

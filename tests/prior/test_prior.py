@@ -263,6 +263,7 @@ def test_faces_without_area_carry_nothing_and_are_counted():
         bind(replace(base, faces=faces[:0]))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("kind", ["one face", "non-manifold", "parts", "seams", "flipped", "unused vertices"])
 def test_any_base_will_do(kind):
     vertices, faces = CUBE, CUBE_FACES

@@ -88,6 +88,7 @@ def test_an_opacity_equal_to_the_cutoff_is_drawn(renderer):
 # Laws
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=seeds, cutoff=cutoffs, samples=st.sampled_from([1, 2, 3]))
 def test_the_core_agrees_with_the_reference(seed, cutoff, samples):

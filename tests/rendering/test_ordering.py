@@ -61,6 +61,7 @@ def mesh_fixture() -> SplatMesh:
     return convert(few_splats())
 
 
+@pytest.mark.slow
 def test_solving_never_loses_against_the_formula(mesh):
     pieces = pieces_of(mesh)
     node = np.zeros(len(pieces.splat), np.int64)
@@ -74,6 +75,7 @@ def test_solving_never_loses_against_the_formula(mesh):
     assert again.before == pytest.approx(found.after)
 
 
+@pytest.mark.slow
 def test_the_order_does_not_depend_on_threads(mesh):
     orders = [drawing_order(mesh, nodes=3, threads=threads) for threads in (1, 2, 5)]
     assert len({order.copies.tobytes() for order in orders}) == 1
@@ -114,6 +116,7 @@ def test_an_independent_viewer_draws_the_file_alike(mesh, tmp_path, nodes):
         assert psnr(shown, ordered_image(stored, order, near, multisample=False)) > 45
 
 
+@pytest.mark.slow
 def test_as_few_nodes_as_are_enough(mesh, monkeypatch):
     views = default_views(mesh)[::8]
     counts = []

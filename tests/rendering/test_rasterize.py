@@ -114,6 +114,7 @@ def test_equal_to_float64(name):
         assert a.dtype == torch.float32
 
 
+@pytest.mark.slow
 def test_reference_by_finite_differences():
     """gradcheck moves every number of the float64 twin."""
     mesh, view = soup(8, 9), camera(5, 4, cx=2.5, cy=2.0, fx=4, fy=5)
@@ -297,6 +298,7 @@ def test_same_gradients_on_every_instruction_set(variant, tmp_path):
             assert np.linalg.norm(found[name] - part) <= TOLERANCE * np.linalg.norm(part)
 
 
+@pytest.mark.slow
 def test_more_entries_than_are_kept_at_once():
     """1,100 layers over a tile, each an entry in 16 blocks."""
     mesh, view = stack(np.linspace(1, 2, 1100), 0.002), camera(16, 16)

@@ -216,6 +216,7 @@ def test_nothing_to_draw():
         assert not any(value.any() for value in (image.alpha, image.depth, image.normals))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("splats", "cameras", "factor"), [("playbot_lod6_2k_sh2.ply", "playbot_far.json", 0.12)]
 )

@@ -149,6 +149,7 @@ def test_equal_depths_go_by_number(kernel):
     assert_splats_are_exact(replace(cloud, means=means), camera())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_real_splats(kernel):
     cloud = load_gaussians(shared_data("splats/playbot_lod6_2k_sh2.ply"))
@@ -156,6 +157,7 @@ def test_real_splats(kernel):
     assert_splats_are_exact(replace(cloud, kernel=kernel), view)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_part_of_a_real_image(kernel):
     cloud = load_gaussians(shared_data("splats/guitar_sh0.ply"))

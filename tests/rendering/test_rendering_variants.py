@@ -256,6 +256,7 @@ print((after - before) / 1024, image.alpha.min())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measures memory as Linux does")
 @pytest.mark.parametrize(
     ("scene", "most"),

@@ -158,6 +158,7 @@ def digest() -> str:
     return found.hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", library.available_variants())
 def test_every_instruction_set_draws_the_same_bits(variant):
     code = "import test_splat_order; print(test_splat_order.digest())"

@@ -44,6 +44,7 @@ def test_triangles_across_the_near_plane(near):
     assert_like_reference(mesh, camera(near=near))
 
 
+@pytest.mark.slow
 def test_small_triangles_on_a_large_image():
     # Many lie in one pixel; tall images are drawn in several bands of rows.
     mesh = soup(5, 600, spread=(1, 1, 0.5))

@@ -248,6 +248,7 @@ def test_levels_are_halved_until_they_would_be_too_small():
         level_options(options, 0)
 
 
+@pytest.mark.slow
 @needs_extra
 def test_a_collider_lies_where_the_mesh_is_in_other_programs(tmp_path):
     save_gaussians(discs(), tmp_path / "scene.ply")

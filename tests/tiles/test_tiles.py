@@ -416,6 +416,7 @@ def test_a_torn_line_of_the_journal_does_not_count(tmp_path):
         Journal(path).keys("cell")
 
 
+@pytest.mark.slow
 def test_splats_in_one_spot_are_parted_by_their_order(tmp_path):
     cloud = next(city_blocks(1000, degree=0))
     means = np.zeros((1000, 3))
@@ -432,6 +433,7 @@ def test_splats_in_one_spot_are_parted_by_their_order(tmp_path):
 # ---- Drawing
 
 
+@pytest.mark.slow
 def test_the_image_is_that_of_the_whole_mesh(splats, tileset):
     found = Tileset(tileset)
     mesh = convert(load_gaussians(splats))

@@ -43,6 +43,7 @@ def tileset(splats, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_leaves_have_the_harmonics_of_the_whole_mesh(splats, tileset):
     mesh = convert(load_gaussians(splats))
     assert mesh.sh_degree == 1
@@ -70,6 +71,7 @@ def test_images_are_those_of_the_whole_mesh(splats, tileset):
     assert joined.sh_degree == 1
 
 
+@pytest.mark.slow
 def test_opaque_tiles_have_them_too(splats, tmp_path):
     build_tiles(stream_gaussians(splats), tmp_path / "t", replace(VIEW, alpha="opaque"))
     root = Tileset(tmp_path / "t").root.load()

@@ -69,6 +69,7 @@ def raw_planes(views: list[View], rounds: int, planes: int = 32) -> tuple[np.nda
 # ---- Truths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [FLAT, SLANTED], ids=["flat", "slanted"])
 def test_a_plane_is_found_where_it_is(plane):
     cameras = cameras_on_a_grid(side=(96, 72))

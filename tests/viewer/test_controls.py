@@ -190,6 +190,7 @@ def test_turning_goes_on_until_it_is_switched_off(page):
     assert turned(before, pose(page)) > 2
 
 
+@pytest.mark.slow
 def test_touch_orbits_pans_and_pinches(page):
     page.send("Emulation.setTouchEmulationEnabled", enabled=True)
     before = pose(page)
@@ -233,6 +234,7 @@ def test_a_double_click_centres_what_is_there(page, mesh, cameras):
     assert np.linalg.norm(rays - along[:, None] * after[1], axis=1).min() < 0.02
 
 
+@pytest.mark.slow
 def test_cameras_by_list_buttons_and_keys(page, cameras):
     assert page.run("[...document.querySelectorAll('#cameras option')].map(o => o.textContent)") == [
         camera.name for camera in cameras
@@ -340,6 +342,7 @@ def test_the_wireframe_shows_edges_and_what_is_between_them(page):
     assert np.abs(wires - solid).mean() > 2
 
 
+@pytest.mark.slow
 def test_splats_and_the_divider(page, cloud, cameras):
     page.size(cameras[0].width, cameras[0].height)
     page.still(PATIENCE)
@@ -536,6 +539,7 @@ def test_cameras_are_flown_to_unless_motion_is_unwelcome(browser, url):
         page.close()
 
 
+@pytest.mark.slow
 def test_hostile_names_are_shown_and_do_nothing(browser, write_page, mesh, cameras):
     named = [replace(camera, name=HOSTILE) for camera in cameras]
     address = write_page(mesh, "hostile", cameras=named, options=PageOptions(title=HOSTILE))
@@ -720,6 +724,7 @@ def test_the_coarse_level_comes_first_and_moves_and_the_fine_one_rests(browser, 
     page.close()
 
 
+@pytest.mark.slow
 def test_the_crop_box_crops_both_levels(browser, two_levels, mesh):
     address, coarse = two_levels
     page = open_page(browser, address, before=COUNTING)
@@ -776,6 +781,7 @@ def test_a_page_without_a_coarse_level_has_no_choice_of_levels(browser, url):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_damaged_fine_level_leaves_the_coarse_one(browser, two_levels, tmp_path):
     whole = Path(unquote(urlparse(two_levels[0]).path)).read_text(encoding="utf-8")
     data = block(whole, "mesh")

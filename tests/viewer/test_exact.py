@@ -78,6 +78,7 @@ def test_samples_are_those_of_render(page, mesh, cameras):
     assert np.abs(page.screenshot().astype(int) - levels(ms.render(mesh, cameras[0]).color)).max() > 5
 
 
+@pytest.mark.slow
 def test_cameras_of_the_list_are_reached_exactly(page, mesh, cameras):
     page.choose("#cameras", "2")
     page.still(PATIENCE)

@@ -92,6 +92,7 @@ def meshes(draw: st.DrawFn) -> SplatMesh:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(meshes(), st.sampled_from(PRECISIONS))
 def test_meshes_come_back_within_half_a_step(mesh, precision):

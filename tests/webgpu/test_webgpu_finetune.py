@@ -235,6 +235,7 @@ def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene, monkeypatc
     assert state.whole_steps(camera, ("loss",)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", [0, 8])
 def test_nothing_is_fetched_between_steps(scene, monkeypatch, terms):
     need_gpu()
@@ -249,6 +250,7 @@ def test_nothing_is_fetched_between_steps(scene, monkeypatch, terms):
     assert fetched == [4]
 
 
+@pytest.mark.slow
 def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
     need_gpu()
     from meshsplats.rendering import gpu as module

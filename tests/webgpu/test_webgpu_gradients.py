@@ -125,6 +125,7 @@ def test_equal_to_the_core(name):
     assert_same_gradients(mesh, view, **options)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("radius", "samples", "near"), [(0.002, 1, 0.5), (0.12, 1, 0.5), (0.05, 2, 0.5), (0.3, 1, 2.0)]
 )
@@ -227,6 +228,7 @@ def test_in_windows_where_a_tape_does_not_fit(monkeypatch):
     GPU.forget()
 
 
+@pytest.mark.slow
 def test_lists_grow():
     mesh, view, _ = scene("piercing")
     mesh = replace(mesh, faces=np.tile(mesh.faces, (40, 1)))
@@ -274,6 +276,7 @@ def test_walks_that_exceed_their_budget_go_on_where_they_ended():
     assert short[1] == usual[1]
 
 
+@pytest.mark.slow
 def test_a_sample_with_too_many_fragments_is_an_error(monkeypatch):
     source = kernels.gradients_source()
     monkeypatch.setattr(

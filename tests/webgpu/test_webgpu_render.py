@@ -290,6 +290,7 @@ def test_lists_grow(monkeypatch):
     assert bits(grown) == bits(usual)
 
 
+@pytest.mark.slow
 def test_large_images_are_drawn_in_windows(monkeypatch):
     mesh, view = soup(1, 100, spread=(2, 2, 2)), camera(70, 50, near=0.3)
     whole = render(mesh, view, samples=2, device="gpu", **EXTRAS)

@@ -170,6 +170,7 @@ def test_splats_with_too_many_triangles_are_an_error():
     assert_same_image(*both(largest, camera()), least=80)  # slivers, by rounding
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["playbot_lod5_3k_sh2.ply", "guitar_sh0.ply"])
 def test_real_scenes(name):
     mesh = replace(convert(load_gaussians(shared_data(f"splats/{name}"))), order="splat")
@@ -182,6 +183,7 @@ def test_real_scenes(name):
 # Gradients
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_equal_to_those_of_the_core(name):
     mesh, options = SCENES[name]
