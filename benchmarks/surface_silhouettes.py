@@ -9,37 +9,27 @@ that is in both. Images are compared on white. Seconds are those of the processo
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from _common import DATA, Report, Stopwatch, arguments
 
 import meshsplats as ms
-from meshsplats.datasets.views import View, ViewImage
+from meshsplats.datasets.views import View
 from meshsplats.finetuning import RunOptions
-from meshsplats.surfaces.views import smaller
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 Draw = Callable[[ms.Camera, tuple[float, float, float]], np.ndarray]
 
 
-def cut_out(view: View) -> View:
-    """``view`` at half its size, its mask as alpha."""
-    image = view.load()
-    assert image.mask is not None
-    alpha = (255 * image.mask).astype(np.uint8)
-    return smaller(replace(view, source=ViewImage(image.color * image.mask[..., None], alpha)), 2)
-
-
-def scores(views: list[View], draw: Draw) -> tuple[str, str, str]:
+def scores(views: Sequence[View], draw: Draw) -> tuple[str, str, str]:
     """Mean and least IoU, and mean PSNR in dB."""
     shares, errors = [], []
     for view in views:
         image, drawn = view.load(), draw(view.camera, WHITE)
-        assert image.alpha is not None
-        own, true = 1 - (drawn - draw(view.camera, BLACK)).mean(axis=2) >= 0.5, image.alpha > 127
+        assert view.alpha is not None
+        own, true = 1 - (drawn - draw(view.camera, BLACK)).mean(axis=2) >= 0.5, view.alpha >= 0.5
         shares.append((own & true).sum() / (own | true).sum())
         errors.append(ms.psnr(drawn, image.over(WHITE)))
     return f"{np.mean(shares):.4f}", f"{np.min(shares):.4f}", f"{np.mean(errors):.2f}"
@@ -55,9 +45,7 @@ def main() -> None:
     options = parser.parse_args()
     threads = options.threads
     with Report(options) as report:
-        data = ms.load_dataset(options.data / "photos/dtu65")
-        train, test = ([cut_out(view) for view in views] for views in (data.train, data.test))
-        data = replace(data, train=train, test=test)
+        data = ms.load_dataset(options.data / "photos/dtu65", masks="subject", downscale=2)
         report.table("dtu65", "triangles", "IoU", "least", "dB", "seconds")
         watch, run = Stopwatch(), RunOptions(threads=threads)
         mesh = ms.train(data, steps=options.steps, max_splats=options.fans, run=run)
@@ -66,7 +54,7 @@ def main() -> None:
         def trained(camera: ms.Camera, background: tuple[float, float, float]) -> np.ndarray:
             return ms.render(mesh, camera, background=background, samples=2, threads=threads).color
 
-        report.row("trained", f"{len(mesh.faces):,}", *scores(test, trained), seconds)
+        report.row("trained", f"{len(mesh.faces):,}", *scores(data.test, trained), seconds)
         watch = Stopwatch()
         surface = ms.make_surface(mesh, data, shape="closed", texture=options.texture, threads=threads)
         seconds = f"{watch.processor:.0f}"
@@ -74,7 +62,7 @@ def main() -> None:
         def drawn(camera: ms.Camera, background: tuple[float, float, float]) -> np.ndarray:
             return ms.draw_surface(surface, camera, background=background, threads=threads)
 
-        report.row("surface", f"{len(surface.faces):,}", *scores(test, drawn), seconds)
+        report.row("surface", f"{len(surface.faces):,}", *scores(data.test, drawn), seconds)
 
 
 if __name__ == "__main__":

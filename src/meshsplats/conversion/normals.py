@@ -102,8 +102,8 @@ def _symmetric(six: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
-    """(n, 3) ``vectors`` (n, 3) with length 1; ``instead``, (3,) or (n, 3), for those without length."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    """(..., 3) ``vectors`` with length 1; ``instead``, which broadcasts, for those without length."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), instead)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from meshsplats._geometry import vertex_normals
 from meshsplats.camera import Camera
+from meshsplats.conversion.normals import unit
 from meshsplats.formats.surfaces.tangents import Frames, corner_frames
 from meshsplats.mesh import Triangles
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
@@ -20,6 +21,8 @@ _SAME_SIDE = 0.0
 """Cosine between the normals of a texel and a point from which both belong to one side of a thin part."""
 _ROWS = 1 << 18
 """Texels at a time."""
+_FLAT = np.array([0.0, 0.0, 1.0])
+"""The smooth normal in tangent space."""
 
 
 class Relief(NamedTuple):
@@ -56,7 +59,7 @@ def normal_map(
     shown = face >= 0
     frames = corner_frames(vertices, faces, uv)
     result = np.zeros((side, side, 3), np.float32)
-    result[..., 2] = 1
+    result[...] = _FLAT
     tree = cKDTree(relief.points)
     rows, columns = np.nonzero(shown)
     for first in range(0, len(rows), _ROWS):
@@ -65,7 +68,7 @@ def normal_map(
         frame = Frames(*(np.einsum("kc,kc...->k...", each, a[texel]) for a in frames))
         place = np.einsum("kc,kcj->kj", each, vertices[faces[texel]])
         result[at] = _in_tangent_space(frame, _normals_at(tree, relief, place, frame.normals))
-    return np.rint(127.5 + 127.5 * _unit(filled(result, shown))).astype(np.uint8)
+    return np.rint(127.5 + 127.5 * unit(filled(result, shown), _FLAT)).astype(np.uint8)
 
 
 def _texels(uv: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -107,10 +110,5 @@ def _in_tangent_space(frame: Frames, normals: np.ndarray) -> np.ndarray:
     fine = np.abs(np.linalg.det(matrix)) > 1e-6
     matrix[~fine] = np.eye(3)
     solved = np.linalg.solve(matrix, normals[..., None])[..., 0]
-    solved[~fine] = (0, 0, 1)
-    return _unit(solved).astype(np.float32)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1), np.array([0, 0, 1.0]))
+    solved[~fine] = _FLAT
+    return unit(solved, _FLAT).astype(np.float32)
