@@ -153,11 +153,13 @@ $(BLENDER_VENV)/%/installed: build/wheel/made
 	  || echo 'Mitsuba cannot be installed here: the test that compares it with Cycles is skipped'
 	@touch $@
 
+# Slow tests run in the newest of the versions alone.
 BLENDER_TESTS := $(BPY:%=test-blender-%)
 test-blender: $(BLENDER_TESTS)
 $(BLENDER_TESTS): test-blender-%: $(BLENDER_VENV)/%/installed
 	@echo 'Blender $*'
 	@MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$*/bin/python -m pytest \
+	  --tier $(if $(filter $*,$(lastword $(BPY))),all,quick) \
 	  tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py
 
 $(SANITIZED)/address.so: SANITIZERS := address,undefined,float-cast-overflow

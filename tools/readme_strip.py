@@ -1,4 +1,5 @@
-"""The strip of the README: a capture as splats, as a mesh, lit in Blender, and opaque in three.js.
+"""The strip of the README: a capture as splats, as a mesh, lit in Blender, opaque in three.js, and as a
+textured surface.
 
     npm install three puppeteer-core    (in some folder; Chromium installed)
     python tools/readme_strip.py PLAYBOT --blender-python blender-env/bin/python \\
@@ -25,7 +26,7 @@ from _node import draw_jobs, drawn_images, job
 import meshsplats as ms
 from meshsplats.images.reading import load_image
 
-LABELS = ("splats", "mesh", "the mesh lit, in Blender", "opaque, in three.js")
+LABELS = ("splats", "mesh", "the mesh lit, in Blender", "opaque, in three.js", "textured surface")
 WIDTH, HEIGHT, GAP, TOP = 400, 400, 8, 44
 """Of a panel, between panels, and of the line of labels, in pixels; the README shows half of them."""
 LIGHT = ("--sun", "-75", "16", "--sun-strength", "5", "--sky", "0.12", "--glass", "--samples", "32")
@@ -51,6 +52,14 @@ def opaque(splats: Path, camera: ms.Camera, folder: Path, node_folder: Path, min
     draw_jobs([job("three", glb, views, folder / "three", 100.0, antialias=True)], folder, node_folder)
     large = drawn_images(folder / "three", 1)[0]
     return large.reshape(HEIGHT, 2, WIDTH, 2, 3).mean(axis=(1, 3))
+
+
+def textured(splats: Path, camera: ms.Camera, folder: Path) -> np.ndarray:
+    """The image of the surface of `meshsplats surface`."""
+    glb = folder / "surface.glb"
+    if not glb.exists():
+        subprocess.run([sys.executable, "-m", "meshsplats", "surface", splats, "-o", glb], check=True)
+    return ms.draw_surface(ms.load_base(glb), camera)
 
 
 def labelled(panels: list[np.ndarray]) -> np.ndarray:
@@ -94,6 +103,7 @@ def main() -> None:
         ms.render(mesh, camera, samples=2).color,
         lit(asked.splats, cameras, asked.work / "lit.png", asked.blender_python),
         opaque(asked.splats, camera, asked.work, asked.node_folder, asked.minutes),
+        textured(asked.splats, camera, asked.work),
     ]
     ms.save_image(asked.output, labelled(panels).clip(0, 1))
     opaque_count = len(ms.load_mesh(asked.work / "opaque.glb").faces)

@@ -35,7 +35,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.training import growing, starting_fans, train, train_config
-from meshsplats.training.as_splats import splats_of_fans
+from meshsplats.training.as_splats import HALVED, splats_of_fans
 from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growth import (
     HALF,
@@ -796,7 +796,7 @@ def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     assert main(words) == 0
     mesh = load_mesh(out)
     assert fan_count(mesh) <= 500
-    assert len(load_gaussians(splats)) == fan_count(mesh)
+    assert len(load_gaussians(splats)) == fan_count(mesh) + int(HALVED * fan_count(mesh))
     for name in ("config.toml", "preview.png"):
         assert (tmp_path / f"mesh.npz.{name}").is_file()
     with Image.open(tmp_path / "mesh.npz.preview.png") as preview:  # from the first held-out photograph

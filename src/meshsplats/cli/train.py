@@ -12,6 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import File, Output, check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.cli.progress import progress_display
 from meshsplats.cli.training import Plan, Trained, TrainingCommand
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import BLACK, Background
@@ -23,6 +24,7 @@ from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.outputs import check_outputs
 from meshsplats.formats.splat_formats import written_ending
+from meshsplats.training.as_splats import FITTED_SHARE
 from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.run import SO_FAR, check_training_memory, train
 
@@ -85,7 +87,7 @@ class Train(TrainingCommand):
     output: Output
     """The mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
     as_splats: File = None
-    """Also write the fans as splats to this file, .ply, .spz or .sog, for splat viewers."""
+    """Also write splats to this file, .ply, .spz or .sog, for their viewers: a fifth of the time."""
     target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
     tuning: GrowingOptions = field(default_factory=GrowingOptions)
 
@@ -140,16 +142,22 @@ class Train(TrainingCommand):
 
         needed = check_training_memory(dataset, config, cache_bytes=self.target.cache_bytes)
         summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
-        return Plan(None, dataset, summary, background, optimise, needed=needed)
+        reserve = 0.0 if self.as_splats is None else 60 * FITTED_SHARE * (config.minutes or 0)
+        return Plan(None, dataset, summary, background, optimise, reserve=reserve, needed=needed)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         from meshsplats.formats.gaussians import save_gaussians
-        from meshsplats.training.as_splats import splats_of_fans
+        from meshsplats.training.as_splats import fit_splats
 
-        if self.as_splats is not None:
-            splats = placed(splats_of_fans(trained.saved), self.origin)
-            say_origin(splats.origin, "keep", splats=True)
-            save_gaussians(splats, self.as_splats)
+        if self.as_splats is None:
+            return
+        run = RunOptions(threads=self.threads, device=self.device, report_every=0, preview_every=0)
+        with progress_display() as show:
+            show.phase(f"fitting splats, for {self.as_splats}")
+            splats = fit_splats(trained.saved, plan.dataset, self.configured(), run=run, on_progress=show)
+        splats = placed(splats, self.origin)
+        say_origin(splats.origin, "keep", splats=True)
+        save_gaussians(splats, self.as_splats)
 
     def preview_camera(self, plan: Plan) -> Camera:
         # From elsewhere, it would show what no photograph shows.

@@ -44,9 +44,6 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
 
-if TYPE_CHECKING:
-    pass
-
 STARTUP_SECONDS = 1.0
 """Time that Python and the libraries take before the command's own clock starts."""
 _CHANGEABLE = {
@@ -216,7 +213,11 @@ class TrainingCommand(Command):
             save_mesh(mesh, files.mesh, **given)
             write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
             draw_preview(trained.shown, files.preview, self.preview_camera(plan), listing=given.get("order"))
-        self.save_more(files, plan, trained)  # which may fail: the mesh is there by now
+        try:
+            self.save_more(files, plan, trained)  # which may fail: the mesh is there by now
+        except Interrupted as stop:
+            say(f"stopped: {files.mesh} is there, the rest is not; --resume --force goes on to it")
+            return 128 + (stop.signal or signal.SIGINT)
         self._print_result(files, time.perf_counter() - start, earlier, trained, scored)
         if not self.json:
             for line in self.next_steps(files, config, plan):

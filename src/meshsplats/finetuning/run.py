@@ -292,7 +292,11 @@ class TrainingLoop:
         phase: Phase,
         options: RunOptions,
         on_progress: Callable[[Progress], None] | None = None,
+        *,
+        plain: bool = True,
     ) -> None:
+        """``plain``: the mesh gets plain colours, which take some of the time."""
+        self.plain = plain
         self.config, self.dataset, self.journal = start.config, start.dataset, start.journal
         self.clock, self.phase, self.options, self.on_progress = clock, phase, options, on_progress
         # The start itself is not kept: pruning replaces its state, whose memory is then free.
@@ -365,7 +369,7 @@ class TrainingLoop:
         return self.phase.result(self.state)
 
     def _plan_plain_images(self) -> None:
-        if self.state.mesh.harmonics is not None and self.clock.step:
+        if self.plain and self.state.mesh.harmonics is not None and self.clock.step:
             self.clock.plan_plain_images(most_images(self.clock.step))
 
     def finished(self) -> SplatMesh:
