@@ -36,7 +36,8 @@ from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, load_mesh, save_mesh
+from meshsplats.formats.mesh_formats import written_mesh_suffixes
+from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh
 from meshsplats.images.writing import save_animation, save_array, save_image
 from meshsplats.mesh import SplatMesh
 
@@ -70,7 +71,7 @@ def message_of(error: OSError, path: Path) -> str:
     return str(error.strerror)
 
 
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+@pytest.mark.parametrize("suffix", written_mesh_suffixes())
 def test_a_full_disk_is_one_line_with_path_and_bytes(small_disk, suffix):
     if suffix.startswith(".usd"):
         pytest.importorskip("pxr")
@@ -132,7 +133,7 @@ def test_a_limit_on_files_is_told(tmp_path, suffix):
     assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
 
 
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+@pytest.mark.parametrize("suffix", written_mesh_suffixes())
 def test_sizes_are_about_right(tmp_path, suffix):
     if suffix.startswith(".usd"):
         pytest.importorskip("pxr")

@@ -25,6 +25,7 @@ from meshsplats.cli.arguments import spelled
 from meshsplats.cli.messages import UsageError, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.mesh_formats import formats_in_words, mesh_format_to_write, written_mesh_suffixes
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import listed, written_suffixes, y_up_suffixes
 from meshsplats.gaussians import GaussianCloud
@@ -53,6 +54,7 @@ LookOfSplats = Annotated[
     Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
 ]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+MeshOutput = Annotated[Path, tyro.conf.arg(aliases=["-o"], help=f"The mesh: {formats_in_words()}.")]
 Origin = Annotated[
     Literal["keep", "local"] | tuple[float, float, float],
     tyro.conf.arg(
@@ -269,10 +271,8 @@ def check_data(
 
 def check_mesh_suffix(path: Path) -> None:
     """Raises UsageError if no mesh can be written under this name."""
-    from meshsplats.formats.meshes import MESH_SUFFIXES
-
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
+    if mesh_format_to_write(path) is None:
+        raise UsageError(f"-o must end in {', '.join(written_mesh_suffixes())}, got {path.name!r}")
 
 
 def check_splat_endings(*kinds: str) -> None:

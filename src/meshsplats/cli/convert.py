@@ -31,7 +31,7 @@ from meshsplats.cli.messages import (
 )
 from meshsplats.cli.records import changes_since
 from meshsplats.errors import DataWarning
-from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.mesh_formats import mesh_format_to_write
 from meshsplats.formats.outputs import CONFIGURATION, beside, means_splats
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.jobs import Job, is_batch, jobs, sources, without_results
@@ -208,7 +208,7 @@ class Convert(ConvertCommand):
 
 def _check_folder(output: Path) -> None:
     """UsageError if ``output`` names a mesh file, where a folder for several is wanted."""
-    if output.suffix.lower() in MESH_SUFFIXES and not output.is_dir():
+    if mesh_format_to_write(output) is not None and not output.is_dir():
         raise UsageError(f"several inputs or formats need a folder: -o {output.with_suffix('')}, say")
 
 

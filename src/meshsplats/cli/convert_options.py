@@ -31,6 +31,7 @@ from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.options import PRESETS
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.outputs import Ending, check_outputs, splat_options
 from meshsplats.formats.scenes import SUFFIXES as SCENE_SUFFIXES
 from meshsplats.formats.sniff import identify
@@ -164,13 +165,13 @@ class ConvertCommand(Command):
             raise UsageError("--with-mesh and --collider go beside splats: --as-splats")
         if self.spz_version is not None or self.linear is not None:
             raise UsageError("--set spz_version and linear are for splats: --as-splats")
-        glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
-        if self.lit and not (glb or usd):
+        names = [f"mesh.{kind}" for kind in kinds]
+        if self.lit and not any(takes(name, "lit") for name in names):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
         if self.smooth and not self.lit:
             raise UsageError("--smooth has no effect without --lit")
         only_glb = self.color_type != "uint16" or self.alpha in GLB_ALPHA or self.compression != "none"
-        if not glb and only_glb:
+        if only_glb and not any(takes(name, "alpha") for name in names):
             raise UsageError(
                 "--alpha mask, hybrid or ordered, --compression and --set color_type are for .glb files"
             )
@@ -235,13 +236,11 @@ class ConvertCommand(Command):
     def alone(self, job: Job, path: Path) -> ConvertCommand:
         """The command that writes ``path`` of ``job`` alone."""
         alone = replace(self, input=(job.source,), output=path, formats=())
-        suffix = path.suffix.lower()
-        if suffix != ".glb":
+        if not takes(path, "alpha"):
             alone = replace(alone, color_type="uint16", compression="none")
             if self.alpha in GLB_ALPHA:
                 alone = replace(alone, alpha="auto", cutoff=None, nodes=None, quick=False)
-        lit = suffix == ".glb" or suffix.startswith(".usd")
-        return alone if lit else replace(alone, lit=False, smooth=False)
+        return alone if takes(path, "lit") else replace(alone, lit=False, smooth=False)
 
     def merges(self) -> bool:
         """Whether splats are merged to keep a limit."""

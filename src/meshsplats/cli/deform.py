@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     track,
 )
 from meshsplats.cli.messages import UsageError
+from meshsplats.formats.mesh_formats import keeps
 from meshsplats.formats.outputs import check_outputs
 from meshsplats.mesh import SplatMesh
 
@@ -98,10 +99,7 @@ class Deform(Command):
 
 
 def _save(mesh: SplatMesh, target: Path) -> None:
-    from dataclasses import replace
-
-    from meshsplats.formats.meshes import BOUND_SUFFIXES, save_mesh
+    from meshsplats.formats.meshes import save_mesh
 
     # Formats without a place for the binding would warn of it.
-    bound = target.suffix.lower() in BOUND_SUFFIXES
-    save_mesh(mesh if bound else replace(mesh, binding=None), target)
+    save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)

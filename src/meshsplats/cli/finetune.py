@@ -16,7 +16,6 @@ from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import (
     ClusterOptions,
     Count,
-    Output,
     SplatOptions,
     check_mesh_suffix,
     load_scene,
@@ -44,6 +43,7 @@ from meshsplats.finetuning.initial import starts_with_filter
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -75,8 +75,6 @@ class Finetune(TrainingCommand):
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or, with --data, a mesh."""
-    output: Output
-    """The tuned mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
     preset: Annotated[Literal["default", "paper"], tyro.conf.arg(metavar="NAME")] = "default"
     """default: best quality at equal time. paper: the text of the MeshSplats paper."""
     start: tyro.conf.Fixed[Literal["same", "default", "paper"]] = "same"
@@ -164,7 +162,7 @@ class Finetune(TrainingCommand):
     def _trained(self, tuned: on_splats.Tuned, config: FinetuneConfig) -> Trained:
         mesh, order, sizes = tuned
         count = len(mesh.faces)
-        hybrid = config.soft_share and self.output.suffix.lower() == ".glb" and not (sizes and sizes.loses)
+        hybrid = config.soft_share and takes(self.output, "alpha") and not (sizes and sizes.loses)
         saving = {"order": order} if order is not None else {"alpha": "hybrid"} if hybrid else {}
         return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", saving, sizes)
 

@@ -33,7 +33,8 @@ from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
-from meshsplats.formats.outputs import CONFIGURATION, check_outputs, recorded_options
+from meshsplats.formats.mesh_formats import takes
+from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, check_outputs, recorded_options
 from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words
@@ -68,7 +69,7 @@ class Levels(Command):
     """Screen size of the finest level: side in pixels of images that just hold the subject."""
     max_splats: Count = None
     """Maximum number of splats of the finest level. Default: all."""
-    format: Literal["glb", "npz", "ply", "usdc", "usda", "obj"] = "glb"
+    format: MeshEnding = "glb"
     """File format of the meshes."""
     alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
     """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
@@ -165,7 +166,7 @@ class Levels(Command):
             raise UsageError("give --minutes or --steps, not both")
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
-        if self.alpha not in ("auto", "opaque") and self.format != "glb":
+        if self.alpha not in ("auto", "opaque") and not takes(f"level.{self.format}", "alpha"):
             raise UsageError(f"--alpha {self.alpha} is for .glb files, not .{self.format}")
         if self.up is not None:
             parse_up(self.up)

@@ -27,11 +27,10 @@ from meshsplats.finetuning import FinetuneConfig, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
+from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS
-
-SUFFIXES = (".npz", ".glb")
 
 if TYPE_CHECKING:
     PriorTuningOptions = FinetuneConfig
@@ -96,8 +95,8 @@ class Prior(TrainingCommand):
         return prior_config(**self.explicit_settings())
 
     def check(self) -> None:
-        if self.output.suffix.lower() not in SUFFIXES:
-            known = " or ".join(SUFFIXES)
+        if not keeps(self.output, "binding"):
+            known = " or ".join(s for s in written_mesh_suffixes() if keeps(f"mesh{s}", "binding"))
             raise UsageError(f"-o must end in {known}, which keep the binding, got {self.output.name!r}")
         if self.splats is not None and self.target.data is not None:
             raise UsageError("give --data or --splats, not both")

@@ -17,9 +17,9 @@ from meshsplats.camera import Camera
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.common import (
     Count,
+    MeshOutput,
     Number,
     Origin,
-    Output,
     draw_preview,
     optional_color,
     plural,
@@ -123,8 +123,7 @@ class TrainingCommand(Command):
 
     input: tyro.conf.Positional[Path]
     """Input."""
-    output: Output
-    """The mesh."""
+    output: MeshOutput
     epochs: Number = None
     """Length of the run: passes over all training views."""
     steps: Count = None
