@@ -271,7 +271,7 @@ def killed_in_the_preview(
 @pytest.mark.parametrize("option", [[], ["--skip-existing"]])
 def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, option):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    killed_in_the_preview(tmp_path, "convert", "scene.ply", "-o", "mesh.glb", module="convert_making")
+    killed_in_the_preview(tmp_path, "convert", "scene.ply", "-o", "mesh.glb")
     made = {"mesh.glb", "mesh.glb.config.toml"}
     assert {name for name in os.listdir(tmp_path) if name.startswith("mesh")} == made
     stamp = (tmp_path / "mesh.glb").stat().st_mtime_ns
@@ -299,7 +299,7 @@ def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, mo
 @posix
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    code = _HANGING_PREVIEW.format("convert_making", "draw_preview")
+    code = _HANGING_PREVIEW.format("convert", "draw_preview")
     arguments = ["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.glb")]
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True

@@ -12,15 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from meshsplats.cameras.files import save_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import (
-    ClusterOptions,
-    Count,
-    SplatOptions,
-    check_mesh_suffix,
-    load_scene,
-    plural,
-)
+from meshsplats.cli.common import ClusterOptions, SplatOptions, check_mesh_suffix, load_scene, plural
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
@@ -81,7 +75,7 @@ class Finetune(TrainingCommand):
     """Conversion of splats; same: that of --preset. default: an ellipse of 5 to 32 triangles a splat. paper:
     the paper's conversion."""
     conversion: StartOptions = field(default_factory=StartOptions)
-    cell_splats: Count = None
+    cell_splats: option.Count = None
     """Tune splats in cells of at most N, in the memory of a cell, one after the other or by --cluster."""
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)

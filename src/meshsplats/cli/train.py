@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from meshsplats.camera import Camera
+from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import File, check_mesh_suffix, check_splat_endings, placed, say_origin
+from meshsplats.cli.common import check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.training import Plan, Trained, TrainingCommand
 from meshsplats.datasets.views import Dataset
@@ -82,7 +83,7 @@ class Train(TrainingCommand):
 
     input: tyro.conf.Positional[Path]
     """The folder of the photographs, or its transforms.json."""
-    as_splats: File = None
+    as_splats: option.File = None
     """Also write the fans as splats to this file, .ply, .spz or .sog, for splat viewers."""
     target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
     tuning: GrowingOptions = field(default_factory=GrowingOptions)
