@@ -24,9 +24,9 @@ FLOORS = (
     ("viewpoints",),
     ("conversion", "datasets"),
     ("evaluation", "surfaces"),
-    ("finetuning", "viewer"),
+    ("finetuning", "jobs", "viewer"),
     ("levels", "prior", "tiles", "training"),
-    ("blender", "chains", "frames", "inspection", "installation", "jobs"),
+    ("blender", "chains", "file_conversion", "frames", "inspection", "installation"),
     ("cli",),
     ("__main__",),
 )

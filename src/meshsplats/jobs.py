@@ -13,7 +13,7 @@ from pathlib import Path
 from meshsplats._files.atomic import refuse_existing
 from meshsplats._files.locks import lock_of, locked
 from meshsplats.errors import FileFormatError, OverwritingError
-from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.mesh_formats import mesh_suffixes
 from meshsplats.formats.outputs import (
     CONFIGURATION,
     PREVIEW,
@@ -264,7 +264,7 @@ def _inside(folder: Path) -> list[Path]:
         for path in folder.iterdir()
         if path.is_dir() and not path.name.startswith(".") and _is_splats(path)
     ]
-    found = sorted([*models, *files_named(folder, (*MESH_SUFFIXES, *splat_suffixes()))])
+    found = sorted([*models, *files_named(folder, (*mesh_suffixes(), *splat_suffixes()))])
     if not found:
         splat_file(folder)  # says what is wrong
     return found

@@ -36,7 +36,8 @@ from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, load_mesh, save_mesh
+from meshsplats.formats.mesh_formats import written_mesh_suffixes
+from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh
 from meshsplats.images.writing import save_animation, save_array, save_image
 from meshsplats.mesh import SplatMesh
 
@@ -70,7 +71,7 @@ def message_of(error: OSError, path: Path) -> str:
     return str(error.strerror)
 
 
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+@pytest.mark.parametrize("suffix", written_mesh_suffixes())
 def test_a_full_disk_is_one_line_with_path_and_bytes(small_disk, suffix):
     if suffix.startswith(".usd"):
         pytest.importorskip("pxr")
@@ -132,7 +133,7 @@ def test_a_limit_on_files_is_told(tmp_path, suffix):
     assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
 
 
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+@pytest.mark.parametrize("suffix", written_mesh_suffixes())
 def test_sizes_are_about_right(tmp_path, suffix):
     if suffix.startswith(".usd"):
         pytest.importorskip("pxr")
@@ -270,7 +271,7 @@ def killed_in_the_preview(
 @pytest.mark.parametrize("option", [[], ["--skip-existing"]])
 def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, option):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    killed_in_the_preview(tmp_path, "convert", "scene.ply", "-o", "mesh.glb", module="convert_making")
+    killed_in_the_preview(tmp_path, "convert", "scene.ply", "-o", "mesh.glb")
     made = {"mesh.glb", "mesh.glb.config.toml"}
     assert {name for name in os.listdir(tmp_path) if name.startswith("mesh")} == made
     stamp = (tmp_path / "mesh.glb").stat().st_mtime_ns
@@ -298,7 +299,7 @@ def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, mo
 @posix
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    code = _HANGING_PREVIEW.format("convert_making", "draw_preview")
+    code = _HANGING_PREVIEW.format("convert", "draw_preview")
     arguments = ["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.glb")]
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True

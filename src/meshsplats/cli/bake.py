@@ -9,8 +9,9 @@ from pathlib import Path
 
 import tyro
 
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import Number, Origin, Output, check_mesh_suffix, plural, size_of, written
+from meshsplats.cli.common import check_mesh_suffix, plural, size_of, written
 from meshsplats.cli.images import ViewOptions
 from meshsplats.formats.outputs import check_outputs
 
@@ -31,19 +32,17 @@ class Bake(Command):
 
     input: tyro.conf.Positional[Path]
     """The mesh: .npz, .ply, .glb, .usdc."""
-    output: Output
+    output: option.Output
     """The mesh to write: .glb, .usdc, .ply, .npz, .obj."""
     views: ViewOptions = field(default_factory=ViewOptions)
     colors: bool = False
     """Replace colours that depend on the view by their mean over these views, for programs that show them the
     same from everywhere."""
-    filter_px2: Number = None
+    filter_px2: option.Number = None
     """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""
-    origin: Origin = "keep"
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    origin: option.Origin = "keep"
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.conversion import bake_filter

@@ -18,12 +18,9 @@ from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
 from meshsplats.blender.plan import in_words
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
-    Count,
-    File,
-    Number,
-    Output,
     PartOptions,
     SplatOptions,
     load_scene,
@@ -98,7 +95,7 @@ class Blender(Command):
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, a mesh, the folder of a tileset, or a chain of levels of detail (levels.json,
     for a .blend)."""
-    output: Output
+    output: option.Output
     """A .png or .exr for one view, a folder for several, or a .blend with a camera for each view."""
     lit: bool = False
     """Light the splats, with the options under "light"."""
@@ -117,27 +114,24 @@ class Blender(Command):
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
     transparent: bool = False
     """No background: images with an alpha channel."""
-    samples: Count = None
+    samples: option.Count = None
     """Unlit: side of the sample grid in each pixel, as in render. Default: 2 (a .blend: 1). With --lit:
     samples per pixel. Default: 16 and denoised, for previews; 64 or more for final images."""
     no_denoise: bool = False
     """With --lit, cycles: do not denoise."""
     format: Literal["png", "exr"] = "png"
     """Format of the images in a folder."""
-    executable: File = None
+    executable: option.File = None
     """An installed Blender, 4.2 or newer, to use instead of the module bpy."""
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
+    threads: option.Threads = None
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
-    max_splats: Count = None
+    max_splats: option.Count = None
     """Merge splats that are alike until at most this many are left: a preview in less time."""
-    max_error: Number = None
+    max_error: option.Number = None
     """Tileset: take tiles whose geometric error is at most this many pixels in the images. Default: 1."""
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.blender import draw

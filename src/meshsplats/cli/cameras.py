@@ -12,8 +12,9 @@ import tyro
 
 from meshsplats._files.atomic import together
 from meshsplats.cameras.files import cameras_beside
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import Count, Output, SplatOptions, Text, load_scene, parse_up
+from meshsplats.cli.common import SplatOptions, load_scene, optional_up
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
@@ -31,23 +32,20 @@ class Cameras(Command):
 
     input: tyro.conf.Positional[Path]
     """Splats."""
-    output: Output
+    output: option.Output
     """The cameras, for --cameras of other commands: .json."""
     count: int = 24
     """Number of views."""
-    up: Text = None
+    up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the file, else found."""
     width: int = 800
     """Image width in pixels."""
-    height: Count = None
+    height: option.Count = None
     """Image height in pixels. Default: the width."""
     reading: SplatOptions = field(default_factory=SplatOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    threads: option.Threads = None
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.cameras.files import save_cameras
@@ -61,7 +59,7 @@ class Cameras(Command):
         scene = load_scene(self.input, self.reading, up=self.up)
         if not isinstance(scene, GaussianCloud):
             raise UsageError(f"{self.input} is a mesh: cameras are found from the splats it was made of")
-        up = None if self.up is None else parse_up(self.up)
+        up = optional_up(self.up)
         given = cameras_beside(self.input, scene.origin)
         if given is not None:
             say(f"{self.input} has {len(given)} cameras of its own, which --cameras {self.input} takes")

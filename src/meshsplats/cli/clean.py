@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING
 import tyro
 
 from meshsplats._files.atomic import together
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
-    Count,
-    Origin,
-    Output,
     SplatOptions,
     check_mesh_suffix,
     check_splat_endings,
@@ -65,19 +63,16 @@ class Clean(Command):
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
-    output: Output
+    output: option.Output
     """The remaining splats: .ply, .spz, .sog or others; a mesh: .glb, .npz, .ply, .usdc, .obj."""
     rules: RuleOptions = field(default_factory=RuleOptions)
     preview_only: bool = False
     """Print and draw what would be removed, but write no result."""
     reading: SplatOptions = field(default_factory=SplatOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
-    origin: Origin = "keep"
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    threads: option.Threads = None
+    origin: option.Origin = "keep"
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.evaluation.viewers import alpha_for_viewers

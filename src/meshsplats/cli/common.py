@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -21,57 +21,24 @@ from meshsplats._words import parse_up as parse_up
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import warn_of_strays_in
+from meshsplats.cli import option
 from meshsplats.cli.arguments import spelled
 from meshsplats.cli.messages import UsageError, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import listed, written_suffixes, y_up_suffixes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
-    from meshsplats.evaluation.viewers import AlphaChoice
     from meshsplats.formats.streaming import SplatStream
     from meshsplats.tiles.tileset import Tileset
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
 Placed = TypeVar("Placed", GaussianCloud, SplatMesh, BaseMesh, GaussianCloud | SplatMesh)
-# Optional options. Their help describes the default, in place of "(default: None)".
-Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
-Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
-Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
-File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
-Point = Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")]
-Box = Annotated[
-    tuple[float, float, float, float, float, float] | None,
-    tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
-]
-LookOfSplats = Annotated[
-    Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
-]
-Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-Origin = Annotated[
-    Literal["keep", "local"] | tuple[float, float, float],
-    tyro.conf.arg(
-        metavar="{keep,local,X Y Z}",
-        help="Georeferenced scenes. keep: the result stands where the input does; local: without its origin;"
-        " X Y Z: coordinates are relative to this point of the world, which several scenes can share.",
-    ),
-]
-
-Missing = Annotated[
-    Literal["error", "skip"],
-    tyro.conf.arg(help="With --data: images that are missing are an error, or their views are left out."),
-]
-
-MeaningOfMasks = Annotated[
-    Literal["count", "subject"],
-    tyro.conf.arg(help="With --data: only pixels inside of masks count, or masks cut out a subject."),
-]
-
 _AXES = (
     "Direction of the y axis in the file; auto: as its format prescribes, up in"
     f" {listed(y_up_suffixes(), 'and')}, else down. After reading, y points down. Some programs write SPZ"
@@ -86,7 +53,7 @@ class SplatOptions:
     axes: Annotated[Literal["auto", "y-down", "y-up"], tyro.conf.arg(help=_AXES)] = "auto"
     kernel: Literal["auto", "3dgs", "antialiased", "2dgs"] = "auto"
     """Kernel that the splats were trained with; auto: as the file says."""
-    time: Number = None
+    time: option.Number = None
     """Splats that move in time: the instant to show, in the file's unit. Default: one in the middle."""
     activated: tyro.conf.Fixed[tuple[Literal["scales", "opacities", "colors"], ...]] = ()
     """Values that a .ply stores as they are, where logarithms, logits and harmonics belong."""
@@ -156,7 +123,7 @@ class SplatOptions:
 class PartOptions:
     """Part of the scene."""
 
-    crop: Box = None
+    crop: option.Box = None
     """Only splats with their centre in this box, in the coordinates of the file; 'info' prints its extent."""
 
     def of(self, scene: Scene) -> Scene:
@@ -204,7 +171,7 @@ class ClusterOptions:
             yield found
 
 
-def placed(scene: Placed, origin: Origin) -> Placed:
+def placed(scene: Placed, origin: option.Origin) -> Placed:
     """``scene`` as --origin wants it written: with its origin, or without any. UsageError for a point that is
     too far away for float32."""
     if origin == "keep":
@@ -217,13 +184,13 @@ def placed(scene: Placed, origin: Origin) -> Placed:
     return replace(scene, origin=np.zeros(3))
 
 
-def written(scene: Placed, origin: Origin) -> Placed:
+def written(scene: Placed, origin: option.Origin) -> Placed:
     """``placed``; also says where the file will stand in the world."""
     say_origin(scene.origin, origin, splats=isinstance(scene, GaussianCloud))
     return placed(scene, origin)
 
 
-def say_origin(found: np.ndarray, origin: Origin, *, splats: bool = False) -> None:
+def say_origin(found: np.ndarray, origin: option.Origin, *, splats: bool = False) -> None:
     """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
     ``splats`` does not tell other programs."""
     if origin == "keep" and found.any():
@@ -255,8 +222,13 @@ def optional_color(text: str | None) -> tuple[float, float, float] | None:
     return None if text is None else parse_color(text)
 
 
+def optional_up(text: str | None) -> np.ndarray | None:
+    """``parse_up`` of an option that may not be given."""
+    return None if text is None else parse_up(text)
+
+
 def check_data(
-    data: Path | None, missing: Missing, cameras: Path | None = None, masks: str = "count"
+    data: Path | None, missing: option.Missing, cameras: Path | None = None, masks: str = "count"
 ) -> None:
     """UsageError for --missing and --masks without --data, and for --cameras with it."""
     if cameras is not None and data is not None:
@@ -269,10 +241,8 @@ def check_data(
 
 def check_mesh_suffix(path: Path) -> None:
     """Raises UsageError if no mesh can be written under this name."""
-    from meshsplats.formats.meshes import MESH_SUFFIXES
-
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
+    if mesh_format_to_write(path) is None:
+        raise UsageError(f"-o must end in {', '.join(written_mesh_suffixes())}, got {path.name!r}")
 
 
 def check_splat_endings(*kinds: str) -> None:
@@ -324,11 +294,6 @@ def draw_preview(
     if not save_preview(scene, path, camera, **how):
         count = layers(scene, camera or preview_camera(scene))
         say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
-
-
-def alpha_record(choice: AlphaChoice | None) -> dict[str, Any] | None:
-    """A choice of the alpha mode for JSON; None where there was none."""
-    return None if choice is None else asdict(choice)
 
 
 def alpha_in_words(record: Mapping[str, Any] | None) -> str | None:

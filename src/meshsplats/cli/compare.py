@@ -11,8 +11,9 @@ from typing import Literal
 import tyro
 
 from meshsplats.cameras.files import save_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import File, Output, PartOptions, SplatOptions, optional_color, parse_color, track
+from meshsplats.cli.common import PartOptions, SplatOptions, optional_color, parse_color, track
 from meshsplats.cli.images import DrawOptions, ViewOptions, view_names
 from meshsplats.cli.records import write_configuration, write_json
 from meshsplats.errors import FileFormatError
@@ -39,9 +40,9 @@ class Compare(Command):
 
     splats: tyro.conf.Positional[Path]
     """Splat file or model folder."""
-    mesh: tyro.conf.Positional[File] = None
+    mesh: tyro.conf.Positional[option.File] = None
     """The mesh. Default: the splats, converted with --preset for these cameras."""
-    output: Output = tyro.MISSING
+    output: option.Output = tyro.MISSING
     """Folder for strips, results.json, cameras.json and config.toml."""
     preset: Literal["default", "paper"] = "default"
     """Preset of the conversion, without a mesh."""
@@ -56,10 +57,8 @@ class Compare(Command):
     """Of the splats and of the mesh."""
     amplify: float = 4.0
     """Factor of the error in the strips."""
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.images.writing import amplified_error, save_image, strip

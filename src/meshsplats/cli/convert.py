@@ -14,9 +14,20 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.cli.common import alpha_in_words, check_mesh_suffix, plural, size_of, track, warnings_kept
-from meshsplats.cli.convert_making import Making, seen_from
+from meshsplats.cli.common import (
+    alpha_in_words,
+    check_mesh_suffix,
+    draw_preview,
+    optional_up,
+    plural,
+    say_origin,
+    size_of,
+    track,
+    warnings_kept,
+    written,
+)
 from meshsplats.cli.convert_options import ConvertCommand
+from meshsplats.cli.images import views_of_a_place
 from meshsplats.cli.messages import (
     FAILED,
     NO_SPACE,
@@ -29,11 +40,14 @@ from meshsplats.cli.messages import (
     say,
     shown_path,
 )
-from meshsplats.cli.records import changes_since
+from meshsplats.cli.records import changes_since, write_configuration
 from meshsplats.errors import DataWarning
-from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.file_conversion import Maker, Surroundings, seen_from
+from meshsplats.formats.mesh_formats import mesh_format_to_write
 from meshsplats.formats.outputs import CONFIGURATION, beside, means_splats
 from meshsplats.formats.splat_formats import written_ending
+from meshsplats.formats.streaming import SplatStream
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.jobs import Job, is_batch, jobs, sources, without_results
 
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
@@ -127,12 +141,41 @@ class Convert(ConvertCommand):
             for mesh in plan.kept:
                 if remark := mesh.remark:
                     warnings.warn(remark, DataWarning, stacklevel=1)
-            result = {} if plan.finished else Making(self).made(plan.job, cameras)
+            result = {} if plan.finished else self._made(plan.job, cameras)
         outputs = [{"path": str(path), "bytes": path.stat().st_size} for path in job.outputs]
         image = job.preview if job.preview and job.preview.exists() else None
         base = {"input": job.shown, "outputs": outputs, "preview": str(image) if image else None}
         more = {"skipped": plan.finished, "warnings": warned, "meshsplats": meshsplats.__version__}
         return base | result | more
+
+    def _made(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
+        """Writes the outputs of ``job``; counts, scores and seconds."""
+        if not (self.as_splats or self.stream):
+            self.check_kind(job)
+        around = Surroundings(
+            load=partial(self.reading.load, up=self.up),
+            stream=self._opened,
+            place=partial(written, origin=self.origin),
+            record=self._record,
+            preview=draw_preview,
+            opening=self._opening,
+        )
+        return Maker(self.product(), around).made(job, cameras)
+
+    def _opened(self, source: Path) -> SplatStream:
+        """The splats of an input in blocks, relative to the origin that is asked for."""
+        given = None if isinstance(self.origin, str) else self.origin
+        found = self.reading.stream(source, given, up=self.up)
+        say_origin(found.origin, self.origin, splats=self.as_splats)
+        return found
+
+    def _record(self, job: Job) -> None:
+        for path, config in zip(job.outputs, job.configs, strict=False):
+            write_configuration(config, "convert", self.alone(job, path))
+
+    def _opening(self, cloud: GaussianCloud) -> Camera | None:
+        found = views_of_a_place(cloud, 1, {"width": 800, "height": 800, "up": optional_up(self.up)})
+        return found[0] if found else None
 
     def _changes(self, job: Job, index: int) -> str | None:
         """How the record beside an output of ``job`` differs from the options of now: see ``Job.plan``."""
@@ -208,7 +251,7 @@ class Convert(ConvertCommand):
 
 def _check_folder(output: Path) -> None:
     """UsageError if ``output`` names a mesh file, where a folder for several is wanted."""
-    if output.suffix.lower() in MESH_SUFFIXES and not output.is_dir():
+    if mesh_format_to_write(output) is not None and not output.is_dir():
         raise UsageError(f"several inputs or formats need a folder: -o {output.with_suffix('')}, say")
 
 

@@ -11,26 +11,16 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
-from meshsplats.cli.common import (
-    Count,
-    File,
-    Folder,
-    Missing,
-    Number,
-    Origin,
-    Output,
-    SplatOptions,
-    Text,
-    check_data,
-    check_splat_endings,
-    parse_up,
-)
+from meshsplats.cli.common import SplatOptions, check_data, check_splat_endings, optional_up
 from meshsplats.cli.messages import UsageError
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.options import PRESETS
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
+from meshsplats.file_conversion import Product
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.outputs import Ending, check_outputs, splat_options
 from meshsplats.formats.scenes import SUFFIXES as SCENE_SUFFIXES
 from meshsplats.formats.sniff import identify
@@ -75,23 +65,23 @@ class ConvertCommand(Command):
     ]
     """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
     input."""
-    output: Output
+    output: option.Output
     """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or
     splats: .spz, .sog, .splat, .compressed.ply, .usdz. Or a folder, for files named like the inputs."""
     formats: Annotated[tuple[Ending, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """With a folder: formats to write. Default: glb."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
-    cameras: File = None
+    cameras: option.File = None
     """Cameras that the mesh will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
     folder that has one. Default: those of the input if it is a model folder, else none."""
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
-    missing: Missing = "error"
-    up: Text = None
+    missing: option.Missing = "error"
+    up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
     file, else -y."""
-    scale: Number = None
+    scale: option.Number = None
     """Factor for all lengths of the result, of meshes and splats: metres in an output unit, say."""
     lit: bool = False
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
@@ -121,16 +111,16 @@ class ConvertCommand(Command):
     """.spz: version. 4 is read by newer programs only. Default: 3."""
     linear: tyro.conf.Fixed[bool | None] = None
     """Splats as .usdc, .usda, .usdz: linear colours, for renderers that take all colours so."""
-    with_mesh: File = None
+    with_mesh: option.File = None
     """Splats as .glb or USD: a mesh to put into the file, too, such as one converted of them."""
-    collider: File = None
+    collider: option.File = None
     """Splats as .glb or USD: a mesh that physics engines collide with and nobody draws, in the file."""
-    fidelity: Count = None
+    fidelity: option.Count = None
     """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
     stream: bool = False
     """Convert in blocks, so that memory does not grow with the file: into a .ply mesh, or with --as-splats
     into a .ply of splats, without a preview. The result is the same."""
-    origin: Origin = "keep"
+    origin: option.Origin = "keep"
     no_preview: bool = False
     """Write no preview."""
     no_sidecar: bool = False
@@ -139,8 +129,7 @@ class ConvertCommand(Command):
     reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
     """Print the results as JSON, a line for each input, errors too."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    force: option.Force = False
     skip_existing: bool = False
     """Keep the meshes that are there, and make those that are missing. Says which of them are older than
     their input or were made with other options."""
@@ -153,8 +142,7 @@ class ConvertCommand(Command):
             raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise ValueError(f"--scale must be a number above 0, got {self.scale}")
-        if self.up is not None:
-            parse_up(self.up)
+        optional_up(self.up)
         if self.stream:
             self._check_stream(kinds)
         if self.as_splats:
@@ -164,13 +152,13 @@ class ConvertCommand(Command):
             raise UsageError("--with-mesh and --collider go beside splats: --as-splats")
         if self.spz_version is not None or self.linear is not None:
             raise UsageError("--set spz_version and linear are for splats: --as-splats")
-        glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
-        if self.lit and not (glb or usd):
+        names = [f"mesh.{kind}" for kind in kinds]
+        if self.lit and not any(takes(name, "lit") for name in names):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
         if self.smooth and not self.lit:
             raise UsageError("--smooth has no effect without --lit")
         only_glb = self.color_type != "uint16" or self.alpha in GLB_ALPHA or self.compression != "none"
-        if not glb and only_glb:
+        if only_glb and not any(takes(name, "alpha") for name in names):
             raise UsageError(
                 "--alpha mask, hybrid or ordered, --compression and --set color_type are for .glb files"
             )
@@ -235,21 +223,51 @@ class ConvertCommand(Command):
     def alone(self, job: Job, path: Path) -> ConvertCommand:
         """The command that writes ``path`` of ``job`` alone."""
         alone = replace(self, input=(job.source,), output=path, formats=())
-        suffix = path.suffix.lower()
-        if suffix != ".glb":
+        if not takes(path, "alpha"):
             alone = replace(alone, color_type="uint16", compression="none")
             if self.alpha in GLB_ALPHA:
                 alone = replace(alone, alpha="auto", cutoff=None, nodes=None, quick=False)
-        lit = suffix == ".glb" or suffix.startswith(".usd")
-        return alone if lit else replace(alone, lit=False, smooth=False)
+        return alone if takes(path, "lit") else replace(alone, lit=False, smooth=False)
 
-    def merges(self) -> bool:
-        """Whether splats are merged to keep a limit."""
-        limits = (self.conversion.max_splats, self.conversion.max_triangles)
-        return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
+    def check_kind(self, job: Job) -> None:
+        """UsageError for options that have no effect on the input of ``job``, which is to be a mesh."""
+        kind = identify(job.source)
+        if kind == "splats" and self.alpha == "hybrid":
+            raise UsageError(
+                f"{job.shown} holds splats: --alpha hybrid is for a mesh with solid triangles, as finetune"
+                " --opacity cutoff --soft-share makes"
+            )
+        if kind != "mesh":
+            return
+        views = () if self.alpha == "ordered" else ("cameras", "data")
+        idle = [name for name in (*views, "fidelity") if getattr(self, name) is not None]
+        idle += ["preset"] if self.preset != "default" else []
+        idle += [name for name, value in asdict(self.conversion).items() if value is not None]
+        if idle:
+            flags = ", ".join(spelled(type(self), name) for name in idle)
+            raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
+        self.reading.refuse_for(job.source)
+
+    def product(self) -> Product:
+        """What is made of each input."""
+        return Product(
+            preset=self.preset,
+            conversion=self.conversion,
+            files=self._files,
+            up=optional_up(self.up),
+            scale=self.scale,
+            keeps_origin=self.origin == "keep",
+            as_splats=self.as_splats,
+            in_blocks=self.stream,
+            of_splats={"spz_version": self.spz_version, "linear": self.linear},
+            with_mesh=self.with_mesh,
+            collider=self.collider,
+            scored_views=self.fidelity,
+            look=self.look_of_result,
+        )
 
     @property
-    def files(self) -> MeshFileOptions:
+    def _files(self) -> MeshFileOptions:
         """How meshes are saved."""
         return MeshFileOptions(
             self.alpha,

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    Number,
-    Origin,
-    Output,
-    check_mesh_suffix,
-    placed,
-    plural,
-    say_origin,
-    size_of,
-    track,
-)
+from meshsplats.cli.common import check_mesh_suffix, placed, plural, say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
+from meshsplats.formats.mesh_formats import keeps
 from meshsplats.formats.outputs import check_outputs
 from meshsplats.mesh import SplatMesh
 
@@ -38,18 +30,16 @@ class Deform(Command):
     """The result of 'meshsplats prior': .npz or .glb."""
     base: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE...")]
     """The edited base, or several: the same vertices and faces in the same order, at other positions."""
-    output: Output
+    output: option.Output
     """The moved splats: .glb, .npz (both can be moved again), .ply, .usdc, .obj. With several bases, files
     are numbered: edited.glb becomes edited_0001.glb, edited_0002.glb ..."""
-    lift: Number = None
+    lift: option.Number = None
     """Distance between layers along the normals, scene units. Default: the spacing of the prior; for coplanar
     layers 0 in .npz, and 1/50000 of the base's diagonal in other formats, whose readers do not know the order
     of coplanar layers."""
-    origin: Origin = "keep"
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    origin: option.Origin = "keep"
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.formats.base_meshes import load_base
@@ -98,10 +88,7 @@ class Deform(Command):
 
 
 def _save(mesh: SplatMesh, target: Path) -> None:
-    from dataclasses import replace
-
-    from meshsplats.formats.meshes import BOUND_SUFFIXES, save_mesh
+    from meshsplats.formats.meshes import save_mesh
 
     # Formats without a place for the binding would warn of it.
-    bound = target.suffix.lower() in BOUND_SUFFIXES
-    save_mesh(mesh if bound else replace(mesh, binding=None), target)
+    save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)

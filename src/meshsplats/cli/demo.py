@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.formats.outputs import check_outputs
 
@@ -34,8 +35,7 @@ class Demo(Command):
     """Folder for all files."""
     no_open: bool = False
     """Open no browser."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    force: option.Force = False
 
     def execute(self) -> int:
         from meshsplats.demo_scene import make_scene

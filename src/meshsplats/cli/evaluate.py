@@ -16,17 +16,11 @@ import tyro
 
 from meshsplats._origin import shared_origin
 from meshsplats.cameras.files import load_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     ClusterOptions,
-    Count,
-    File,
-    Folder,
-    MeaningOfMasks,
-    Missing,
-    Output,
     SplatOptions,
-    Text,
     check_data,
     load_scene,
     optional_color,
@@ -80,23 +74,23 @@ class Evaluate(Command):
     mesh: tyro.conf.Positional[Files] = ()
     """The mesh, or several, to score side by side. With --protocol: a folder with a mesh, splats or a model
     folder for each scene, by its name."""
-    output: Output = tyro.MISSING
+    output: option.Output = tyro.MISSING
     """Folder for the results."""
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs; with --protocol the folder of its scenes. Default: images of the splats."""
-    before: File = None
+    before: option.File = None
     """Another mesh to score, such as the one before fine-tuning."""
-    splats: File = None
+    splats: option.File = None
     """The splats. With --data: scored, too, at SH degree 0 and with all spherical harmonics. Without: their
     images are the ground truth (also scored at SH degree 0)."""
-    images: Folder = None
+    images: option.Folder = None
     """Images by other programs to score, such as Blender: a file for each view, by its name or in order."""
-    cameras: File = None
+    cameras: option.File = None
     """Without --data: cameras. Default: those that finetune holds out."""
     look: Literal["area", "splats"] = "area"
     """Without --data: kind of ground truth. area: means over each pixel's area, as in programs that take
     several samples per pixel. splats: images of a 3DGS viewer at this size."""
-    sh_degree: Count = None
+    sh_degree: option.Count = None
     """Without --data: SH degree of the ground truth. Default: all that are stored."""
     lpips: Files = ()
     """Weights of LPIPS, files or a folder: torchvision's vgg16-397923af.pth and vgg.pth of the package lpips,
@@ -105,21 +99,21 @@ class Evaluate(Command):
     """Network of LPIPS; splatting papers use vgg."""
     fit_exposure: bool = False
     """Also score with a gain and an offset per channel, fitted to each image."""
-    samples: Count = None
+    samples: option.Count = None
     """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
     with --look splats."""
     order: OrderOfBlending = None
     """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
     centres. Default: that of each mesh."""
-    background: Text = None
+    background: option.Text = None
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs without
     alpha that of the model folder, else black or white, the one that fits the splats best."""
-    downscale: Count = None
+    downscale: option.Count = None
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
-    missing: Missing = "error"
-    masks: MeaningOfMasks = "count"
+    missing: option.Missing = "error"
+    masks: option.MeaningOfMasks = "count"
     protocol: Annotated[
         Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
         tyro.conf.arg(metavar="{" + ",".join(BENCHMARKS) + "}", help_behavior_hint=""),
@@ -136,12 +130,9 @@ class Evaluate(Command):
     """Factor of the error in the strips."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    threads: option.Threads = None
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         self._check()

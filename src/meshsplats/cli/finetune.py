@@ -12,16 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from meshsplats.cameras.files import save_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import (
-    ClusterOptions,
-    Count,
-    Output,
-    SplatOptions,
-    check_mesh_suffix,
-    load_scene,
-    plural,
-)
+from meshsplats.cli.common import ClusterOptions, SplatOptions, check_mesh_suffix, load_scene, plural
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
@@ -44,6 +37,7 @@ from meshsplats.finetuning.initial import starts_with_filter
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -75,15 +69,13 @@ class Finetune(TrainingCommand):
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or, with --data, a mesh."""
-    output: Output
-    """The tuned mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
     preset: Annotated[Literal["default", "paper"], tyro.conf.arg(metavar="NAME")] = "default"
     """default: best quality at equal time. paper: the text of the MeshSplats paper."""
     start: tyro.conf.Fixed[Literal["same", "default", "paper"]] = "same"
     """Conversion of splats; same: that of --preset. default: an ellipse of 5 to 32 triangles a splat. paper:
     the paper's conversion."""
     conversion: StartOptions = field(default_factory=StartOptions)
-    cell_splats: Count = None
+    cell_splats: option.Count = None
     """Tune splats in cells of at most N, in the memory of a cell, one after the other or by --cluster."""
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
@@ -164,7 +156,7 @@ class Finetune(TrainingCommand):
     def _trained(self, tuned: on_splats.Tuned, config: FinetuneConfig) -> Trained:
         mesh, order, sizes = tuned
         count = len(mesh.faces)
-        hybrid = config.soft_share and self.output.suffix.lower() == ".glb" and not (sizes and sizes.loses)
+        hybrid = config.soft_share and takes(self.output, "alpha") and not (sizes and sizes.loses)
         saving = {"order": order} if order is not None else {"alpha": "hybrid"} if hybrid else {}
         return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", saving, sizes)
 

@@ -15,25 +15,16 @@ from typing import Any, Literal
 import tyro
 
 from meshsplats.chains import TABLE, ChainOptions, make_chain, partial_folder
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    Count,
-    Number,
-    Origin,
-    Output,
-    SplatOptions,
-    Text,
-    parse_up,
-    placed,
-    say_origin,
-    size_of,
-)
+from meshsplats.cli.common import SplatOptions, optional_up, placed, say_origin, size_of
 from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
-from meshsplats.formats.outputs import CONFIGURATION, check_outputs, recorded_options
+from meshsplats.formats.mesh_formats import takes
+from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, check_outputs, recorded_options
 from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words
@@ -58,7 +49,7 @@ class Levels(Command):
 
     input: tyro.conf.Positional[Path]
     """Splat file, or the folder of a trained model."""
-    output: Output
+    output: option.Output
     """Folder for the meshes; it appears when all of them are done."""
     levels: int = 4
     """Number of meshes."""
@@ -66,9 +57,9 @@ class Levels(Command):
     """Splats of each level per splat of the next: 4, for half the size on the screen, or 2."""
     width: int = 800
     """Screen size of the finest level: side in pixels of images that just hold the subject."""
-    max_splats: Count = None
+    max_splats: option.Count = None
     """Maximum number of splats of the finest level. Default: all."""
-    format: Literal["glb", "npz", "ply", "usdc", "usda", "obj"] = "glb"
+    format: MeshEnding = "glb"
     """File format of the meshes."""
     alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
     """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
@@ -76,24 +67,23 @@ class Levels(Command):
     cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
     no_tune: bool = False
     """Convert only: seconds in place of minutes."""
-    minutes: Number = None
+    minutes: option.Number = None
     """Length of the fine-tuning of each level. Default: 2."""
-    steps: Count = None
+    steps: option.Count = None
     """Length of the fine-tuning of each level, in place of --minutes."""
     order: Literal["fragment", "splat"] = "fragment"
     """Order in which triangles are blended, tuned and scored: exact at every sample, or whole splats by their
     centres."""
-    sh_degree: Count = None
+    sh_degree: option.Count = None
     """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
-    up: Text = None
+    up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
     file, else -y."""
-    origin: Origin = "keep"
+    origin: option.Origin = "keep"
     resume: bool = False
     """Continue an interrupted run of the same command, from the levels in FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
+    threads: option.Threads = None
     json: bool = False
     """Print the table as JSON."""
     force: bool = False
@@ -123,7 +113,7 @@ class Levels(Command):
             max_splats=self.max_splats,
             format=self.format,
             alpha=self.alpha,
-            up=None if self.up is None else parse_up(self.up),
+            up=optional_up(self.up),
             sh_degree=self.sh_degree,
             order=self.order,
             threads=self.threads,
@@ -165,10 +155,9 @@ class Levels(Command):
             raise UsageError("give --minutes or --steps, not both")
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
-        if self.alpha not in ("auto", "opaque") and self.format != "glb":
+        if self.alpha not in ("auto", "opaque") and not takes(f"level.{self.format}", "alpha"):
             raise UsageError(f"--alpha {self.alpha} is for .glb files, not .{self.format}")
-        if self.up is not None:
-            parse_up(self.up)
+        optional_up(self.up)
         if self.no_tune:
             return None
         if self.steps is not None:

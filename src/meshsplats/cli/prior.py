@@ -11,7 +11,8 @@ import tyro
 
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
-from meshsplats.cli.common import File, Number, Output, SplatOptions
+from meshsplats.cli import option
+from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import UsageError, quoted
 from meshsplats.cli.training import (
     Plan,
@@ -27,11 +28,10 @@ from meshsplats.finetuning import FinetuneConfig, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
+from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS
-
-SUFFIXES = (".npz", ".glb")
 
 if TYPE_CHECKING:
     PriorTuningOptions = FinetuneConfig
@@ -53,13 +53,13 @@ class LayOptions:
     """Take --triangles as the mean, with more on larger faces."""
     layers: int = LAYERS
     """Layers of triangles on each face: 1 to 16."""
-    spacing: Number = None
+    spacing: option.Number = None
     """Distance between layers along the base's normals, scene units; below 0 inwards; 0: all layers lie in
     the base. Default: inwards, all layers together 1/30 of the diagonal of the base's box."""
     colors: Literal["auto", "texture", "vertices", "views", "grey"] = "auto"
     """Initial colours: the base's texture, its vertex colours, or the images that see a point most squarely;
     auto: the first of these that exists."""
-    texture: File = None
+    texture: option.File = None
     """Image for the base's texture coordinates, if its file names none."""
 
 
@@ -80,9 +80,9 @@ class Prior(TrainingCommand):
 
     input: tyro.conf.Positional[Path]
     """Base mesh: .obj, .ply, .glb, .gltf, .npz, USD; in the frame of the photographs or splats."""
-    output: Output
+    output: option.Output
     """The result with its binding to the base: .npz, which keeps everything, or .glb."""
-    splats: File = None
+    splats: option.File = None
     """Splats whose images are the targets, in place of --data: a file or a model folder."""
     laying: LayOptions = field(default_factory=LayOptions)
     tuning: PriorTuningOptions = field(default_factory=PriorTuningOptions)
@@ -96,8 +96,8 @@ class Prior(TrainingCommand):
         return prior_config(**self.explicit_settings())
 
     def check(self) -> None:
-        if self.output.suffix.lower() not in SUFFIXES:
-            known = " or ".join(SUFFIXES)
+        if not keeps(self.output, "binding"):
+            known = " or ".join(s for s in written_mesh_suffixes() if keeps(f"mesh{s}", "binding"))
             raise UsageError(f"-o must end in {known}, which keep the binding, got {self.output.name!r}")
         if self.splats is not None and self.target.data is not None:
             raise UsageError("give --data or --splats, not both")

@@ -14,11 +14,10 @@ import tyro
 
 from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.files import load_cameras, save_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     ClusterOptions,
-    Number,
-    Output,
     PartOptions,
     SplatOptions,
     load_scene,
@@ -80,7 +79,7 @@ class Render(Command):
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, a mesh, or the folder of a tileset."""
-    output: Output
+    output: option.Output
     """A .png for one view, or a folder. Without other options: the front view, or an orbit of 60 views."""
     as_splats: bool = False
     """Render the splats themselves, not the mesh that they become."""
@@ -88,10 +87,10 @@ class Render(Command):
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
-    cutoff: Number = None
+    cutoff: option.Number = None
     """Draw a mesh as a depth buffer does: opaque where its opacity is at least this, nothing elsewhere. 0 to
     1; default: blended."""
-    max_error: Number = None
+    max_error: option.Number = None
     """Tileset: draw tiles whose geometric error is at most this many pixels; 0 draws the finest ones.
     Default: 1."""
     transparent: bool = False
@@ -104,10 +103,8 @@ class Render(Command):
     fps: float = 15.0
     """Images per second of the turntable."""
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         single = self.output.suffix.lower() == ".png"

@@ -13,15 +13,9 @@ import tyro
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
-    Count,
-    File,
-    Folder,
-    Missing,
-    Number,
-    Origin,
-    Output,
     SplatOptions,
     check_data,
     check_splat_endings,
@@ -50,29 +44,26 @@ class Simplify(Command):
 
     input: tyro.conf.Positional[Path]
     """Splat file, or the folder of a trained model."""
-    output: Output
+    output: option.Output
     """The splats: .ply, .spz, .sog or another format."""
-    count: Count = None
+    count: option.Count = None
     """Number of splats to keep."""
-    share: Number = None
+    share: option.Number = None
     """Share of the splats to keep, above 0 to 1: 0.25 keeps a quarter."""
-    cameras: File = None
+    cameras: option.File = None
     """Cameras that the splats will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
     folder that has one. Detail finer than their pixels goes first. Default: those of the input if it is a
     model folder, else images of 1000 pixels that hold the subject."""
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
-    missing: Missing = "error"
+    missing: option.Missing = "error"
     no_preview: bool = False
     """Write no preview."""
-    origin: Origin = "keep"
+    origin: option.Origin = "keep"
     reading: SplatOptions = field(default_factory=SplatOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    threads: option.Threads = None
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.conversion.merging import simplify

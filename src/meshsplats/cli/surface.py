@@ -12,22 +12,9 @@ import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import (
-    Count,
-    File,
-    Folder,
-    MeaningOfMasks,
-    Missing,
-    Number,
-    Origin,
-    Output,
-    SplatOptions,
-    check_data,
-    load_scene,
-    size_of,
-    written,
-)
+from meshsplats.cli.common import SplatOptions, check_data, load_scene, size_of, written
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
@@ -63,17 +50,17 @@ class Surface(Command):
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh of splats."""
-    output: Output
+    output: option.Output
     """The mesh, opaque: .glb, .usdz with the texture inside; .obj, .ply, .usdc with the texture beside; .npz
     without; .stl, .3mf for printing."""
     surface: Options = field(default_factory=Options)
     levels: int = 1
     """Levels of detail, each with a quarter of the triangles of the one before: MESH.glb, MESH_lod1.glb..."""
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs to fit shape and texture to, in place of images of the scene."""
-    missing: Missing = "error"
-    masks: MeaningOfMasks = "count"
-    cameras: File = None
+    missing: option.Missing = "error"
+    masks: option.MeaningOfMasks = "count"
+    cameras: option.File = None
     """Camera file: from where images are made, in place of --views."""
     unlit: bool = False
     """A material that shows the texture as it is, without lights."""
@@ -81,18 +68,15 @@ class Surface(Command):
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     collision: Collider = None
     """(.glb, USD) A static collider for engines, which is drawn, too, or not. Default: none."""
-    scale: Number = None
+    scale: option.Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
     no_preview: bool = False
     """Write no preview."""
     reading: SplatOptions = field(default_factory=SplatOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
-    origin: Origin = "keep"
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    threads: option.Threads = None
+    origin: option.Origin = "keep"
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         from meshsplats.cameras.files import load_cameras

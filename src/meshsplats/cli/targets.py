@@ -11,8 +11,9 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import spelled
-from meshsplats.cli.common import Count, File, Folder, LookOfSplats, Missing, Text, parse_up
+from meshsplats.cli.common import optional_up
 from meshsplats.cli.messages import UsageError
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import Masks
@@ -29,16 +30,16 @@ PLACING = ("placement", "distance", "up")
 class TargetOptions:
     """Targets: photographs (--data), else images of the splats."""
 
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs (COLMAP, NeRF, nerfstudio, LLFF)."""
     downscale: int = 1
     """With --data: factor by which images are smaller than the photographs."""
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
-    missing: Missing = "error"
+    missing: option.Missing = "error"
     masks: tyro.conf.Fixed[Masks] = "count"
     """With --data: only pixels inside of masks count, or (subject) what is outside is clear."""
-    views: Count = None
+    views: option.Count = None
     """Without --data: number of training images. Default: one per second, or per two --steps, from 200 to
     1000."""
     held_out: int = 8
@@ -54,15 +55,15 @@ class TargetOptions:
     """Without --data: cameras all around an object, above the ground around an object in its surroundings,
     in free places inside a room, or found from the splats as 'meshsplats cameras' does. auto: found, except
     for objects."""
-    cameras: File = None
+    cameras: option.File = None
     """Without --data: cameras, a JSON list or a cameras.json of a 3DGS trainer. Default: those of a model
     folder, else placed ones (--placement)."""
-    up: Text = None
+    up: option.Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
-    look: LookOfSplats = None
+    look: option.LookOfSplats = None
     """Images of splats. area: means over pixels, right at every size (with several samples: Blender, MSAA).
     splats: as in a 3DGS viewer, for this renderer. Default: area; of the other presets: splats."""
-    sh_degree: Count = None
+    sh_degree: option.Count = None
     """Without --data: render the splats with spherical harmonics up to this degree. Default: all that are
     stored."""
     cache: float = 2.0
@@ -141,7 +142,7 @@ class TargetOptions:
             width=self.width,
             distance=self.distance,
             below=bool(self.below),
-            up=None if self.up is None else parse_up(self.up),
+            up=optional_up(self.up),
             look=self.look_for(preset),
             zooms=zooms,
             sh_degree=self.sh_degree,

@@ -13,21 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    Box,
-    ClusterOptions,
-    Count,
-    LookOfSplats,
-    Number,
-    Origin,
-    Output,
-    SplatOptions,
-    Text,
-    alpha_in_words,
-    parse_up,
-    say_origin,
-)
+from meshsplats.cli.common import ClusterOptions, SplatOptions, alpha_in_words, parse_up, say_origin
 from meshsplats.cli.messages import Terminated, UsageError, say
 from meshsplats.cli.records import write_configuration
 from meshsplats.conversion import ConversionOptions
@@ -52,7 +40,7 @@ class Tiles(Command):
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
     ]
     """Splat file, or the folder of a trained model; several of them; a folder of splat files."""
-    output: Output
+    output: option.Output
     """Folder for the tileset; it appears when it is complete. Until then, FOLDER.partial."""
     as_splats: bool = False
     """Tiles of splats (SPZ in glTF), as CesiumJS draws them, not of triangles."""
@@ -60,10 +48,10 @@ class Tiles(Command):
     """Maximum number of triangles of a tile. A splat of --as-splats counts as 2."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
-    look: LookOfSplats = None
+    look: option.LookOfSplats = None
     """area: for programs that take several samples a pixel; splats: as splat viewers show them. Default:
     area."""
-    min_opacity: Number = None
+    min_opacity: option.Number = None
     """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
     colors: Annotated[
         Literal["base", "view"] | None, tyro.conf.arg(metavar="{base,view}", help_behavior_hint="")
@@ -71,11 +59,11 @@ class Tiles(Command):
     """base: one colour for each splat, which every program shows; the default of meshes. view: also the
     harmonics of colours that depend on the view, for this program's images and for shaders; 1.6 to 2 times
     as large."""
-    color_degree: Count = None
+    color_degree: option.Count = None
     """Harmonics of 'view' up to this degree, 1 to 3. Default: all that the splats have."""
-    crop: Box = None
+    crop: option.Box = None
     """Only splats with their centre in this box, in the coordinates of the file."""
-    up: Text = None
+    up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
     files, else -y."""
     lit: bool = False
@@ -84,15 +72,13 @@ class Tiles(Command):
     """auto: blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by a few
     images of both. blend: viewers blend true opacities; mask: they draw as solid what is at least 20 %
     opaque; opaque: solid triangles, cut there."""
-    origin: Origin = "keep"
+    origin: option.Origin = "keep"
     resume: bool = False
     """Continue an interrupted run of the same command, from FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
-    json: bool = False
-    """Print the result as JSON."""
+    threads: option.Threads = None
+    json: option.AsJson = False
     force: bool = False
     """Replace an older tileset, and begin again where a partial one is left."""
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from meshsplats.camera import Camera
+from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import File, Output, check_mesh_suffix, check_splat_endings, placed, say_origin
+from meshsplats.cli.common import check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.training import Plan, Trained, TrainingCommand
@@ -84,9 +85,7 @@ class Train(TrainingCommand):
 
     input: tyro.conf.Positional[Path]
     """The folder of the photographs, or its transforms.json."""
-    output: Output
-    """The mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
-    as_splats: File = None
+    as_splats: option.File = None
     """Also write splats to this file, .ply, .spz or .sog, for their viewers: a fifth of the time."""
     target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
     tuning: GrowingOptions = field(default_factory=GrowingOptions)

@@ -14,18 +14,9 @@ import tyro
 
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
-from meshsplats.cli.common import (
-    Count,
-    Number,
-    Origin,
-    Output,
-    draw_preview,
-    optional_color,
-    plural,
-    size_of,
-    written,
-)
+from meshsplats.cli.common import draw_preview, optional_color, plural, size_of, written
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
@@ -120,13 +111,12 @@ class TrainingCommand(Command):
 
     input: tyro.conf.Positional[Path]
     """Input."""
-    output: Output
-    """The mesh."""
-    epochs: Number = None
+    output: option.MeshOutput
+    epochs: option.Number = None
     """Length of the run: passes over all training views."""
-    steps: Count = None
+    steps: option.Count = None
     """Length of the run: number of steps."""
-    minutes: Number = None
+    minutes: option.Number = None
     """Length of the run: time for the whole command."""
     resume: bool = False
     """Continue an interrupted run; with --force also one that has ended, for longer."""
@@ -136,15 +126,12 @@ class TrainingCommand(Command):
     """Steps between two scores on held-out views."""
     preview_every: tyro.conf.Fixed[int] = 500
     """Steps between two previews; after each quarter of a short run. 0: none."""
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
+    threads: option.Threads = None
     device: Annotated[Literal["cpu", "gpu"], tyro.conf.arg(metavar="NAME")] = "cpu"
     """cpu, or gpu: a graphics card (extra gpu)."""
-    origin: Origin = "keep"
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    origin: option.Origin = "keep"
+    json: option.AsJson = False
+    force: option.Force = False
 
     @property
     def inputs(self) -> list[Path]:

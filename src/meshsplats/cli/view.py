@@ -12,20 +12,16 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
-    Count,
-    File,
-    Folder,
-    Missing,
     PartOptions,
     SplatOptions,
-    Text,
     check_data,
     load_scene,
     optional_color,
+    optional_up,
     parse_color,
-    parse_up,
     plural,
     size_of,
 )
@@ -64,36 +60,34 @@ class View(Command):
         None
     )
     """An .html file with everything inside. Default: the browser is opened."""
-    splats: File = None
+    splats: option.File = None
     """Splats to compare a mesh with. Default: the input, where that is splats."""
     without_splats: bool = False
     """Leave the splats out: the page is smaller."""
-    max_triangles: Count = None
+    max_triangles: option.Count = None
     """Splats are merged until their mesh has no more triangles. Default: 4,000,000."""
     whole: bool = False
     """Merge no splats, up to 20,000,000 triangles."""
-    cameras: File = None
+    cameras: option.File = None
     """Viewpoints to choose from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model
     folder that has one. Default: those of the input, if it is a model folder."""
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): viewpoints to choose from."""
-    missing: Missing = "error"
-    up: Text = None
+    missing: option.Missing = "error"
+    up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else of the
     mesh."""
-    background: Text = None
+    background: option.Text = None
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with --data that of the
     model folder or of the photographs."""
-    title: Text = None
+    title: option.Text = None
     """Name of the scene in the page. Default: that of the file."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
     no_open: bool = False
     """Print the address, and open no browser."""
-    json: bool = False
-    """Print the result as JSON."""
-    force: bool = False
-    """Overwrite existing outputs."""
+    json: option.AsJson = False
+    force: option.Force = False
 
     def execute(self) -> None:
         self._check()
@@ -132,8 +126,7 @@ class View(Command):
             )
         if self.background is not None:
             parse_color(self.background)
-        if self.up is not None:
-            parse_up(self.up)
+        optional_up(self.up)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
         scene = self.part.of(load_scene(self.input, self.reading, up=self.up))
@@ -177,7 +170,7 @@ class View(Command):
         beside = cameras_beside(self.input, scene.origin)
         if beside is not None:
             return beside
-        lens = {"width": 800, "height": 800, "up": None if self.up is None else parse_up(self.up)}
+        lens = {"width": 800, "height": 800, "up": optional_up(self.up)}
         return views_of_a_place(scene, FOUND_VIEWS, lens) or []
 
     def _announce(self, shown: Content) -> None:
@@ -212,7 +205,7 @@ class View(Command):
         options = PageOptions(
             title=self.title or ("scene" if name == "-" else Path(name).resolve().stem),
             background=background.color,
-            up=None if self.up is None else parse_up(self.up),
+            up=optional_up(self.up),
             merged_from=shown.merged_from,
         )
         return make_page(

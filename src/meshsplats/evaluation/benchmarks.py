@@ -22,7 +22,7 @@ from meshsplats.evaluation.backgrounds import (
 )
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, evaluate
 from meshsplats.evaluation.strips import markdown_table
-from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.mesh_formats import mesh_suffixes
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -74,7 +74,7 @@ trained with. The 7 scenes of Mip-NeRF 360 are the public ones; the other two ar
 def find_input(folder: Path, scene: str) -> Path | None:
     """Mesh, splats or model folder of ``scene`` in ``folder``: ``scene.npz``, ``scene.ply`` or ``scene/``;
     of several, the first."""
-    for suffix in (".npz", ".glb", ".gltf", *MESH_SUFFIXES, *splat_suffixes()):
+    for suffix in (".npz", ".glb", ".gltf", *mesh_suffixes(), *splat_suffixes()):
         if (folder / (scene + suffix)).is_file():
             return folder / (scene + suffix)
     return folder / scene if (folder / scene).is_dir() else None

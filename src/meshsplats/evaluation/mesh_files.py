@@ -12,6 +12,7 @@ from meshsplats.conversion.normals import shading_normals
 from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.ordering import NODES, drawing_order
@@ -52,14 +53,14 @@ class MeshFileOptions:
         self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
     ) -> AlphaChoice | None:
         """The alpha mode of the .glb among ``paths``, where it is left to the measurement."""
-        measured = self.alpha == "auto" and len(mesh.faces) and any(map(_is_glb, paths))
+        measured = self.alpha == "auto" and len(mesh.faces) and any(takes(path, "alpha") for path in paths)
         return choose_alpha(mesh, cameras) if measured else None
 
     def order(
         self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
     ) -> DrawOrder | None:
         """The order of blending of the .glb among ``paths``, where it is to have one."""
-        if self.alpha != "ordered" or not any(map(_is_glb, paths)):
+        if self.alpha != "ordered" or not any(takes(path, "alpha") for path in paths):
             return None
         return drawing_order(mesh, cameras or None, nodes=self.nodes, quick=self.quick)
 
@@ -77,17 +78,10 @@ class MeshFileOptions:
                 "alpha": self.alpha if self.alpha in GLB_ALPHA else None,  # or cut already
                 "cutoff": self.cutoff if self.alpha == "mask" else None,
             }
+        compression = None if self.compression == "none" else self.compression
+        asked = {"color_type": self.color_type, "compression": compression, "lit": self.lit}
         for path in paths:
-            glb = _is_glb(path)
-            more: dict[str, Any] = {}
-            if glb:
+            more: dict[str, Any] = {name: value for name, value in asked.items() if takes(path, name)}
+            if takes(path, "alpha"):
                 more |= own if choice is None else choice.options
-                more |= {"color_type": self.color_type} if self.color_type != "uint16" else {}
-                more |= {"compression": self.compression} if self.compression != "none" else {}
-            if self.lit and (glb or path.suffix.lower().startswith(".usd")):
-                more["lit"] = True
             save_mesh(mesh, path, **more)
-
-
-def _is_glb(path: Path) -> bool:
-    return path.suffix.lower() == ".glb"

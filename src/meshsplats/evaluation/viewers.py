@@ -16,6 +16,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.errors import DataWarning
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf.writer import Alpha
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering.api import render
 from meshsplats.rendering.layers import affordable, layers
@@ -118,8 +119,8 @@ def alpha_for_viewers(
 ) -> dict[str, Any]:
     """Arguments of ``save_mesh`` for the alpha mode of ``choose_alpha``, where ``path`` is a .glb; none for
     other files and empty meshes."""
-    glb = os.fspath(path).lower().endswith(".glb") and len(mesh.faces)
-    return choose_alpha(mesh, threads=threads).options if glb else {}
+    measured = takes(os.fspath(path), "alpha") and len(mesh.faces)
+    return choose_alpha(mesh, threads=threads).options if measured else {}
 
 
 def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int | None = None) -> AlphaChoice:

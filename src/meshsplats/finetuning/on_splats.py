@@ -38,6 +38,7 @@ from meshsplats.finetuning.plain import with_plain_means
 from meshsplats.finetuning.reports import SCORED_VIEWS, held_out_scores, scored_count
 from meshsplats.finetuning.run import RunOptions, finetune
 from meshsplats.finetuning.setup import Display, Setup
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Device
@@ -117,7 +118,7 @@ def tuned_as_configured(
 
 def check_order_of_file(config: FinetuneConfig, path: Path) -> None:
     """ValueError if the order of triangles of a run is to be in a file, and that of ``path`` has none."""
-    if config.order == "file" and path.suffix.lower() != ".glb":
+    if config.order == "file" and not takes(path, "order"):
         raise ValueError(f"order 'file' is for .glb files, which list triangles in an order, not {path.name}")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,41 +19,19 @@ from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.compressed import Compression
-from meshsplats.formats.gltf.reader import read_gltf
-from meshsplats.formats.gltf.view_colors import Harmonics, stored_bytes
-from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
-from meshsplats.formats.npz import read_npz, write_npz
-from meshsplats.formats.obj.mesh import read_obj, write_obj
-from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_blocks, write_mesh_ply
+from meshsplats.formats.gltf.view_colors import Harmonics
+from meshsplats.formats.gltf.writer import Alpha, ColorType
+from meshsplats.formats.mesh_formats import (
+    FileSize,
+    mesh_format,
+    mesh_format_to_write,
+    mesh_suffixes,
+    written_mesh_suffixes,
+)
+from meshsplats.formats.ply.mesh import write_mesh_blocks
 from meshsplats.formats.sniff import content_of
-from meshsplats.formats.usd.reader import read_usd
-from meshsplats.formats.usd.writer import write_usd
+from meshsplats.formats.splat_formats import listed
 from meshsplats.mesh import SplatMesh, checked_cutoff
-
-_USD = (".usdc", ".usda", ".usd")
-_WRITERS: dict[str, Callable[..., None]] = {
-    ".npz": write_npz,
-    ".ply": write_mesh_ply,
-    ".glb": write_glb,
-    **dict.fromkeys(_USD, write_usd),
-    ".obj": write_obj,
-}
-_GLB = (".glb",)
-BOUND_SUFFIXES = (".npz", ".glb")
-"""Formats that keep the binding of a mesh prior."""
-_UNFILTERED = (*_GLB, *_USD, ".obj")
-"""Formats of programs that render triangles without a low-pass filter."""
-_OPTION_SUFFIXES = {
-    "lit": (*_GLB, *_USD),
-    "color_type": _GLB,
-    "alpha": _GLB,
-    "compression": _GLB,
-    "order": _GLB,
-    "harmonics": _GLB,
-}
-
-MESH_SUFFIXES = tuple(_WRITERS)
-"""Suffixes that ``save_mesh`` knows."""
 
 
 def load_mesh(
@@ -106,20 +84,13 @@ def _mesh_in(content: Content, source: Path, point: np.ndarray | None) -> SplatM
             )
         if source.suffix.lower() != ".npz" and (what := foreign_archive(source, content.archive.names)):
             raise FileFormatError(f"{source}: {what}")
-        return read_npz(source, point)
-    if content.container == "ply":
-        return read_mesh_ply(source, point)
-    if content.container in ("glb", "json"):
-        return read_gltf(source, point)
-    if content.container == "usd":
-        return read_usd(source, point)
-    if content.is_obj:
-        return read_obj(source, point)
+    if (kind := mesh_format(content)) is not None:
+        return kind.codec.read(source, point)
     if what := foreign(source, content.head):
         raise FileFormatError(f"{source}: {what}")
     raise FileFormatError(
         f"{source}: not a mesh file of a known format, it begins with {content.head[:8]!r};"
-        " expected .npz, .ply, .glb, .gltf, .usdc, .usda or .obj"
+        f" expected {listed(mesh_suffixes())}"
     )
 
 
@@ -191,9 +162,9 @@ def save_mesh(
     need_path(path=path)
     target = Path(path)
     suffix = target.suffix.lower()
-    writer = _WRITERS.get(suffix)
-    if writer is None:
-        known = ", ".join(_WRITERS)
+    kind = mesh_format_to_write(target)
+    if kind is None:
+        known = ", ".join(written_mesh_suffixes())
         raise ValueError(f"{target.name!r} does not name a mesh format; choose a name that ends in {known}")
     chosen = {
         "lit": lit,
@@ -209,11 +180,11 @@ def save_mesh(
             raise ValueError("the option cutoff needs alpha='opaque' or alpha='mask'")
         cutoff = checked_cutoff(cutoff)
     for name in options:
-        if suffix not in _OPTION_SUFFIXES[name] and options[name] != "opaque":
-            suffixes = ", ".join(_OPTION_SUFFIXES[name])
+        if name not in kind.takes and options[name] != "opaque":
+            suffixes = ", ".join(written_mesh_suffixes(name))
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
-    unbound = suffix not in BOUND_SUFFIXES or alpha in ("opaque", "hybrid")
-    if mesh.binding is not None and unbound:
+    bound = "binding" in kind.keeps and alpha not in ("opaque", "hybrid")
+    if mesh.binding is not None and not bound:
         warnings.warn(
             f"{target.name}: the binding to a base mesh is left out; later poses need .npz or .glb",
             DataWarning,
@@ -221,19 +192,19 @@ def save_mesh(
         )
     if alpha == "opaque":
         mesh = cut_mesh(mesh, CUTOFF if cutoff is None else cutoff)
-        if suffix not in _GLB:
+        if "alpha" not in kind.takes:
             del options["alpha"]
     elif (
         alpha is None
         and order is None
-        and suffix in _GLB
+        and "alpha" in kind.takes
         and len(mesh.colors)
         and (mesh.colors[:, 3] == 1).all()
     ):
         options["alpha"] = "opaque"
     elif cutoff is not None:
         options["cutoff"] = cutoff
-    if mesh.filter_px2 and suffix in _UNFILTERED:
+    if mesh.filter_px2 and not kind.own:
         warnings.warn(
             f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"
             " other programs do not have: from afar it will look thin there. Make it part of the triangles"
@@ -241,16 +212,16 @@ def save_mesh(
             DataWarning,
             stacklevel=2,
         )
-    if mesh.harmonics is not None and suffix == ".obj":
+    if mesh.harmonics is not None and "harmonics" not in kind.keeps:
         warnings.warn(
-            f"{target.name}: harmonics are left out, .obj has no place for them: colours will be the same"
+            f"{target.name}: harmonics are left out, {suffix} has no place for them: colours will be the same"
             " from everywhere. bake --colors (plain_colors_of) makes them the mean of what given views show",
             DataWarning,
             stacklevel=2,
         )
     size = expected_bytes(mesh, suffix, compressed="compression" in options, copies=order is not None)
     with atomic_path(target, needs=size) as temporary:
-        writer(mesh, temporary, **options)
+        kind.codec.write(mesh, temporary, **options)
 
 
 def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -> tuple[int, int, int]:
@@ -284,21 +255,11 @@ def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False, co
     """Estimated size of the file of ``mesh`` with this ``suffix``, with ``copies`` of all triangles: within a
     few kilobytes for `.npz` and `.ply`, within 15 % for `.glb` with colours of 16 bits, rough for the
     others."""
-    v, f = len(mesh.vertices), len(mesh.faces)
-    bound = suffix in BOUND_SUFFIXES
+    kind = mesh_format_to_write(f"mesh{suffix}")
+    if kind is None:
+        raise ValueError(f"no mesh is written as {suffix!r}")
+    bound = "binding" in kind.keeps
     arrays = {n: a for n, a in mesh.arrays().items() if a.ndim and (bound or not n.startswith("binding."))}
-    held = sum(array.nbytes for array in arrays.values()) - 28 * v - 12 * f - 12  # beyond the required arrays
-    if suffix == ".obj":
-        return 75 * v + (26 if mesh.normals is None else 50) * f
-    if suffix == ".usda":
-        return 85 * v + 24 * f + 3 * held
-    if suffix == ".ply":
-        held += 12 * v if mesh.harmonics is not None and mesh.plain_colors is None else 0
-        return (52 if mesh.origin.any() else 28) * v + 13 * f + held
-    if suffix == ".glb":
-        held += stored_bytes(mesh)
-        whole = 20 * v + (1 + copies) * (12 if v > 0xFFFF else 6) * f + held
-        return 3 * whole // 10 if compressed else whole
-    if suffix in _USD:
-        return 28 * v + 6 * f + held
-    return 28 * v + 12 * f + held
+    # Beyond the required ones.
+    held = sum(a.nbytes for a in arrays.values()) - 28 * len(mesh.vertices) - 12 * len(mesh.faces) - 12
+    return kind.codec.expected_bytes(FileSize(mesh, suffix, held, compressed, copies))

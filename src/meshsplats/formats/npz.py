@@ -33,6 +33,7 @@ from meshsplats.formats._validation import (
     straight_colors,
 )
 from meshsplats.formats._zipped import BoundedReader
+from meshsplats.formats.mesh_formats import FileSize, MeshCodec
 from meshsplats.mesh import MAX_COLOR, SplatMesh
 from meshsplats.spherical_harmonics import TERMS
 
@@ -243,3 +244,10 @@ def _load(archive: zipfile.ZipFile, member: _Member, name: str, path: Path) -> n
             view[done : done + len(block)] = block
             done += len(block)
     return array.T if member.fortran else array
+
+
+def _bytes(size: FileSize) -> int:
+    return 28 * len(size.mesh.vertices) + 12 * len(size.mesh.faces) + size.held
+
+
+CODEC = MeshCodec(lambda content: content.container == "zip", read_npz, write_npz, _bytes)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.errors import FileFormatError, OverwritingError
-from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.splat_formats import format_to_write, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
 from meshsplats.gaussians import GaussianCloud
@@ -26,10 +26,17 @@ Scene = TypeVar("Scene", GaussianCloud, SplatMesh, BaseMesh)
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
 
-Ending = Literal[
-    "glb", "npz", "ply", "usdc", "usda", "usd", "obj", "compressed.ply", "splat", "spz", "sog", "usdz"
-]
-"""Of files that are written, meshes and splats, without the first dot."""
+if TYPE_CHECKING:
+    MeshEnding = str
+    Ending = str
+else:
+    # The default of the commands comes first.
+    _MESHES = sorted((s[1:] for s in written_mesh_suffixes()), key=lambda ending: ending != "glb")
+    _SPLATS = [s[1:] for s in written_suffixes() if s not in written_mesh_suffixes()]
+    MeshEnding = Literal[tuple(_MESHES)]
+    """Of meshes that are written, without the dot."""
+    Ending = Literal[tuple(_MESHES + _SPLATS)]
+    """Of files that are written, meshes and splats, without the first dot."""
 
 
 def beside(output: Path, record: str) -> Path:
@@ -40,7 +47,9 @@ def beside(output: Path, record: str) -> Path:
 
 def means_splats(kinds: Sequence[str]) -> bool:
     """Whether files with these endings, without a dot, can only be splats, not meshes."""
-    return bool(kinds) and all(f".{k}" in written_suffixes() and f".{k}" not in MESH_SUFFIXES for k in kinds)
+    return bool(kinds) and all(
+        f".{k}" in written_suffixes() and f".{k}" not in written_mesh_suffixes() for k in kinds
+    )
 
 
 def splat_options(kinds: Sequence[str], **given: Any) -> list[dict[str, Any]]:

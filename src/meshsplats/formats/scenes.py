@@ -107,7 +107,7 @@ def _words(up: np.ndarray) -> str:
 
 def _bytes(parts: SceneParts, suffix: str) -> int:
     """Estimated, for the message about a full disk."""
-    total = 0 if parts.mesh is None else expected_bytes(parts.mesh, suffix)
+    total = 0 if parts.mesh is None else expected_bytes(parts.mesh, ".usdc" if suffix == ".usdz" else suffix)
     if parts.splats is not None:
         total += (48 + 12 * parts.splats.sh.shape[1]) * len(parts.splats)
     return total + sum(28 * len(p.faces) for p in (parts.surface, parts.collider) if p is not None)

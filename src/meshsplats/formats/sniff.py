@@ -9,6 +9,7 @@ from meshsplats._foreign import foreign, foreign_archive
 from meshsplats.errors import FileFormatError
 from meshsplats.formats import splat_formats
 from meshsplats.formats.content import Container, Content
+from meshsplats.formats.mesh_formats import mesh_format
 from meshsplats.formats.splat_formats import SplatFormat, listed, zipped_suffixes
 
 _UNREAD: dict[Container | None, str] = {
@@ -166,7 +167,7 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
             raise
         except FileFormatError:
             return _without_splats(content)
-        if not kind.has_signature and (content.container == "usd" or content.is_obj):
+        if not kind.has_signature and _is_marked_mesh(content):
             return "mesh"
         return "splats" if kind.reader.holds_splats(content) else "mesh"
 
@@ -175,7 +176,7 @@ def _without_splats(content: Content) -> Literal["mesh", "cameras"]:
     """As ``identify``, of a file that is of no splat format."""
     if content.is_archive:
         splat_format(content)  # says what it is
-    if content.container == "usd" or content.is_obj:
+    if _is_marked_mesh(content):
         return "mesh"
     if content.is_text and content.container in ("json", "array"):
         return "cameras"
@@ -186,6 +187,11 @@ def _without_splats(content: Content) -> Literal["mesh", "cameras"]:
         f"{content.path}: neither splats, a mesh nor cameras of a known format; it begins with"
         f" {content.head[:8]!r}"
     )
+
+
+def _is_marked_mesh(content: Content) -> bool:
+    """Whether a mesh format recognises the file as its own. JSON and archives hold other things, too."""
+    return content.container not in ("json", "zip") and mesh_format(content) is not None
 
 
 def _holds_arrays(content: Content) -> bool:

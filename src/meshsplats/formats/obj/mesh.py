@@ -15,6 +15,7 @@ from meshsplats._origin import in_words, zero_origin
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import checked, local_positions, straight_colors
+from meshsplats.formats.mesh_formats import FileSize, MeshCodec
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
@@ -145,3 +146,10 @@ def _corner(word: bytes, count: int) -> int:
     if word[:1] == b"0" or index < 0:
         raise ValueError
     return index
+
+
+def _bytes(size: FileSize) -> int:
+    return 75 * len(size.mesh.vertices) + (26 if size.mesh.normals is None else 50) * len(size.mesh.faces)
+
+
+CODEC = MeshCodec(lambda content: content.is_obj, read_obj, write_obj, _bytes)

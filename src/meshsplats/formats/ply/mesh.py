@@ -32,6 +32,7 @@ from meshsplats.formats._validation import (
     straight_colors,
     warn_of_lost_detail,
 )
+from meshsplats.formats.mesh_formats import FileSize, MeshCodec
 from meshsplats.formats.ply.faces import read_faces
 from meshsplats.formats.ply.header import (
     MAX_PROPERTIES,
@@ -402,3 +403,12 @@ def _notes(
             case _:
                 pass  # the version, or a note of a later version
     return attributes, settings
+
+
+def _bytes(size: FileSize) -> int:
+    mesh, held = size.mesh, size.held
+    held += 12 * len(mesh.vertices) if mesh.harmonics is not None and mesh.plain_colors is None else 0
+    return (52 if mesh.origin.any() else 28) * len(mesh.vertices) + 13 * len(mesh.faces) + held
+
+
+CODEC = MeshCodec(lambda content: content.container == "ply", read_mesh_ply, write_mesh_ply, _bytes)

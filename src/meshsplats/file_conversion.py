@@ -1,0 +1,266 @@
+"""What is made of one input: a mesh, splats, or either in blocks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats._files.atomic import together
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import cameras_beside
+from meshsplats.cameras.framing import unit_up
+from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.conversion.driver import worth_drawing
+from meshsplats.conversion.options import Preset
+from meshsplats.conversion.selection import choose_splats
+from meshsplats.conversion.streaming import convert_blocks
+from meshsplats.errors import FileFormatError
+from meshsplats.evaluation.comparison import fidelity
+from meshsplats.evaluation.mesh_files import MeshFileOptions
+from meshsplats.formats.gaussians import save_gaussian_blocks, save_gaussians
+from meshsplats.formats.meshes import load_mesh, save_mesh_blocks
+from meshsplats.formats.outputs import scaled, splat_options
+from meshsplats.formats.scenes import save_scene
+from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_formats import written_ending
+from meshsplats.formats.streaming import SplatStream
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.jobs import Job
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.looks import Look
+
+
+@dataclass(frozen=True)
+class Product:
+    """What is made of an input."""
+
+    preset: Preset = "default"
+    conversion: ConversionOptions = field(default_factory=ConversionOptions)
+    files: MeshFileOptions = field(default_factory=MeshFileOptions)
+    up: np.ndarray | None = None
+    """(3,) direction that points up; None: that of the cameras or of the input."""
+    scale: float | None = None
+    """Factor for all lengths of the result."""
+    keeps_origin: bool = True
+    """Of what is made in blocks: whether it has the origin of the splats, or none."""
+    as_splats: bool = False
+    """Splats, not a mesh."""
+    in_blocks: bool = False
+    """Made block by block, into a .ply: memory does not grow with the input."""
+    of_splats: Mapping[str, Any] = field(default_factory=dict)
+    """Options of ``save_gaussians``, for those formats that take them."""
+    with_mesh: Path | None = None
+    """A mesh for the file of the splats."""
+    collider: Path | None = None
+    """A mesh that things collide with there."""
+    scored_views: int | None = None
+    """Count of views in which a mesh is compared with its splats; None: it is not."""
+    look: Look = "area"
+    """Of that comparison."""
+
+    @property
+    def merges(self) -> bool:
+        """Whether splats are merged to keep a limit."""
+        limits = (self.conversion.max_splats, self.conversion.max_triangles)
+        return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a program does for the maker of its files."""
+
+    load: Callable[[Path], GaussianCloud]
+    stream: Callable[[Path], SplatStream]
+    """Splats in blocks, relative to the origin that the result shall have."""
+    place: Callable[[Any], Any]
+    """Makes of a scene the one that is written."""
+    record: Callable[[Job], None]
+    """Writes what is noted beside the outputs, with which it appears."""
+    preview: Callable[..., None]
+    """Draws a scene to a file, from a camera or None."""
+    opening: Callable[[GaussianCloud], Camera | None]
+    """The camera of the preview of a place; None: one in front."""
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Makes the outputs of jobs. Cameras that ``made`` gets are in the world; None: those of each input, if
+    it has some."""
+
+    product: Product
+    around: Surroundings
+
+    def made(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
+        """Writes the outputs of ``job``. Returns counts, scores and seconds, for JSON."""
+        kind, product = identify(job.source), self.product
+        if kind == "cameras" or (kind == "mesh" and product.as_splats):
+            raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
+        if product.in_blocks and kind == "mesh":
+            raise FileFormatError(f"{job.source}: a mesh; --stream is for splats")
+        if product.in_blocks:
+            return self._splats_in_blocks(job) if product.as_splats else self._mesh_in_blocks(job, cameras)
+        if product.as_splats:
+            return self._splats(job, cameras)
+        return self._mesh_again(job, cameras) if kind == "mesh" else self._mesh(job, cameras)
+
+    @contextmanager
+    def _recorded(self, job: Job) -> Iterator[None]:
+        """The files that are written within the block appear together with their records: a mesh without one
+        cannot be told from a stranger's. The preview, which takes longer, comes later."""
+        with together():
+            self.around.record(job)
+            yield
+
+    def _mesh(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
+        product, start = self.product, time.perf_counter()
+        cloud = self.around.load(job.source)
+        seen = seen_from(cameras, job.source, cloud.origin)
+        read = time.perf_counter()
+        mesh = convert(cloud, product.conversion, preset=product.preset, cameras=seen, up=product.up)
+        mesh = product.files.prepared(mesh, seen)
+        times = {"read": read - start, "convert": time.perf_counter() - read}
+        opening = self.around.opening(cloud) if job.preview and not seen else None
+        return {
+            "splats": len(cloud),
+            "converted": mesh.splat_count or 0,
+            "merged": product.merges,
+            **self._finish(mesh, job, seen, times, opening),
+            "fidelity": self._fidelity(cloud, mesh, seen),
+        }
+
+    def _mesh_in_blocks(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
+        product, start = self.product, time.perf_counter()
+        source = self.around.stream(job.source)
+        seen = seen_from(cameras, job.source, source.origin)
+        blocks = convert_blocks(
+            source, product.conversion, preset=product.preset, cameras=seen, up=product.up
+        )
+        parts = (part if product.keeps_origin else replace(part, origin=np.zeros(3)) for part in blocks)
+        with self._recorded(job):
+            vertices, triangles, converted = save_mesh_blocks(parts, job.outputs[0])
+        return {
+            "splats": source.count,
+            "converted": converted,
+            "merged": False,
+            "triangles": triangles,
+            "vertices": vertices,
+            "seconds": {"convert": round(time.perf_counter() - start, 4)},
+            "fidelity": None,
+        }
+
+    def _splats_in_blocks(self, job: Job) -> dict[str, Any]:
+        start = time.perf_counter()
+        source = self.around.stream(job.source)
+        options, count, degree, kernels = self.product.conversion, 0, 0, set()
+        for block in source:
+            count += len(worth_drawing(block, options))
+            degree = max(degree, block.sh_degree)
+            kernels.add(block.kernel)
+        if not count:
+            raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
+        kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
+        up = source.up if self.product.up is None else unit_up(self.product.up)
+        origin = source.origin if self.product.keeps_origin else np.zeros(3)
+        kept = (replace(block.take(worth_drawing(block, options)), origin=origin) for block in source)
+        with self._recorded(job):
+            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=up)
+        seconds = round(time.perf_counter() - start, 4)
+        return {"read": source.count, "written": count, "seconds": seconds}
+
+    def _fidelity(
+        self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera]
+    ) -> dict[str, Any] | None:
+        """Scores of the mesh against its splats."""
+        if self.product.scored_views is None:
+            return None
+        if self.product.conversion.crop is not None:
+            cloud = choose_splats(cloud, crop=self.product.conversion.crop)
+        return fidelity(cloud, mesh, cameras, self.product.scored_views, self.product.look)
+
+    def _finish(
+        self,
+        mesh: SplatMesh,
+        job: Job,
+        cameras: Sequence[Camera],
+        times: dict[str, float],
+        opening: Camera | None = None,
+    ) -> dict[str, Any]:
+        """Writes ``mesh``, which is prepared, and its preview. Its part of the result; ``times``: of what was
+        done before, in seconds."""
+        start, files = time.perf_counter(), self.product.files
+        choice = files.choice(mesh, job.outputs, cameras)
+        order = files.order(mesh, job.outputs, cameras)
+        chosen = time.perf_counter()
+        placed = self.around.place(scaled(mesh, self.product.scale))
+        with self._recorded(job):
+            files.save(placed, job.outputs, choice, order)
+        comparing = "choose alpha" if order is None else "solve order"
+        times |= {comparing: chosen - start, "save": time.perf_counter() - chosen}
+        if job.preview:
+            self.around.preview(mesh, job.preview, opening)
+        return {
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "alpha": None if choice is None else asdict(choice),
+            "seconds": {name: round(value, 4) for name, value in times.items()},
+        }
+
+    def _mesh_again(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
+        """A mesh in another format."""
+        start = time.perf_counter()
+        mesh = self.product.files.prepared(self._upright(load_mesh(job.source)))
+        times = {"read": time.perf_counter() - start}
+        seen = [camera.relative_to(mesh.origin) for camera in cameras or ()]
+        return {**self._finish(mesh, job, seen, times), "fidelity": None}
+
+    def _splats(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
+        start, product = time.perf_counter(), self.product
+        cloud = self._upright(self.around.load(job.source))
+        options = product.conversion
+        merging, count = options.budget != "drop", options.max_splats
+        kept = choose_splats(
+            cloud,
+            crop=options.crop,
+            min_opacity=options.min_opacity,
+            max_splats=None if merging else count,
+        )
+        if merging and count is not None:
+            seen = seen_from(cameras, job.source, kept.origin)
+            kept = simplify(kept, count, cameras=seen or None)
+        result = self.around.place(scaled(kept, product.scale))
+        with self._recorded(job):
+            taken = splat_options([written_ending(path.name) for path in job.outputs], **product.of_splats)
+            for path, own in zip(job.outputs, taken, strict=True):
+                if product.with_mesh is None and product.collider is None:
+                    save_gaussians(result, path, **own)
+                else:
+                    mesh, collider = self._part(product.with_mesh), self._part(product.collider)
+                    save_scene(path, splats=result, mesh=mesh, collider=collider)
+        seconds = time.perf_counter() - start
+        if job.preview:
+            self.around.preview(kept, job.preview)
+        return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
+
+    def _part(self, path: Path | None) -> SplatMesh | None:
+        """A mesh to write beside the splats, as they are."""
+        if path is None:
+            return None
+        part: SplatMesh = self.around.place(scaled(self._upright(load_mesh(path)), self.product.scale))
+        return part
+
+    def _upright(self, scene: Any) -> Any:
+        return scene if self.product.up is None else replace(scene, up=unit_up(self.product.up))
+
+
+def seen_from(cameras: Sequence[Camera] | None, source: Path, origin: np.ndarray) -> list[Camera]:
+    """``cameras``, which are in the world, relative to ``origin``; None: those of the model folder
+    ``source``, if it is one."""
+    if cameras is None:
+        return cameras_beside(source, origin) or []
+    return [camera.relative_to(origin) for camera in cameras]
