@@ -59,6 +59,8 @@ FITS = {
     "dataset": {"a data set"},
     "optional dataset": {"a data set", "nothing"},
     "base": {"a base mesh"},
+    "optional base": {"a base mesh", "nothing"},
+    "shown": {"a mesh", "a base mesh"},
     "prior": {"a prior"},
     "path": PATHS,
     "optional path": {*PATHS, "nothing"},
@@ -135,7 +137,13 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
         (
             "make_page",
             {"mesh": MESH},
-            {"mesh": "mesh", "splats": "splats", "cameras": "cameras", "options": "options"},
+            {
+                "mesh": "shown",
+                "splats": "splats",
+                "surface": "optional base",
+                "cameras": "cameras",
+                "options": "options",
+            },
         ),
         ("needed_samples", {"mesh": MESH, "cameras": CAMERAS}, {"mesh": "mesh", "cameras": "cameras"}),
         ("psnr", {"a": IMAGE, "b": IMAGE}, {"a": "array", "b": "array"}),

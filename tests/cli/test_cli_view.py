@@ -13,13 +13,16 @@ import urllib.request
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from meshsplats import _toml as toml
+from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
+from meshsplats.formats.base_meshes import save_base
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.viewer import content
@@ -270,3 +273,83 @@ def test_a_machine_without_a_window_gets_the_address(folder, monkeypatch, capsys
     assert main(["view", str(folder / "mesh.npz"), "--no-open"]) == 0
     assert len(asked) == 1
     assert np.isfinite(json.loads(printed.out)["image_error_levels"])
+
+
+@pytest.fixture(scope="module")
+def surface(folder):
+    """surface.glb: a textured triangle."""
+    pixels = np.full((64, 64, 4), 255, np.uint8)
+    corners = np.eye(3, dtype=np.float32)
+    base = BaseMesh(
+        corners,
+        np.array([[0, 1, 2]]),
+        uv=np.array([[[0, 0], [1, 0], [0, 1]]]),
+        face_texture=np.zeros(1, np.int32),
+        textures=(Texture(pixels, ("clamp", "clamp")),),
+    )
+    for name in ("surface.glb", "surface.obj"):
+        save_base(base, folder / name)
+    return folder / "surface.glb"
+
+
+def blocks(path) -> set[str]:
+    found = re.findall(r'<script type="[\w/]+" id="(\w+)">', path.read_text("utf-8"))
+    return set(found) - {"settings", "kernels"}
+
+
+def test_a_textured_surface_alone_or_beside(folder, surface, tmp_path, capsys):
+    page, scene = tmp_path / "page.html", str(folder / "scene.ply")
+    textured = {"surface", "coordinates", "picture"}
+    cases = {
+        "a surface of 1 triangle": ([str(surface)], textured),
+        "a surface of 1 triangle, 200 splats": ([str(surface), "--splats", scene], {*textured, "splats"}),
+        "1,600 triangles, a surface of 1 triangle, 200 splats": (
+            [scene, "--surface", str(surface)],
+            {*textured, "mesh", "splats"},
+        ),
+        "1,600 triangles, a surface of 1 triangle": (
+            [str(folder / "mesh.npz"), "--surface", str(folder / "surface.obj")],
+            {*textured, "mesh"},
+        ),
+    }
+    for printed, (words, there) in cases.items():
+        assert main(["view", *words, "-o", str(page), "--force"]) == 0
+        said = capsys.readouterr()
+        assert f"): {printed}\n" in said.out
+        assert "left out" not in said.err
+        assert blocks(page) == there
+    assert main(["view", str(surface), "-o", str(page), "--force", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["triangles"], result["surface_triangles"]) == (0, 1)
+    assert 0 < result["texture_bytes"] < result["bytes"]
+
+
+def test_options_that_a_surface_has_not(folder, surface, tmp_path, capsys):
+    page = ["-o", str(tmp_path / "page.html")]
+    for words, message in (
+        (["--surface", str(surface)], "is a textured surface: --surface has no effect"),
+        (["--crop", *"012345"], "is a textured surface: --crop has no effect"),
+        (["--whole"], "is a mesh: --whole is for splats"),
+    ):
+        assert main(["view", str(surface), *page, *words]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_mesh_with_several_textures_is_shown_in_its_colours(tmp_path, surface):
+    import trimesh
+
+    visuals = [
+        trimesh.visual.TextureVisuals(
+            uv=np.eye(3)[:, :2],
+            material=trimesh.visual.material.PBRMaterial(
+                baseColorTexture=Image.fromarray(np.full((8, 8, 3), tone, np.uint8))
+            ),
+        )
+        for tone in (10, 200)
+    ]
+    parts = [trimesh.Trimesh(np.eye(3) + k, [[0, 1, 2]], visual=v) for k, v in enumerate(visuals)]
+    trimesh.Scene(parts).export(tmp_path / "two.glb")
+    page = tmp_path / "page.html"
+    assert main(["view", str(tmp_path / "two.glb"), "-o", str(page)]) == 0
+    assert blocks(page) == {"mesh"}

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
+from meshsplats._files.atomic import in_words
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli import option
@@ -22,7 +24,6 @@ from meshsplats.cli.common import (
     optional_color,
     optional_up,
     parse_color,
-    plural,
     size_of,
 )
 from meshsplats.cli.images import views_of_a_place
@@ -30,6 +31,7 @@ from meshsplats.cli.messages import UsageError, say, shown_path
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import choose_background
+from meshsplats.formats.base_meshes import load_base
 from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -44,8 +46,8 @@ FOUND_VIEWS = 12
 
 @dataclass(frozen=True)
 class View(Command):
-    """Shows splats or a mesh in the browser, exactly, the splats beside it for comparison; or writes a page
-    that anyone can open with a double click (-o scene.html).
+    """Shows splats or a mesh in the browser, exactly, the splats beside it for comparison; or a textured
+    surface; or writes a page that anyone can open with a double click (-o scene.html).
 
     Splats are converted to a mesh first, with default settings; very many are merged before. Nothing leaves
     this machine: the browser gets the scene from 127.0.0.1 until Ctrl-C.
@@ -55,13 +57,15 @@ class View(Command):
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
-    """Splats, a model folder, or a mesh."""
+    """Splats, a model folder, a mesh, or a surface with a texture (.glb, .obj)."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = (
         None
     )
     """An .html file with everything inside. Default: the browser is opened."""
     splats: option.File = None
     """Splats to compare a mesh with. Default: the input, where that is splats."""
+    surface: option.File = None
+    """A surface to compare the input with (.glb or .obj with its texture, or any mesh)."""
     without_splats: bool = False
     """Leave the splats out: the page is smaller."""
     max_triangles: option.Count = None
@@ -92,7 +96,7 @@ class View(Command):
     def execute(self) -> None:
         self._check()
         if self.output is not None:
-            inputs = [path for path in (self.input, self.splats, self.cameras) if path is not None]
+            inputs = [p for p in (self.input, self.splats, self.surface, self.cameras) if p is not None]
             outputs = [self.output, beside(self.output, CONFIGURATION)]
             check_outputs(outputs, self.force, inputs=inputs)
         scene = self._scene()
@@ -128,9 +132,15 @@ class View(Command):
             parse_color(self.background)
         optional_up(self.up)
 
-    def _scene(self) -> GaussianCloud | SplatMesh:
-        scene = self.part.of(load_scene(self.input, self.reading, up=self.up))
-        if isinstance(scene, SplatMesh):
+    def _scene(self) -> GaussianCloud | SplatMesh | BaseMesh:
+        scene = content.surface_or(lambda path: load_scene(path, self.reading, up=self.up), self.input)
+        if isinstance(scene, BaseMesh):
+            if self.surface is not None or self.part.crop is not None:
+                given = "--crop" if self.surface is None else "--surface"
+                raise UsageError(f"{shown_path(self.input)} is a textured surface: {given} has no effect")
+        else:
+            scene = self.part.of(scene)
+        if not isinstance(scene, GaussianCloud):
             if self.max_triangles is not None or self.whole:
                 given = "--whole" if self.whole else "--max-triangles"
                 raise UsageError(f"{shown_path(self.input)} is a mesh: {given} is for splats")
@@ -139,19 +149,23 @@ class View(Command):
             raise UsageError(f"{shown_path(self.input)} is splats: --splats is for a mesh")
         return scene
 
-    def _content(self, scene: GaussianCloud | SplatMesh, cameras: list[Camera]) -> Content:
+    def _content(self, scene: GaussianCloud | SplatMesh | BaseMesh, cameras: list[Camera]) -> Content:
         """What the page will show."""
+        beside = None if self.surface is None else load_base(self.surface, origin=scene.origin)
         try:
             if isinstance(scene, GaussianCloud):
                 advice = "leave --whole out, or make 'meshsplats tiles'"
                 most = None if self.whole else self.max_triangles or content.TRIANGLES
                 shown = not self.without_splats
-                return content.content_of_splats(scene, cameras, max_triangles=most, shown=shown)
+                made = content.content_of_splats(scene, cameras, max_triangles=most, shown=shown)
+                return replace(made, surface=beside)
             advice = "fine-tune it with --max-triangles, or make 'meshsplats tiles'"
             splats = None
             if self.splats is not None:
                 splats = self.part.of(self.reading.load(self.splats, scene.origin))
-            return content.content_of_mesh(scene, splats)
+            if isinstance(scene, BaseMesh):
+                return Content(None, splats, surface=scene)
+            return replace(content.content_of_mesh(scene, splats), surface=beside)
         except content.TooManyTrianglesError as error:
             raise UsageError(f"{error}: {advice}") from None
 
@@ -162,22 +176,21 @@ class View(Command):
 
         return load_dataset(self.data, missing=self.missing, origin=origin)
 
-    def _cameras(self, photographs: Dataset | None, scene: GaussianCloud | SplatMesh) -> list[Camera]:
+    def _cameras(
+        self, photographs: Dataset | None, scene: GaussianCloud | SplatMesh | BaseMesh
+    ) -> list[Camera]:
         if photographs is not None:
             return [view.camera for view in photographs.views]
         if self.cameras is not None:
             return load_cameras(self.cameras, origin=scene.origin)
         beside = cameras_beside(self.input, scene.origin)
-        if beside is not None:
-            return beside
+        if beside is not None or isinstance(scene, BaseMesh):
+            return beside or []
         lens = {"width": 800, "height": 800, "up": optional_up(self.up)}
         return views_of_a_place(scene, FOUND_VIEWS, lens) or []
 
     def _announce(self, shown: Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""
-        from meshsplats._files.atomic import in_words
-        from meshsplats.viewer.page import estimated_size
-
         if self.json:
             return  # the result has the same numbers
         if shown.merged_from is not None:
@@ -187,16 +200,16 @@ class View(Command):
                 " --max-triangles N or --whole keeps more"
             )
         if self.output is not None:
-            size = in_words(estimated_size(shown.mesh, shown.splats, shown.coarse))
-            say(f"{self.output} will have about {size}: {_sizes(shown)}")
+            size = in_words(shown.estimated_size())
+            say(f"{self.output} will have about {size}: {content.in_words(shown.counts())}")
 
     def _page(self, shown: Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
-        from meshsplats.viewer.page import PageOptions, make_page
+        from meshsplats.viewer.page import PageOptions
 
         background = choose_background(
             optional_color(self.background),
-            photographs,
-            {"mesh": shown.mesh},
+            None if shown.mesh is None else photographs,
+            {} if shown.mesh is None else {"mesh": shown.mesh},
             self.input,
             None,
             whole=self.part.crop is None,
@@ -208,9 +221,7 @@ class View(Command):
             up=optional_up(self.up),
             merged_from=shown.merged_from,
         )
-        return make_page(
-            shown.mesh, splats=shown.splats, coarse=shown.coarse, cameras=cameras, options=options
-        )
+        return shown.page(cameras, options)
 
     def _write(self, page: Page, result: dict[str, Any]) -> None:
         from meshsplats._files.atomic import write_text
@@ -221,8 +232,8 @@ class View(Command):
         if self.json:
             print(json.dumps({"page": str(self.output), **result}, indent=1, allow_nan=False))
             return
-        print(f"{self.output} ({size_of(self.output)}): {_contents(result)}")
-        print(_errors(result))
+        print(f"{self.output} ({size_of(self.output)}): {content.in_words(result)}")
+        print(content.errors_in_words(result))
         print("next: open it with a double click, or send it to someone; it needs no network")
 
     def _serve(self, page: Page, result: dict[str, Any]) -> None:
@@ -232,8 +243,8 @@ class View(Command):
             if self.json:
                 print(json.dumps({"url": server.url, **result}, allow_nan=False), flush=True)
             else:
-                print(_contents(result))
-                print(_errors(result))
+                print(content.in_words(result))
+                print(content.errors_in_words(result))
                 print(f"{server.url}\nCtrl-C ends", flush=True)
             if not self.no_open and not open_page(server.url):
                 say("no browser was found: open the address above in one, on this machine")
@@ -241,26 +252,3 @@ class View(Command):
                 server.serve_forever()
             except KeyboardInterrupt:
                 say("ended")
-
-
-def _sizes(shown: Content) -> str:
-    parts = [plural(len(shown.mesh.faces), "triangle")]
-    parts += [] if shown.coarse is None else [f"a coarse level of {len(shown.coarse.faces):,}"]
-    return ", ".join(parts if shown.splats is None else [*parts, plural(len(shown.splats), "splat")])
-
-
-def _contents(result: dict[str, Any]) -> str:
-    parts = [plural(result["triangles"], "triangle")]
-    parts += [f"a coarse level of {result['coarse_triangles']:,}"] if result["coarse_triangles"] else []
-    parts += [plural(result["splats"], "splat")] if result["splats"] else []
-    parts += [plural(result["viewpoints"], "viewpoint")] if result["viewpoints"] else []
-    return ", ".join(parts)
-
-
-def _errors(result: dict[str, Any]) -> str:
-    return (
-        f"{result['bytes_a_triangle']:.1f} bytes a triangle; quantisation moves vertices by at most"
-        f" {result['position_error_radii']:.1g} of the scene's radius,\ncolours by"
-        f" {result['color_error_levels']:.2g}, opacities by {result['alpha_error_levels']:.2g} and pixels of"
-        f" one view by {result['image_error_levels']:.2g} of 255 levels"
-    )

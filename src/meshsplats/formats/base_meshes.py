@@ -20,7 +20,7 @@ from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.npz import write_npz
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
-from meshsplats.formats.surfaces.corners import plain_mesh
+from meshsplats.formats.surfaces.corners import check_texture, plain_mesh
 from meshsplats.formats.surfaces.glb import write_surface_glb
 from meshsplats.formats.surfaces.solids import write_3mf, write_stl
 from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_ply
@@ -144,8 +144,7 @@ def save_base(
         raise ValueError(f"image is for surfaces with a texture, and formats that keep it, not for {suffix}")
     if not len(base.faces):
         raise ValueError("the surface has no faces")
-    if base.textured and not (len(base.textures) == 1 and base.textured_faces().all()):
-        raise ValueError(f"a surface has one texture on all faces, this mesh has {len(base.textures)}")
+    check_texture(base)
     own = None if image is None else f".{image}"
     writers: dict[str, Callable[[Path], None]] = {
         ".glb": lambda to: write_surface_glb(base, to, unlit=unlit, image=own, collision=collision),

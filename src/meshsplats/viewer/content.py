@@ -1,24 +1,32 @@
-"""What a page shows: splats that are merged if they are many, their mesh, a coarse level for weak devices."""
+"""What a page shows: splats that are merged if they are many, their mesh, a coarse level for weak devices; a
+surface beside them or alone."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
+from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.formats.base_meshes import load_base
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.layers import SMALLEST, affordable
-from meshsplats.viewer.page import Page
+from meshsplats.viewer.page import Page, PageOptions, estimated_size, make_page
+
+Scene = TypeVar("Scene")
 
 SIDE = 400
 """Largest side of the image by which the errors of merging and quantisation are measured."""
@@ -40,16 +48,51 @@ class TooManyTrianglesError(ValueError):
 class Content:
     """What a page shows."""
 
-    mesh: SplatMesh
+    mesh: SplatMesh | None
+    """None: the surface alone, or with splats."""
     splats: GaussianCloud | None
     """Shown beside it."""
     coarse: SplatMesh | None = None
+    surface: BaseMesh | None = None
     kept: int = 0
     """Splats of the mesh, where it was made of splats."""
     merged_from: int | None = None
     """How many there were, if they were merged."""
     merging_psnr: float = 0.0
     """dB between images of all splats and of those that are left, in one view."""
+
+    @property
+    def main(self) -> SplatMesh | BaseMesh:
+        """The mesh, else the surface."""
+        main = self.surface if self.mesh is None else self.mesh
+        assert main is not None
+        return main
+
+    def page(self, cameras: Sequence[Camera], options: PageOptions) -> Page:
+        """The page of it, as by ``make_page``."""
+        surface = None if self.mesh is None else self.surface
+        return make_page(
+            self.main,
+            splats=self.splats,
+            coarse=self.coarse,
+            surface=surface,
+            cameras=cameras,
+            options=options,
+        )
+
+    def estimated_size(self) -> int:
+        """About how many bytes its page will have."""
+        return estimated_size(self.mesh, self.splats, self.coarse, self.surface)
+
+    def counts(self) -> dict[str, int]:
+        """How many triangles and splats there are."""
+        surface = {} if self.surface is None else {"surface_triangles": len(self.surface.faces)}
+        return {
+            "triangles": 0 if self.mesh is None else len(self.mesh.faces),
+            "coarse_triangles": 0 if self.coarse is None else len(self.coarse.faces),
+            **surface,
+            "splats": 0 if self.splats is None else len(self.splats),
+        }
 
 
 def content_of_splats(
@@ -70,7 +113,7 @@ def content_of_splats(
     _check_size(each * min(count, len(cloud)))
     kept = simplify_in_blocks(cloud, count)
     mesh = convert(kept)
-    content = Content(mesh, kept.of_degree(0) if shown else None, _coarse(mesh, kept), len(kept))
+    content = Content(mesh, kept.of_degree(0) if shown else None, _coarse(mesh, kept), kept=len(kept))
     if kept is cloud:
         return content
     images = (render_splats(each, _camera(cloud, cameras)).color for each in (kept, cloud))
@@ -86,19 +129,36 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     return Content(mesh, splats.of_degree(0), _coarse(mesh, splats))
 
 
+def surface_or(load: Callable[[Any], Scene], path: str | os.PathLike[str]) -> Scene | BaseMesh:
+    """What ``load`` reads from ``path``, or the surface there: a mesh with one texture on all faces."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load(path)
+        # They are of meshes that may have a texture, which is read by load_base alone.
+        hints = (NoTextureWarning, NoColorsWarning)
+        base = load_base(path) if any(issubclass(each.category, hints) for each in caught) else None
+    if base is not None and len(base.textures) == 1 and base.textured_faces().all():
+        return base
+    for each in caught:
+        warnings.warn(each.message, stacklevel=2)
+    return scene
+
+
 def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[str, Any]:
     """Sizes of ``page``, and the errors that merging and quantisation make."""
     mesh, packed = content.mesh, page.mesh
-    camera = _camera(mesh, cameras)
-    camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
-    images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
+    image = {}
+    if mesh is not None:
+        camera = _camera(mesh, cameras)
+        camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
+        images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
+        image = {"image_error_levels": 255 * float(np.abs(images[0] - images[1]).max())}
     merged: dict[str, Any] = {}
     if content.merged_from is not None:
         merged = {"merged_from": content.merged_from, "merging_psnr": round(content.merging_psnr, 2)}
     return {
-        "triangles": len(mesh.faces),
-        "coarse_triangles": 0 if content.coarse is None else len(content.coarse.faces),
-        "splats": 0 if content.splats is None else len(content.splats),
+        **content.counts(),
+        **({"texture_bytes": page.texture} if page.texture else {}),
         **merged,
         "viewpoints": len(cameras),
         "bytes": len(page.html.encode("utf-8")),
@@ -107,8 +167,36 @@ def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[st
         "position_error_radii": packed.relative_error,
         "color_error_levels": packed.color_error,
         "alpha_error_levels": packed.alpha_error,
-        "image_error_levels": 255 * float(np.abs(images[0] - images[1]).max()),
+        **image,
     }
+
+
+def in_words(counts: dict[str, Any]) -> str:
+    """Of ``Content.counts`` or ``measured``: what there is."""
+    kinds = {
+        "triangles": "{:,} triangle{}",
+        "coarse_triangles": "a coarse level of {:,}",
+        "surface_triangles": "a surface of {:,} triangle{}",
+        "splats": "{:,} splat{}",
+        "viewpoints": "{:,} viewpoint{}",
+    }
+    there = [(text, counts.get(name, 0)) for name, text in kinds.items()]
+    return ", ".join(text.format(count, "" if count == 1 else "s") for text, count in there if count)
+
+
+def errors_in_words(result: dict[str, Any]) -> str:
+    """Of ``measured``: bytes, and what quantisation changes."""
+    moved = (
+        f"{result['bytes_a_triangle']:.1f} bytes a triangle; quantisation moves vertices by at most"
+        f" {result['position_error_radii']:.1g} of the scene's radius"
+    )
+    if "image_error_levels" not in result:
+        return moved
+    return (
+        f"{moved},\ncolours by {result['color_error_levels']:.2g}, opacities by"
+        f" {result['alpha_error_levels']:.2g} and pixels of one view by"
+        f" {result['image_error_levels']:.2g} of 255 levels"
+    )
 
 
 def _coarse(mesh: SplatMesh, splats: GaussianCloud) -> SplatMesh | None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._kinds import need, need_all
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
@@ -28,11 +29,12 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.order import Order, checked_order
 from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_mesh
+from meshsplats.viewer.surface import PackedSurface, pack_surface
 from meshsplats.webgpu import device, frames, kernels
 
 MODULES = (
     *("scene.js", "camera.js", "controls.js", "crop.js", "order.js", "shaders.js", "sorted.js"),
-    *("arrays.js", "exact.js", "status.js", "app.js"),
+    *("arrays.js", "exact.js", "status.js", "contents.js", "app.js"),
 )
 """The scripts of the page, in the order in which they are joined."""
 
@@ -66,35 +68,59 @@ class Page:
 
     html: str
     mesh: QuantisedMesh
+    """Of a surface alone: its triangles."""
+    texture: int = 0
+    """Bytes of the texture of a surface in the page."""
 
 
 def make_page(
-    mesh: SplatMesh,
+    mesh: SplatMesh | BaseMesh,
     *,
     splats: GaussianCloud | None = None,
     coarse: SplatMesh | None = None,
+    surface: BaseMesh | None = None,
     cameras: Sequence[Camera] = (),
     options: PageOptions | None = None,
 ) -> Page:
     """A page that shows ``mesh`` in any current browser, from a server or a disk, without a network.
 
     Args:
-        mesh: the triangles. Normals, attributes and bindings are left out.
+        mesh: the triangles. Normals, attributes and bindings are left out. Or a surface alone, which is drawn
+            as a depth buffer does, by WebGL.
         splats: shown beside the mesh or in its place, with colours of degree 0.
         coarse: the same scene with few triangles: drawn first, while the view moves, and on phones. In the
             order of ``mesh``.
+        surface: shown beside the mesh or in its place, with its texture as it is, without lights.
         cameras: viewpoints to choose from. The first is where the page begins; without any, it begins before
             the subject.
         options: title, background, up.
 
-    Raises ValueError for a mesh without triangles.
+    Raises ValueError for a mesh without triangles, a surface with several textures, and for a surface alone
+    with another or a coarse level.
     """
-    need(SplatMesh, mesh=mesh)
+    if not isinstance(mesh, BaseMesh):
+        need(SplatMesh, mesh=mesh)
+    need(BaseMesh, surface=surface, optional=True)
     need(GaussianCloud, splats=splats, optional=True)
     need_all(Camera, cameras=cameras)
     need(PageOptions, options=options, optional=True)
     options = options or PageOptions()
-    packed = quantise_mesh(mesh)
+    blocks: dict[str, tuple[str, str]] = {}
+    textured = None
+    if isinstance(mesh, BaseMesh):
+        if surface is not None or coarse is not None:
+            raise ValueError("a page of a surface alone has no other surface and no coarse level")
+        textured = pack_surface(mesh)
+        mesh, packed = textured.shape, textured.mesh
+    else:
+        packed = quantise_mesh(mesh)
+        blocks |= _mesh_blocks(mesh, packed, coarse)
+        if surface is not None:
+            textured = pack_surface(surface.relative_to(mesh.origin))
+    if textured is not None:
+        blocks |= _surface_blocks(textured)
+    if splats is not None:
+        blocks["splats"] = ("text/plain", _base64(pack_splats(splats)))
     views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
     if not views:
@@ -116,29 +142,55 @@ def make_page(
             "colour error": f"{packed.color_error:.2g} of 255",
         },
     }
+    blocks = {"settings": ("application/json", _json(settings)), **blocks}
+    return Page(
+        _assembled(settings["title"], blocks), packed, 0 if textured is None else len(textured.picture)
+    )
+
+
+def _mesh_blocks(
+    mesh: SplatMesh, packed: QuantisedMesh, coarse: SplatMesh | None
+) -> dict[str, tuple[str, str]]:
+    """What the page has of a mesh, for both renderers."""
     grouped = mesh.depth_group is not None and bool((mesh.depth_group >= 0).any())
     groups = grouped and mesh.order == "fragment"
-    if coarse is not None and coarse.order != mesh.order:
-        coarse = replace(coarse, order=checked_order(mesh.order, coarse.face_splat))
     blocks = {
-        "settings": ("application/json", _json(settings)),
         "kernels": ("application/json", _json(_kernels(groups, mesh.order))),
         "mesh": ("text/plain", _base64(packed.data)),
     }
     if coarse is not None:
+        if coarse.order != mesh.order:
+            coarse = replace(coarse, order=checked_order(mesh.order, coarse.face_splat))
         blocks["coarse"] = ("text/plain", _base64(quantise_mesh(coarse).data))
-    if splats is not None:
-        blocks["splats"] = ("text/plain", _base64(pack_splats(splats)))
-    return Page(_assembled(settings["title"], blocks), packed)
+    return blocks
+
+
+def _surface_blocks(surface: PackedSurface) -> dict[str, tuple[str, str]]:
+    """What the page has of a surface."""
+    blocks = {"surface": ("text/plain", _base64(surface.mesh.data))}
+    if surface.coordinates is not None:
+        blocks["coordinates"] = ("text/plain", _base64(surface.coordinates))
+        blocks["picture"] = ("text/plain", _base64(surface.picture))
+    return blocks
 
 
 def estimated_size(
-    mesh: SplatMesh, splats: GaussianCloud | None = None, coarse: SplatMesh | None = None
+    mesh: SplatMesh | None,
+    splats: GaussianCloud | None = None,
+    coarse: SplatMesh | None = None,
+    surface: BaseMesh | None = None,
 ) -> int:
-    """About how many bytes the page of these will have; known in a fraction of a second."""
-    data = estimated_bytes(mesh, splats) + (0 if coarse is None else estimated_bytes(coarse))
-    texts = [_read(name) for name in (*MODULES, "style.css", "index.html")]
-    return len(_json(_kernels(False, mesh.order))) + sum(map(len, texts)) + 4 * data // 3
+    """About how many bytes the page of these will have; known in a fraction of a second, that of a surface in
+    a few."""
+    data = 0 if surface is None else pack_surface(surface).size
+    if mesh is not None:
+        data += estimated_bytes(mesh, splats)
+    elif splats is not None:
+        data += len(pack_splats(splats))
+    data += 0 if coarse is None else estimated_bytes(coarse)
+    texts = sum(len(_read(name)) for name in (*MODULES, "style.css", "index.html"))
+    code = 0 if mesh is None else len(_json(_kernels(False, mesh.order)))
+    return code + texts + 4 * data // 3
 
 
 def _kernels(groups: bool, order: Order) -> dict[str, object]:

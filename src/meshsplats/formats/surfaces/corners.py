@@ -88,6 +88,12 @@ def normal_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]:
     return suffix, encode_image(f"a{suffix}", base.normal_map.astype(np.float32) / 255)
 
 
+def check_texture(base: BaseMesh) -> None:
+    """ValueError for a mesh that is not textured as a surface is: with one texture on all faces, or none."""
+    if base.textured and not (len(base.textures) == 1 and base.textured_faces().all()):
+        raise ValueError(f"a surface has one texture on all faces, this mesh has {len(base.textures)}")
+
+
 def plain_mesh(base: BaseMesh) -> SplatMesh:
     """``base`` as a mesh without texture: with its vertex colours, else grey."""
     colors = base.colors

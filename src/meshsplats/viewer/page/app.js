@@ -1,10 +1,11 @@
 // The page: settings, the loop that draws while something moves and refines the image when it is still.
 
-import { View, add, dot } from "./camera.js";
-import { connect, connectDivider, connectPanel, fillCameras } from "./controls.js";
+import { View, add, dot, nearestVertex } from "./camera.js";
+import { Contents } from "./contents.js";
+import { connect, connectPanel, fillCameras } from "./controls.js";
 import { CropBox } from "./crop.js";
 import { ExactRenderer } from "./exact.js";
-import { decodeMesh, decodeSplats, unpack } from "./scene.js";
+import { decodeMesh, decodeSplats, decodeSurface, unpack } from "./scene.js";
 import { SortedRenderer } from "./sorted.js";
 import { element, number, report } from "./status.js";
 
@@ -20,13 +21,16 @@ const calm = matchMedia("(prefers-reduced-motion: reduce)");
 const PHONE = 600; // CSS pixels of the shorter side of a screen, below which a device with touch is a phone
 
 class App {
-  // levels: the meshes that are unpacked, "coarse" and "fine"; unpackFine() gives the fine one, once, where
-  // it is not.
+  // levels: the meshes that are unpacked, "coarse" and "fine", and the "surface"; unpackFine() gives the
+  // fine one, once, where it is not.
   constructor(settings, levels, splats, unpackFine) {
     Object.assign(this, { settings, levels, splats, unpackFine });
     this.stage = element("stage");
     this.canvases = { exact: element("exact"), sorted: element("sorted") };
-    this.options = { content: "mesh", style: "blended", renderer: "exact", samples: 2, split: 0.5, gain: 1 };
+    this.meshes = ["coarse", "fine"].filter(level => levels[level]);
+    const there = { mesh: this.meshes.length, splats, surface: levels.surface };
+    this.contents = new Contents(Object.keys(there).filter(kind => there[kind]));
+    this.options = { style: "blended", renderer: "exact", samples: 2, gain: 1 };
     const phone = matchMedia("(pointer: coarse)").matches && Math.min(screen.width, screen.height) < PHONE;
     this.options.detail = phone && levels.coarse ? "coarse" : "fine";
     this.view = this.#viewOf(0);
@@ -42,6 +46,8 @@ class App {
 
   // The level of the image at rest, and its mesh.
   get resting() {
+    const { kinds, chosen } = this.contents;
+    if (chosen === "surface" || !kinds.includes("mesh")) return "surface";
     if (this.options.detail === "fine" && this.levels.fine) return "fine";
     return this.levels.coarse ? "coarse" : "fine";
   }
@@ -58,24 +64,16 @@ class App {
       problems.push(error.message);
     }
     this.#connect();
-    this.preparing = true;
+    this.preparing = Boolean(kernels);
     if (this.sorted) this.#begin();
     await this.#refine();
-    this.preparing = true;
-    try {
-      const lost = reason =>
-        this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
-      const exact = await ExactRenderer.create(this.canvases.exact, kernels, lost);
-      for (const level of Object.keys(this.levels)) this.#give(exact, level);
-      this.exact = exact;
-    } catch (error) {
-      problems.push(error.message);
-    }
-    this.preparing = false;
+    if (kernels) await this.#prepareExact(kernels, problems);
     if (!this.exact && !this.sorted)
       throw new Error(`This browser cannot draw the scene: ${problems.join("; ")}.`);
     if (this.exact) {
       this.changed();
+    } else if (!kernels) {
+      this.#fall(); // a surface alone, which is drawn by WebGL anywhere
     } else {
       this.#fall(`The image is not exact here: ${problems.join("; ")}.` +
         ` WebGL draws ${this.mesh.order === "splat" ? "whole splats" : "triangles"} sorted by` +
@@ -85,6 +83,20 @@ class App {
       for (const input of document.querySelectorAll("[name=content], [name=style]")) input.disabled = true;
       this.#begin();
     }
+  }
+
+  async #prepareExact(kernels, problems) {
+    this.preparing = true;
+    try {
+      const lost = reason =>
+        this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
+      const exact = await ExactRenderer.create(this.canvases.exact, kernels, lost);
+      for (const level of this.meshes) this.#give(exact, level);
+      this.exact = exact;
+    } catch (error) {
+      problems.push(error.message);
+    }
+    this.preparing = false;
   }
 
   #begin() {
@@ -102,6 +114,7 @@ class App {
     if (this.sorted) await new Promise(resolve => { this.shown = resolve; });
     try {
       this.levels.fine = await unpackFine();
+      this.meshes.push("fine");
       this.crop.again();
       if (this.exact) this.#give(this.exact, "fine");
     } catch (error) {
@@ -128,7 +141,7 @@ class App {
     this.options.renderer = "sorted";
     element("renderer").value = "sorted";
     element("renderer").options[0].disabled = true;
-    this.say(message);
+    if (message) this.say(message);
     this.changed();
   }
 
@@ -185,19 +198,11 @@ class App {
   // Centres the nearest visible vertex at a point of the stage, in CSS pixels.
   pick(x, y) {
     const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight), { mesh } = this;
-    const { rows: [a, b, c], fx, fy, cx, cy } = pinhole, points = mesh.vertices;
-    let nearest = Infinity, found = -1;
-    for (let v = 0, i = 0; v < points.length / 3; v++, i += 3) {
-      const z = c[0] * points[i] + c[1] * points[i + 1] + c[2] * points[i + 2] + c[3];
-      if (!(z > pinhole.near) || z >= nearest || mesh.colors[4 * v + 3] < 0.2) continue;
-      const dx = fx * (a[0] * points[i] + a[1] * points[i + 1] + a[2] * points[i + 2] + a[3]) / z + cx - x;
-      const dy = fy * (b[0] * points[i] + b[1] * points[i + 1] + b[2] * points[i + 2] + b[3]) / z + cy - y;
-      if (dx * dx + dy * dy < PICK * PICK) [nearest, found] = [z, i];
-    }
-    if (found < 0) return;
-    const point = [...points.subarray(found, found + 3)], target = this.view.copy();
-    target.distance = nearest;
-    target.position = add(point, target.forward, -nearest);
+    const found = nearestVertex(mesh, pinhole, x, y, PICK);
+    if (!found) return;
+    const target = this.view.copy();
+    target.distance = found.depth;
+    target.position = add(found.point, target.forward, -found.depth);
     this.flight = { from: this.view.copy(), target, start: calm.matches ? -Infinity : performance.now() };
     this.changed();
   }
@@ -221,17 +226,8 @@ class App {
         input.addEventListener("change", () => { options[name] = input.value; apply(); });
       }
     };
-    choose("content", () => {
-      element("divider").hidden = options.content !== "both";
-      this.changed();
-    });
+    this.contents.connect(this.stage, () => this.changed());
     choose("style", () => this.changed());
-    element("content").closest("fieldset").hidden = !this.splats;
-    if (!this.splats) for (const input of document.querySelectorAll("[name=content]")) input.disabled = true;
-    connectDivider(element("divider"), this.stage, split => {
-      options.split = split;
-      this.changed();
-    });
     const background = element("background");
     background.value = settings.background;
     const paint = () => {
@@ -350,7 +346,7 @@ class App {
     }
     if (!quiet || this.finished) return;
     const { options } = this, exact = this.exactly;
-    const passes = exact && options.content !== "splats" ? options.samples ** 2 : 1, pass = this.passes++;
+    const passes = exact ? options.samples ** 2 : 1, pass = this.passes++;
     if (exact) await this.#drawExact(this.resting, 1, pass, options.samples);
     if (pass === 0) await this.#drawSorted(this.resting, 1, true, exact);
     if (this.dirty) return;
@@ -363,7 +359,7 @@ class App {
   // Whether the image at rest is the exact one.
   get exactly() {
     return Boolean(this.exact?.levels[this.resting]) && this.options.renderer === "exact" &&
-      this.options.style === "blended";
+      this.options.style === "blended" && this.contents.shows("mesh");
   }
 
   // A quick image while something changes: small enough to be fluid, by WebGL where WebGPU is too slow.
@@ -393,23 +389,19 @@ class App {
   }
 
   async #drawSorted(level, scale, still, exact) {
-    const { options } = this, meshToo = !exact, parts = [];
-    const split = { mesh: 0, both: options.split, splats: 1 }[options.content];
-    if (this.splats && split > 0) parts.push({ what: "splats", from: 0, to: split });
-    if (meshToo && split < 1) parts.push({ what: "mesh", from: split, to: 1 });
-    const { style, background, gain } = options, stop = () => this.dirty;
+    const parts = this.contents.parts.filter(({ what }) => !(exact && what === "mesh"));
+    const { style, background, gain } = this.options, stop = () => this.dirty;
     if (parts.length && this.sorted) {
       const drawn = await this.sorted.draw(
         { view: this.view, level, parts, style, still, scale, background, gain, stop });
       if (!drawn) return;
     }
-    this.canvases.exact.style.visibility = exact && split < 1 ? "visible" : "hidden";
+    this.canvases.exact.style.visibility = exact ? "visible" : "hidden";
     this.canvases.sorted.style.visibility = parts.length ? "visible" : "hidden";
   }
 
   // Sample `pass` of n x n in each pixel.
   async #drawExact(level, scale, pass, n) {
-    if (this.options.content === "splats") return;
     const { width, height } = this.canvases.exact, { background, gain } = this.options;
     const w = Math.max(1, Math.round(width * scale)), h = Math.max(1, Math.round(height * scale));
     const begun = performance.now();
@@ -436,10 +428,14 @@ async function main() {
     return found;
   };
   const unpackFine = async () => decodeMesh(await unpack(take("mesh")));
-  const levels = text("coarse") ? { coarse: decodeMesh(await unpack(take("coarse"))) }
-    : { fine: await unpackFine() };
-  const splats = text("splats") ? decodeSplats(await unpack(take("splats"))) : null;
-  await new App(settings, levels, splats, levels.fine ? null : unpackFine).start(JSON.parse(text("kernels")));
+  const taken = async id => text(id) ? unpack(take(id)) : null, levels = {};
+  if (text("coarse")) levels.coarse = decodeMesh(await taken("coarse"));
+  else if (text("mesh")) levels.fine = await unpackFine();
+  if (text("surface"))
+    levels.surface = await decodeSurface(await taken("surface"), await taken("coordinates"), take("picture"));
+  const splats = text("splats") ? decodeSplats(await taken("splats")) : null;
+  const app = new App(settings, levels, splats, text("mesh") ? unpackFine : null);
+  await app.start(JSON.parse(text("kernels") ?? "null"));
 }
 
 main().catch(error => {

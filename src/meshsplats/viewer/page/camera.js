@@ -109,3 +109,19 @@ export function project(pinhole, point) {
   const [x, y, z] = pinhole.rows.map(r => r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]);
   return [pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy, z];
 }
+
+// The nearest vertex of a mesh, {point, depth}, that is not nearly transparent and lies within `reach` pixels
+// of a point of the image.
+export function nearestVertex({ vertices, colors }, pinhole, x, y, reach) {
+  const { rows: [a, b, c], fx, fy, cx, cy } = pinhole;
+  let depth = Infinity, found = -1;
+  for (let v = 0, i = 0; v < vertices.length / 3; v++, i += 3) {
+    const X = vertices[i], Y = vertices[i + 1], Z = vertices[i + 2];
+    const z = c[0] * X + c[1] * Y + c[2] * Z + c[3];
+    if (!(z > pinhole.near) || z >= depth || colors[4 * v + 3] < 0.2) continue;
+    const dx = fx * (a[0] * X + a[1] * Y + a[2] * Z + a[3]) / z + cx - x;
+    const dy = fy * (b[0] * X + b[1] * Y + b[2] * Z + b[3]) / z + cy - y;
+    if (dx * dx + dy * dy < reach * reach) [depth, found] = [z, i];
+  }
+  return found < 0 ? null : { point: [...vertices.subarray(found, found + 3)], depth };
+}

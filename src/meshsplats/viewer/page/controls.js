@@ -55,8 +55,8 @@ export function connect(stage, pilot, least) {
   });
 
   const once = {
-    Home: "home", "[": "previous", "]": "next", 1: "mesh", 2: "both", 3: "splats", b: "blended", o: "opaque",
-    x: "wireframe", h: "plain",
+    Home: "home", "[": "previous", "]": "next", 1: "mesh", 2: "both", 3: "splats", 4: "surface",
+    b: "blended", o: "opaque", x: "wireframe", h: "plain",
   };
   document.addEventListener("keydown", event => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -99,7 +99,7 @@ function pair(touches) {
   return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, apart: Math.hypot(a.x - b.x, a.y - b.y) };
 }
 
-// The boundary between splats and mesh: moved(share) while it is dragged or moved by keys.
+// The boundary between two contents: moved(share) while it is dragged or moved by keys.
 export function connectDivider(divider, stage, moved) {
   const set = share => {
     const value = Math.max(0, Math.min(1, share));

@@ -83,6 +83,18 @@ function decodeHarmonics({ terms, step, row: first }, row) {
   return { terms, step, values };
 }
 
+// A surface: a mesh with texture coordinates (2 a vertex) and the picture of its texture, or without both.
+export async function decodeSurface(mesh, coordinates, picture) {
+  const surface = decodeMesh(mesh);
+  if (!coordinates) return surface;
+  const { row, steps, wrap, type } = coordinates.header, [u, v] = coordinates.rows(row, 2);
+  const uv = new Float32Array(2 * u.length);
+  for (let i = 0; i < u.length; i++) uv.set([u[i] / steps, v[i] / steps], 2 * i);
+  const image = await createImageBitmap(new Blob([bytesOf(picture)], { type }),
+    { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  return Object.assign(surface, { uv, wrap, image });
+}
+
 // First triangle of each splat, and their count at the end.
 export function startsOf(splat) {
   const starts = [];

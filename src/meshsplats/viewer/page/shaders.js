@@ -13,10 +13,16 @@ ivec2 place(uint i) { return ivec2(i & 4095u, i >> 12); }
 const HEAD = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 `;
-// terms: spherical harmonics of each splat, in the order of the core; 0 for none.
-export const meshVertex = terms => HEAD + LENS + `
+// terms: spherical harmonics of each splat, in the order of the core; 0 for none. textured: whether vertices
+// have coordinates in a picture, which is multiplied with their colours.
+const textures = textured => textured ? "#define TEXTURED\n" : "";
+export const meshVertex = (terms, textured) => HEAD + textures(textured) + LENS + `
 #define TERMS ${terms}
 in vec3 position; in vec4 color;
+#ifdef TEXTURED
+in vec2 coordinate;
+centroid out vec2 uv;
+#endif
 uniform float brightest; // display value of the largest number in \`color\`
 centroid out vec4 rgba;
 #if TERMS > 0
@@ -47,15 +53,26 @@ void main() {
 #if TERMS > 0
   rgba.rgb = max(rgba.rgb + shade(normalize(position - eye)), 0.);
 #endif
+#ifdef TEXTURED
+  uv = coordinate;
+#endif
   gl_Position = clip(seen(position));
 }`;
-export const MESH_FRAGMENT = HEAD + `
+export const meshFragment = textured => HEAD + textures(textured) + `
 uniform float solid; // opacity of all fragments; negative: that of the vertices
 centroid in vec4 rgba;
+#ifdef TEXTURED
+uniform sampler2D picture;
+centroid in vec2 uv;
+#endif
 out vec4 result;
 void main() {
   float alpha = solid < 0. ? rgba.a : solid;
-  result = vec4(rgba.rgb * alpha, alpha);
+  vec3 rgb = rgba.rgb;
+#ifdef TEXTURED
+  rgb *= texture(picture, uv).rgb;
+#endif
+  result = vec4(rgb * alpha, alpha);
 }`;
 export const SPLAT_VERTEX = HEAD + LENS + `
 uniform sampler2D means, shapes, colors;

@@ -1,11 +1,11 @@
 // WebGL2: the mesh with its triangles sorted by their centres, and the splats. Not exact, as triangles that
 // overlap in depth are not split, but quick, and it runs where WebGPU is missing. A mesh in the order of its
-// splats is blended in that order.
+// splats is blended in that order. Surfaces are opaque, so a depth buffer sorts them.
 
 import { fanMiddles, middlesOf } from "./crop.js";
 import { depthsOf, sortFarToNear, sortFarToNearExactly } from "./order.js";
 import { counting, ownersOf } from "./scene.js";
-import { MESH_FRAGMENT, PRESENT_FRAGMENT, PRESENT_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, meshVertex }
+import { PRESENT_FRAGMENT, PRESENT_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, meshFragment, meshVertex }
   from "./shaders.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
@@ -29,8 +29,9 @@ export class SortedRenderer {
     if (this.triangles[level]) return this.triangles[level];
     const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3,
       V = mesh.vertices.length / 3;
-    const { harmonics } = mesh, terms = harmonics?.terms ?? 0;
-    const drawing = this.programs[`mesh ${terms}`] ??= program(gl, meshVertex(terms), MESH_FRAGMENT);
+    const { harmonics, uv } = mesh, terms = harmonics?.terms ?? 0;
+    const drawing = this.programs[`mesh ${uv ? "textured" : terms}`] ??= program(
+      gl, meshVertex(terms, uv), meshFragment(uv));
     const brightest = mesh.colors.reduce((most, value) => Math.max(most, value), 1), bright = brightest > 1;
     const largest = bright ? 65535 : 255, colors = new (bright ? Uint16Array : Uint8Array)(4 * V);
     for (let i = 0; i < 4 * V; i++)
@@ -40,6 +41,10 @@ export class SortedRenderer {
     if (harmonics) {
       attributes.push(["owner", ownersOf(mesh), 1, gl.UNSIGNED_INT]);
       textures.harmonics = texture(gl, gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT, inFours(harmonics.values));
+    }
+    if (uv) {
+      attributes.push(["coordinate", uv, 2, gl.FLOAT]);
+      textures.picture = picture(gl, mesh);
     }
     // In the order of the splats, the centres have the precision of the core's.
     const bySplat = mesh.order === "splat", middles = bySplat ? middlesOf(mesh, fans, Float64Array)
@@ -88,18 +93,19 @@ export class SortedRenderer {
     }
   }
 
-  // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of
-  // the canvas transparent. scale: size of the image in that of the canvas; still: triangles are sorted one
-  // by one, not fan by fan, unless the mesh is in the order of its splats, and the device may take its time,
-  // unless stop() says that the image is not wanted any more: then the canvas stays as it is, and the result
-  // is false.
+  // Draws parts [{what: "mesh", "splats" or "surface", from, to}] of the image's width, 0 to 1, and leaves
+  // the rest of the canvas transparent. scale: size of the image in that of the canvas; still: triangles are
+  // sorted one by one, not fan by fan, unless the mesh is in the order of its splats, and the device may take
+  // its time, unless stop() says that the image is not wanted any more: then the canvas stays as it is, and
+  // the result is false.
   async draw({ view, level, parts, style, still, scale, background, gain, stop }) {
     const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
     const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h), images = [];
     gl.disable(gl.SCISSOR_TEST);
     for (const { what } of parts) {
-      images.push(what === "mesh" ? await this.#drawMesh(level, pinhole, style, still, stop)
-        : this.#drawSplats(pinhole, scale));
+      images.push(what === "splats" ? this.#drawSplats(pinhole, scale) : what === "mesh"
+        ? await this.#drawMesh("mesh", level, pinhole, style, still, stop)
+        : await this.#drawMesh(what, what, pinhole, style === "blended" ? "opaque" : style, still, stop));
       if (!images.at(-1)) return false;
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -124,12 +130,12 @@ export class SortedRenderer {
     return true;
   }
 
-  async #drawMesh(level, pinhole, style, still, stop) {
+  async #drawMesh(what, level, pinhole, style, still, stop) {
     const { gl } = this, all = this.#needMesh(level), opaque = style === "opaque",
       wires = style === "wireframe";
     if (!opaque) this.#sortMesh(all, pinhole, still);
     const list = opaque ? all.items : all.order.subarray(0, all.count);
-    const frame = this.#frame(pinhole.width, pinhole.height, 4, opaque), corners = wires ? 6 : 3;
+    const frame = this.#frame(what, pinhole.width, pinhole.height, 4, opaque), corners = wires ? 6 : 3;
     for (let at = 0; at === 0 || at < list.length; at += PART) {
       if (still && at > 0) {
         await this.#idle();
@@ -188,7 +194,7 @@ export class SortedRenderer {
     const { gl } = this, all = this.#needSplats();
     depthsOf(this.splats.means, pinhole.rows[2], pinhole.near, all.depths);
     sortFarToNear(all.depths, all.items, all.order);
-    const frame = this.#frame(pinhole.width, pinhole.height, 0, false);
+    const frame = this.#frame("splats", pinhole.width, pinhole.height, 0, false);
     const list = all.order.subarray(0, all.items.length);
     this.#begin(frame, this.programs.splats, pinhole, true);
     bindTextures(gl, this.programs.splats, all.textures);
@@ -218,9 +224,9 @@ export class SortedRenderer {
     gl.uniform3f(at("size"), pinhole.width, pinhole.height, pinhole.near);
   }
 
-  // A frame buffer of that size, kept until another size is asked for.
-  #frame(width, height, samples, depth) {
-    const { gl } = this, format = this.float ? gl.RGBA16F : gl.RGBA8, key = `${samples} ${depth}`;
+  // A frame buffer of that size for a part of the image, kept until another size is asked for.
+  #frame(what, width, height, samples, depth) {
+    const { gl } = this, format = this.float ? gl.RGBA16F : gl.RGBA8, key = `${what} ${depth}`;
     const old = this.frames.get(key);
     if (old && old.width === width && old.height === height) return old;
     if (old) for (const free of old.free) free();
@@ -354,6 +360,21 @@ function texture(gl, format, layout, type, values) {
   gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, layout, type, padded);
   for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
     gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  return id;
+}
+
+// The texture of a surface.
+function picture(gl, { image, wrap }) {
+  const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), side = Math.max(image.width, image.height);
+  if (side > most) throw new Error(`a texture of ${side} texels is too large for WebGL2 here (${most})`);
+  const modes = { clamp: gl.CLAMP_TO_EDGE, repeat: gl.REPEAT, mirror: gl.MIRRORED_REPEAT };
+  const id = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, id);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+  gl.generateMipmap(gl.TEXTURE_2D);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, modes[wrap[0]]);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, modes[wrap[1]]);
   return id;
 }
 

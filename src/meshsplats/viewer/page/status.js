@@ -5,9 +5,9 @@ export const number = value => Math.round(value).toLocaleString("en");
 
 // state: of the image; exact: whether the exact renderer drew it, in so many passes; scale: of the canvas.
 export function report(app, state, exact, passes, scale, level) {
-  const { options } = app, only = options.content === "splats";
-  const kind = only ? "splats" : exact ? "exact" : "sorted";
-  const samples = exact && !only ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
+  const kind = !app.contents.shows("mesh") ? app.contents.parts.map(({ what }) => what).join(", ")
+    : exact ? "exact" : "sorted";
+  const samples = exact ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
   const size = scale < 1 ? `, 1/${Math.round(1 / scale)} size` : state === "moving" ? ", moving" : samples;
   const wording = {
     refining: `, ${app.passes} of ${passes} samples`, preparing: ", preparing the exact image",
