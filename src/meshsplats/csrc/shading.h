@@ -69,25 +69,27 @@ class Shading {
 
     void backward() {
         each_batch([&](int64_t splat, const int32_t *vertex, int count, auto terms) {
-            float basis[terms][BATCH], *out = nullptr;
-            if (s_.harmonic_gradient) {
-                find_basis(vertex, count, basis);
-                out = s_.harmonic_gradient + splat * terms * 3;
-            }
+            float g[3][BATCH] = {};
+            bool reached = false;
             for (int i = 0; i < count; ++i) {
                 const int64_t at = 4 * (int64_t)vertex[i];
-                float g[3];
                 for (int channel = 0; channel < 3; ++channel) {
                     // At 0, only what leads back into the visible colours.
                     const bool passes = s_.shaded[at + channel] > 0 || s_.gradient[at + channel] < 0;
-                    g[channel] = passes ? s_.gradient[at + channel] : 0.0f;
-                    s_.color_gradient[at + channel] += g[channel];
+                    g[channel][i] = passes ? s_.gradient[at + channel] : 0.0f;
+                    s_.color_gradient[at + channel] += g[channel][i];
+                    reached |= g[channel][i] != 0;
                 }
                 s_.color_gradient[at + 3] += s_.gradient[at + 3];
-                for (int k = 0; out && k < terms; ++k)
-                    for (int channel = 0; channel < 3; ++channel)
-                        out[3 * k + channel] += basis[k][i] * g[channel];
             }
+            if (!reached || !s_.harmonic_gradient) return;  // most splats of a place, in most views
+            float basis[terms][BATCH];
+            find_basis(vertex, count, basis);
+            float *out = s_.harmonic_gradient + splat * terms * 3;
+            for (int i = 0; i < count; ++i)
+                for (int k = 0; k < terms; ++k)
+                    for (int channel = 0; channel < 3; ++channel)
+                        out[3 * k + channel] += basis[k][i] * g[channel][i];
         });
     }
 

@@ -289,7 +289,7 @@ class State:
         flat = gradients.harmonics.reshape(len(gradients.harmonics), -1)
         rate = self._harmonics_rate(color_rate)
         if rate > 0:
-            reached = nonzero_rows(flat)
+            reached = nonzero_rows(flat[:, :9])  # degree 1: where it is 0, so are all
             if self.frozen is not None:
                 reached &= ~self._frozen_splats
             self._harmonics.lr = rate
