@@ -56,9 +56,10 @@ def test_blocks_give_the_mesh_of_the_whole(job):
     assert result["splats"] == len(few_splats())
 
 
-def test_splats_are_chosen_and_a_mesh_is_none(job, tmp_path):
-    product = Product(as_splats=True, conversion=replace(Product().conversion, max_splats=3))
-    assert product.merges
+@pytest.mark.parametrize("budget", ["merge", "drop"])
+def test_splats_are_chosen_and_a_mesh_is_none(job, tmp_path, budget):
+    product = Product(as_splats=True, conversion=ms.ConversionOptions(max_splats=3, budget=budget))
+    assert product.merges == (budget == "merge")
     splats = replace(job, outputs=(tmp_path / "c.splat",), configs=())
     assert Maker(product, PLAIN).made(splats, [])["written"] == 3
     ms.save_mesh(ms.convert(few_splats()), tmp_path / "m.npz")
@@ -66,14 +67,11 @@ def test_splats_are_chosen_and_a_mesh_is_none(job, tmp_path):
         Maker(product, PLAIN).made(replace(splats, source=tmp_path / "m.npz"), [])
 
 
-def test_an_error_leaves_neither_mesh_nor_record(job):
-    def fails(job):
-        record(job)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Maker(Product(), replace(PLAIN, record=fails)).made(job, [])
-    assert not any(path.exists() for path in job.outputs)
+def test_an_error_in_one_format_leaves_no_file_of_another(job, tmp_path):
+    wrong = replace(job, outputs=(job.outputs[0], tmp_path / "b.none"))
+    with pytest.raises(ValueError, match="does not name a mesh format"):
+        Maker(Product(), PLAIN).made(wrong, [])
+    assert not job.outputs[0].exists()
 
 
 def test_cameras_are_in_the_world(tmp_path):
