@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -16,6 +17,7 @@ from meshsplats._files.atomic import replace_folder, write_text
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 from meshsplats.formats.meshes import save_mesh
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import (
     SAMPLES,
@@ -72,6 +74,39 @@ class ChainOptions:
 def partial_folder(folder: Path) -> Path:
     """Where the chain ``folder`` lies until it is complete."""
     return folder.with_name(f"{folder.name}.partial")
+
+
+def check_folder(folder: Path, *, resume: bool = False, replace_old: bool = False) -> None:
+    """Checks whether ``folder`` can become a chain: a new one, one in place of an older, or with ``resume``
+    that of an interrupted run.
+
+    Raises:
+        FileExistsError: it exists and is not to be replaced or holds something else, or a partial one is
+            left.
+        FileNotFoundError: there is nothing to resume.
+        OSError: it cannot be written.
+    """
+    unfinished = partial_folder(folder)
+    check_outputs([folder], replace_old)
+    if folder.exists() and not (folder / TABLE).is_file():
+        raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
+    if resume and not (unfinished / CONFIGURATION).is_file():
+        raise FileNotFoundError(f"nothing to resume in {unfinished}: leave out --resume to start again")
+    if unfinished.exists() and not resume and not replace_old:
+        raise FileExistsError(
+            f"{unfinished} is left from an earlier run: --resume continues it, --force starts again"
+        )
+
+
+def begin_folder(folder: Path) -> Path:
+    """Makes ``partial_folder(folder)``, empty, and returns it. FileExistsError for one that is no chain's."""
+    unfinished = partial_folder(folder)
+    if unfinished.exists():
+        if not (unfinished / CONFIGURATION).is_file():
+            raise FileExistsError(f"{unfinished} exists and is not of this command: remove it")
+        shutil.rmtree(unfinished)
+    unfinished.mkdir()
+    return unfinished
 
 
 def make_chain(

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Shared, Workers
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, recorded_options
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import encode_array, encode_depth_png, encode_image, straight_rgba
 from meshsplats.mesh import SplatMesh
@@ -83,6 +86,28 @@ def depth_unit(points: np.ndarray, cameras: Sequence[Camera]) -> float:
         float((corners @ c.world_to_camera[2, :3] + c.world_to_camera[2, 3]).max()) for c in cameras
     )
     return max(farthest, 1e-6) / 65535
+
+
+def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
+    """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
+    return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]
+
+
+def remove_older(folder: Path, kept: Sequence[Path]) -> None:
+    """Removes the images of an earlier 'meshsplats render' into ``folder``, which its records name, except
+    ``kept``."""
+    if recorded_options(folder / CONFIGURATION, "render") is None:
+        return
+    try:
+        count = len(load_cameras(folder / CAMERAS))
+    except (OSError, ValueError):
+        return
+    names = [f"turntable.{kind}" for kind in ("webp", "gif", "png")]
+    for prefix, suffix in (("view", ".png"), ("depth", ".png"), ("depth", ".npy")):
+        names += view_names(count, prefix, suffix)
+    for name in names:
+        if folder / name not in kept:
+            (folder / name).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

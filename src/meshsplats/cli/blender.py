@@ -29,10 +29,11 @@ from meshsplats.cli.common import (
     plural,
     size_of,
 )
-from meshsplats.cli.images import ViewOptions, view_names
+from meshsplats.cli.images import EXCLUSIVE_VIEWS, ViewOptions
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs
+from meshsplats.frames import view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -85,11 +86,7 @@ class Blender(Command):
         *("engine", "samples", "orbit", "cameras", "azimuth", "elevation", "distance"),
         *("width", "background", "transparent", "executable", "json", "force"),
     )
-    EXCLUSIVE = (
-        ("orbit", "dome", "look_around", "cameras", "data"),
-        ("fov", "focal_length"),
-        ("background", "transparent"),
-    )
+    EXCLUSIVE = (*EXCLUSIVE_VIEWS, ("background", "transparent"))
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]

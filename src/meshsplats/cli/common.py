@@ -23,7 +23,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import warn_of_strays_in
 from meshsplats.cli import option
 from meshsplats.cli.arguments import spelled
-from meshsplats.cli.messages import UsageError, one_line, say, shown_path
+from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
@@ -278,6 +278,28 @@ def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:
     from rich.progress import track as progress
 
     yield from progress(items, label, total, console=Console(stderr=True), transient=True)
+
+
+def again(options: object, *names: str, **defaults: Any) -> list[Any]:
+    """The words with which another command takes the same options: ``names``, where they are given, and those
+    with ``defaults`` that have other values."""
+    wanted = dict.fromkeys(names) | defaults
+    values = {name: getattr(options, name) for name in wanted}
+    changed = [name for name, default in wanted.items() if values[name] != default]
+    return [word for name in changed for word in (flag(name), values[name])]
+
+
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:
+    """A table without lines: ``left`` columns of text, and numbers."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for i, head in enumerate(heads):
+        table.add_column(head, justify="left" if i < left else "right")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
 
 
 def plural(count: int, noun: str) -> str:

@@ -13,14 +13,15 @@ import tyro
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import PartOptions, SplatOptions, optional_color, parse_color, track
-from meshsplats.cli.images import DrawOptions, ViewOptions, view_names
+from meshsplats.cli.common import PartOptions, SplatOptions, optional_color, parse_color, print_table, track
+from meshsplats.cli.images import EXCLUSIVE_VIEWS, DrawOptions, ViewOptions
 from meshsplats.cli.records import write_configuration, write_json
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.evaluation.comparison import Comparison, compare_views
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, check_outputs
 from meshsplats.formats.sniff import identify
+from meshsplats.frames import view_names
 from meshsplats.rendering.looks import comparison_in_words, mesh_samples
 
 RESULTS = "results.json"
@@ -35,7 +36,7 @@ class Compare(Command):
         *("splats", "mesh", "output", "preset", "look", "orbit", "look_around", "cameras"),
         *("data", "downscale", "width", "background", "crop", "json", "force"),
     )
-    EXCLUSIVE = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
+    EXCLUSIVE = EXCLUSIVE_VIEWS
     CONFIGURABLE = True
 
     splats: tyro.conf.Positional[Path]
@@ -133,21 +134,10 @@ class Compare(Command):
         if self.json:
             print(json.dumps(result, indent=1, allow_nan=False))
             return
-        _print_table(comparison)
+        rows = [(view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}") for view in comparison.views]
+        rows.append(("mean", f"{comparison.psnr:.2f}", f"{comparison.ssim:.4f}"))
+        print_table(("view", "PSNR dB", "SSIM"), rows)
         print(comparison_in_words(self.look, samples))
         print(f"{len(cloud):,} splats against {len(mesh.faces):,} triangles, {result['seconds']:.1f} s")
         print(f"background: {background.describe()}")
         print(f"strips splats | mesh | error x {self.amplify:g}: {self.output}/")
-
-
-def _print_table(comparison: Comparison) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("view", box=None, pad_edge=False, show_footer=True)
-    table.columns[0].footer = "mean"
-    table.add_column("PSNR dB", justify="right", footer=f"{comparison.psnr:.2f}")
-    table.add_column("SSIM", justify="right", footer=f"{comparison.ssim:.4f}")
-    for view in comparison.views:
-        table.add_row(view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}")
-    Console().print(table)

@@ -15,6 +15,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.cli.common import (
+    again,
     alpha_in_words,
     check_mesh_suffix,
     draw_preview,
@@ -231,20 +232,20 @@ class Convert(ConvertCommand):
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         words += ["--look", self.look_of_result] if self.look_of_result != "area" else []
-        if self.data is not None:
-            words += ["--data", self.data]
-            words += ["--missing", self.missing] if self.missing != "error" else []
-        elif cameras:
+        words += again(self, "data", missing="error")
+        if cameras and self.data is None:
             words += ["--cameras", source if self.cameras is None else self.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
 
     def _for_depth_buffers(self) -> str:
         """The command that makes a mesh for viewers that do not sort, and what is gained by it."""
         words: list[str | Path] = ["meshsplats", "finetune", shown_path(self.input[0])]
-        if self.data is not None:
-            words += ["--data", self.data]
-            words += ["--missing", self.missing] if self.missing != "error" else []
-        words += [*self.reading.again(), "-o", self.output.with_suffix(".solid.glb")]
+        words += [
+            *again(self, "data", missing="error"),
+            *self.reading.again(),
+            "-o",
+            self.output.with_suffix(".solid.glb"),
+        ]
         command = command_line([*words, "--opacity", "cutoff", "--soft-share", "0.05"])
         return f"{command} ({ENGINE_GAIN})"
 

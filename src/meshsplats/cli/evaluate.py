@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,9 +25,10 @@ from meshsplats.cli.common import (
     load_scene,
     optional_color,
     parse_color,
+    print_table,
     track,
 )
-from meshsplats.cli.images import OrderOfBlending, view_names
+from meshsplats.cli.images import OrderOfBlending
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.cli.records import write_configuration
 from meshsplats.cli.targets import TargetOptions
@@ -50,6 +51,7 @@ from meshsplats.evaluation.results import (
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names, score_table
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs
+from meshsplats.frames import view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -163,7 +165,7 @@ class Evaluate(Command):
         if self.json:
             print(json.dumps({"scenes": [r.to_dict() for r in reports], "seconds": seconds}, indent=1))
             return
-        _print_table(reports)
+        print_table(*score_table(reports, {}), left=2)
         for note in notes(reports):
             print(note)
         print(f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/")
@@ -342,16 +344,3 @@ def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) 
     from meshsplats.finetuning import RunOptions, finetune, make_config
 
     return finetune(mesh, dataset, make_config(preset), run=RunOptions(threads=threads, report_every=0))
-
-
-def _print_table(reports: Sequence[Report]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    heads, rows = score_table(reports, {})
-    table = Table(*heads[:2], box=None, pad_edge=False)
-    for head in heads[2:]:
-        table.add_column(head, justify="right")
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)

@@ -14,7 +14,7 @@ import tyro
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import ClusterOptions, SplatOptions, check_mesh_suffix, load_scene, plural
+from meshsplats.cli.common import ClusterOptions, SplatOptions, again, check_mesh_suffix, load_scene, plural
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
@@ -242,11 +242,7 @@ class Finetune(TrainingCommand):
             return [f"next: {command_line(words)}"]
         words = ["meshsplats", "evaluate", self.output]
         if target.data is not None:
-            words += ["--data", target.data]
-            words += ["--downscale", target.downscale] if target.downscale != 1 else []
-            words += ["--test-every", target.test_every] if target.test_every != 8 else []
-            words += ["--missing", target.missing] if target.missing != "error" else []
-            words += ["--masks", target.masks] if target.masks != "count" else []
+            words += again(target, "data", downscale=1, test_every=8, missing="error", masks="count")
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
             words += ["--look", dataset.look] if dataset.look != "area" else []

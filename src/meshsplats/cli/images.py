@@ -24,6 +24,8 @@ from meshsplats.mesh import SplatMesh
 OrderOfBlending = Annotated[
     Literal["fragment", "splat"] | None, tyro.conf.arg(metavar="{fragment,splat}", help_behavior_hint="")
 ]
+EXCLUSIVE_VIEWS = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
+"""Options of views of which one may be given."""
 LONG_SECONDS = 10
 """Images that take longer than this, as far as can be estimated, are announced."""
 
@@ -152,11 +154,7 @@ class ViewOptions:
                 else "give --downscale or --width"
             )
         check_data(self.data, self.missing)
-        modes = [
-            name
-            for name in ("orbit", "dome", "look_around", "cameras", "data")
-            if getattr(self, name) is not None
-        ]
+        modes = [name for name in EXCLUSIVE_VIEWS[0] if getattr(self, name) is not None]
         if len(modes) > 1:
             raise UsageError(f"give one of {', '.join(map(flag, modes))}, not several")
         if self.fov is not None and self.focal_length is not None:
@@ -240,8 +238,3 @@ def announce_cost(
     ):
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
-
-
-def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
-    """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
-    return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]

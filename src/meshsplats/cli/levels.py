@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from typing import Any, Literal
 
 import tyro
 
-from meshsplats.chains import TABLE, ChainOptions, make_chain, partial_folder
+from meshsplats.chains import TABLE, ChainOptions, begin_folder, check_folder, make_chain, partial_folder
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions, optional_up, placed, say_origin, size_of
@@ -24,7 +23,7 @@ from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, check_outputs, recorded_options
+from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, recorded_options
 from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words
@@ -168,21 +167,12 @@ class Levels(Command):
         """OSError, before the work, if the folder cannot appear."""
         if self.output.suffix:
             raise UsageError(f"-o must name a folder, got {self.output.name!r}")
-        partial = partial_folder(self.output)
-        check_outputs([self.output], self.force)
-        if self.output.exists() and not (self.output / TABLE).is_file():
-            raise FileExistsError(f"{self.output} is there and holds no {TABLE}: give another folder")
-        if self.resume and not (partial / CONFIGURATION).is_file():
-            raise FileNotFoundError(f"nothing to resume in {partial}: leave out --resume to start again")
-        if partial.exists() and not self.resume and not self.force:
-            raise FileExistsError(
-                f"{partial} is left from an earlier run: --resume continues it, --force starts again"
-            )
+        check_folder(self.output, resume=self.resume, replace_old=self.force)
 
     def _begin(self) -> None:
         """Makes the folder of unfinished levels, empty; with --resume it must be that of the same command."""
-        unfinished = partial_folder(self.output)
         if self.resume:
+            unfinished = partial_folder(self.output)
             before = recorded_options(unfinished / CONFIGURATION, "levels") or {}
             for name, value in configuration("levels", self, unfinished)["options"].items():
                 if name not in _CHANGEABLE and before.get(name) != value:
@@ -190,12 +180,7 @@ class Levels(Command):
                         f"{unfinished} was started with {flag(name)} {before.get(name)}, not {value}"
                     )
             return
-        if unfinished.exists():
-            if not (unfinished / CONFIGURATION).is_file():
-                raise FileExistsError(f"{unfinished} exists and is not of this command: remove it")
-            shutil.rmtree(unfinished)
-        unfinished.mkdir()
-        write_configuration(unfinished / CONFIGURATION, "levels", self)
+        write_configuration(begin_folder(self.output) / CONFIGURATION, "levels", self)
 
     def _print_table(self, rows: list[dict[str, Any]]) -> None:
         heads = (

@@ -30,7 +30,7 @@ from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
+from meshsplats.prior import bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ class Prior(TrainingCommand):
             trained = train_prior(prior, dataset, config, run=run, on_progress=show)
             counts = {"base_faces": len(trained.base_faces), "triangles": len(trained.mesh.faces)}
             made = f"{counts['triangles']:,} triangles on {counts['base_faces']:,} faces"
-            return Trained(exported(trained, self.output), trained.mesh, counts, made)
+            return Trained(trained.in_file(self.output), trained.mesh, counts, made)
 
         return Plan(prior.mesh, dataset, summary, background, optimise)
 
@@ -153,14 +153,6 @@ class Prior(TrainingCommand):
         cloud = self.reading.load(self.splats, base.origin)
         views = worthwhile_views(as_begun(config, earlier))
         return self.target.make(cloud, self.splats, background, self.threads, views)
-
-
-def exported(prior: MeshPrior, path: Path) -> SplatMesh:
-    """The mesh of ``prior`` for the format of ``path``: for other programs, coplanar layers are set apart by
-    ``export_lift``."""
-    if path.suffix.lower() == ".npz":
-        return prior.mesh
-    return prior.pose(lift=prior.export_lift)
 
 
 def _grey_mesh(base: BaseMesh) -> SplatMesh:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import tyro
 
 from meshsplats.camera import Camera, hiding_near_plane
-from meshsplats.cameras.files import load_cameras, save_cameras
+from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
@@ -28,13 +28,13 @@ from meshsplats.cli.common import (
     size_of,
     track,
 )
-from meshsplats.cli.images import DrawOptions, ViewOptions, announce_cost, view_names
+from meshsplats.cli.images import EXCLUSIVE_VIEWS, DrawOptions, ViewOptions, announce_cost
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import choose_background
-from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, recorded_options
-from meshsplats.frames import FrameOptions, Scene, depth_unit, draw_frames
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs
+from meshsplats.frames import FrameOptions, Scene, depth_unit, draw_frames, remove_older, view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.drawing import MAX_ERROR
@@ -70,11 +70,7 @@ class Render(Command):
         *("data", "elevation", "azimuth", "distance", "up", "width"),
         *("height", "background", "transparent", "depth", "json", "force"),
     )
-    EXCLUSIVE = (
-        ("orbit", "dome", "look_around", "cameras", "data"),
-        ("fov", "focal_length"),
-        ("background", "transparent"),
-    )
+    EXCLUSIVE = (*EXCLUSIVE_VIEWS, ("background", "transparent"))
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
@@ -150,7 +146,7 @@ class Render(Command):
             color = background.color
             result |= background.to_dict()
         if not single:
-            _remove_older(self.output, files.every)
+            remove_older(self.output, files.every)
         drawing = FrameOptions(
             background=color,
             transparent=self.transparent,
@@ -267,19 +263,3 @@ class Render(Command):
                 write_bytes(files.images[i], image)
                 if depth is not None:
                     write_bytes(files.depths[i], depth)
-
-
-def _remove_older(folder: Path, kept: Sequence[Path]) -> None:
-    """Removes the images of an earlier run in ``folder``, which its records name, except ``kept``."""
-    if recorded_options(folder / CONFIGURATION, "render") is None:
-        return
-    try:
-        count = len(load_cameras(folder / CAMERAS))
-    except (OSError, ValueError):
-        return
-    names = [f"turntable.{kind}" for kind in ("webp", "gif", "png")]
-    for prefix, suffix in (("view", ".png"), ("depth", ".png"), ("depth", ".npy")):
-        names += view_names(count, prefix, suffix)
-    for name in names:
-        if folder / name not in kept:
-            (folder / name).unlink(missing_ok=True)

@@ -11,7 +11,7 @@ import tyro
 from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import check_mesh_suffix, check_splat_endings, placed, say_origin
+from meshsplats.cli.common import again, check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.training import Plan, Trained, TrainingCommand
@@ -174,10 +174,7 @@ class Train(TrainingCommand):
             words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
             return [f"next: {command_line(words)}"]
         words = ["meshsplats", "evaluate", self.output, "--data", self.input]
-        words += ["--downscale", target.downscale] if target.downscale != 1 else []
-        words += ["--test-every", target.test_every] if target.test_every != 8 else []
-        words += ["--missing", target.missing] if target.missing != "error" else []
-        words += ["--masks", target.masks] if target.masks != "count" else []
+        words += again(target, downscale=1, test_every=8, missing="error", masks="count")
         if plan.background is not None:
             words += ["--background", plan.background.name]
         words += ["--samples", samples_of(plan.dataset.train[0], config), "-o", f"{folder}-evaluation"]

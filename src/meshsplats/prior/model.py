@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -99,6 +100,11 @@ class MeshPrior:
         if lift is None and binding.lift and binding.area > 0:
             posed = binding.moved(positions, binding.lift * (posed.area / binding.area) ** 0.5)
         return self.mesh.moved(posed.positions(), normals=posed.normals(), binding=posed)
+
+    def in_file(self, path: str | os.PathLike[str]) -> SplatMesh:
+        """The mesh for the format of ``path``: for other programs than this one, which reads .npz, coplanar
+        layers are set apart by ``export_lift``."""
+        return self.mesh if Path(path).suffix.lower() == ".npz" else self.pose(lift=self.export_lift)
 
     def check_topology(self, base: BaseMesh) -> None:
         """Raises ValueError unless ``base`` has the number of vertices and the triangles of this base."""

@@ -1,0 +1,81 @@
+"""A program of one's own makes the files of a job, as the command does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _splats import few_splats
+
+import meshsplats as ms
+from meshsplats.evaluation.mesh_files import MeshFileOptions
+from meshsplats.file_conversion import Maker, Product, Surroundings, seen_from
+from meshsplats.jobs import jobs
+
+
+def record(job):
+    for path in job.configs:
+        path.write_text("noted")
+
+
+PLAIN = Surroundings(
+    load=ms.load_gaussians,
+    stream=ms.stream_gaussians,
+    place=lambda scene: scene,
+    record=record,
+    preview=lambda scene, path, camera=None: path.write_bytes(b"drawn"),
+    opening=lambda cloud: None,
+)
+
+
+@pytest.fixture
+def job(tmp_path):
+    ms.save_gaussians(few_splats(), tmp_path / "a.ply")
+    (found,) = jobs([tmp_path / "a.ply"], tmp_path, ["npz", "ply"], preview=True, sidecars=True, shown=str)
+    return replace(found, outputs=(tmp_path / "b.npz", tmp_path / "b.ply"))
+
+
+def test_a_mesh_appears_in_every_format_with_its_record_and_preview(job, tmp_path):
+    result = Maker(Product(scale=2.0), PLAIN).made(job, [])
+    mesh = ms.convert(ms.load_gaussians(job.source))
+    assert (result["converted"], result["triangles"]) == (mesh.splat_count, len(mesh.faces))
+    for path in job.outputs:
+        np.testing.assert_array_equal(ms.load_mesh(path).vertices, mesh.vertices * np.float32(2))
+    assert [path.read_text() for path in job.configs] == ["noted"] * 2
+    assert job.preview.read_bytes() == b"drawn"
+
+
+def test_blocks_give_the_mesh_of_the_whole(job):
+    one = replace(job, outputs=job.outputs[1:], configs=job.configs[1:])
+    files = MeshFileOptions(alpha="blend")
+    Maker(Product(files=files), PLAIN).made(one, None)
+    whole = one.outputs[0].read_bytes()
+    result = Maker(Product(in_blocks=True), PLAIN).made(one, None)
+    assert one.outputs[0].read_bytes() == whole
+    assert result["splats"] == len(few_splats())
+
+
+@pytest.mark.parametrize("budget", ["merge", "drop"])
+def test_splats_are_chosen_and_a_mesh_is_none(job, tmp_path, budget):
+    product = Product(as_splats=True, conversion=ms.ConversionOptions(max_splats=3, budget=budget))
+    assert product.merges == (budget == "merge")
+    splats = replace(job, outputs=(tmp_path / "c.splat",), configs=())
+    assert Maker(product, PLAIN).made(splats, [])["written"] == 3
+    ms.save_mesh(ms.convert(few_splats()), tmp_path / "m.npz")
+    with pytest.raises(ms.FileFormatError, match="not splats"):
+        Maker(product, PLAIN).made(replace(splats, source=tmp_path / "m.npz"), [])
+
+
+def test_an_error_in_one_format_leaves_no_file_of_another(job, tmp_path):
+    wrong = replace(job, outputs=(job.outputs[0], tmp_path / "b.none"))
+    with pytest.raises(ValueError, match="does not name a mesh format"):
+        Maker(Product(), PLAIN).made(wrong, [])
+    assert not job.outputs[0].exists()
+
+
+def test_cameras_are_in_the_world(tmp_path):
+    camera = ms.Camera(np.eye(4), 50, 50, 32, 32, 64, 64)
+    (moved,) = seen_from([camera], tmp_path, np.array([1.0, 2, 3]))
+    np.testing.assert_allclose(moved.world_to_camera[:3, 3], [1, 2, 3])
+    assert seen_from(None, tmp_path, np.zeros(3)) == []
