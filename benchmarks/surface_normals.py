@@ -21,7 +21,7 @@ from _common import DATA, PHOTOGRAPHED, SCENES, Report, arguments
 import meshsplats as ms
 from meshsplats._geometry import vertex_normals
 from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.formats.surfaces.tangents import corner_frames
+from meshsplats.formats.surfaces.tangents import corner_frames, unit
 from meshsplats.mesh import Triangles
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
 
@@ -44,10 +44,6 @@ def corners(base: BaseMesh, camera: ms.Camera, values: np.ndarray) -> tuple[np.n
         image = TapedRendering(triangles, camera, TapeOptions(background=(0, 0, 0)), tape_bytes=None)
         parts.append(image.attributes)
     return np.concatenate(parts, axis=2), image.alpha > 0.5
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def smooth_normals(base: BaseMesh, camera: ms.Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from PIL import Image
 from meshsplats import BaseMesh, load_base, load_mesh, save_base
 from meshsplats.base_mesh import Texture
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
+from meshsplats.formats.surfaces.convex import THICK, convex_parts
 
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="install meshsplats[usd]")
 
@@ -173,6 +174,47 @@ def test_godot_knows_colliders_by_their_names(tmp_path, collision, suffix):
     assert again.textured == (collision != "only")
 
 
+def test_unreal_gets_convex_parts_by_their_names(tmp_path):
+    """As trimesh reads them: named after the surface, convex, closed, around all of it, and near it."""
+    pytest.importorskip("scipy")
+    trimesh = pytest.importorskip("trimesh")
+    ring = trimesh.creation.torus(2.0, 0.5, major_sections=64, minor_sections=24)
+    base = BaseMesh(ring.vertices, ring.faces.astype(np.int32), up=[0, 0, 1], origin=[5, 0, 0])
+    save_base(base, tmp_path / "a.glb", collision="convex")
+    scene = trimesh.load_scene(tmp_path / "a.glb")
+    assert sorted(scene.geometry) == [*(f"UCX_surface_{k:02d}" for k in range(32)), "surface"]
+    shown = scene.geometry.pop("surface")
+    hulls = list(scene.geometry.values())
+    middle = shown.triangles.mean(axis=1)
+    held = np.zeros(len(middle), bool)
+    for hull in hulls:
+        assert hull.is_convex
+        assert hull.is_volume  # closed, and facing outwards
+        sides = np.einsum("nd,md->nm", middle, hull.face_normals)
+        held |= (sides <= (hull.face_normals * hull.triangles[:, 0]).sum(axis=1) + 1e-4).all(axis=1)
+    assert held.all()
+    volume = sum(hull.volume for hull in hulls)
+    assert volume < 1.4 * ring.volume
+    assert ring.convex_hull.volume > 1.75 * ring.volume  # what a single part would have
+    for hull in hulls:
+        material = hull.visual.material
+        assert (material.alphaMode, material.baseColorFactor[3]) == ("MASK", 0)
+    again = load_base(tmp_path / "a.glb")
+    np.testing.assert_array_equal(again.vertices[again.faces], base.vertices[base.faces])
+
+
+def test_flat_and_tiny_surfaces_have_convex_parts(tmp_path):
+    pytest.importorskip("scipy")
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    for faces in ([[0, 1, 2]], [[0, 1, 2], [0, 2, 3]]):
+        ((points, triangles),) = convex_parts(square, np.array(faces))
+        low, high = points.min(axis=0), points.max(axis=0)
+        np.testing.assert_allclose(high - low, [1, 1, THICK * np.sqrt(2)], rtol=1e-4)
+        corners = points[triangles]
+        volume = np.linalg.det(corners.astype(float)).sum() / 6
+        assert volume == pytest.approx(len(faces) / 2 * THICK * np.sqrt(2), rel=1e-3)
+
+
 @pytest.mark.parametrize("collision", [None, "drawn", "only"])
 def test_usd_physics_knows_colliders(tmp_path, collision):
     pxr = pytest.importorskip("pxr")
@@ -202,7 +244,8 @@ def test_what_cannot_be_written(tmp_path):
         (base, "a.glb", {"image": "gif"}, "image must be one of"),
         (plain, "a.glb", {"image": "png"}, "with a texture"),
         (base, "a.stl", {"image": "png"}, "with a texture"),
-        (base, "a.glb", {"collision": "box"}, "collision must be one of drawn, only, got 'box'"),
+        (base, "a.glb", {"collision": "box"}, "collision must be one of drawn, only, convex, got 'box'"),
+        (base, "a.usdc", {"collision": "convex"}, "collision 'convex' is for .glb, not for .usdc"),
         (base, "a.obj", {"collision": "only"}, "collision applies to .glb"),
         (base, "a.glb", {"collision": "only", "image": "png"}, "with a texture"),
         (BaseMesh(np.zeros((0, 3)), np.zeros((0, 3), int)), "a.glb", {}, "no faces"),
@@ -246,6 +289,7 @@ def test_the_validator_finds_nothing(tmp_path, gltf_issues):
         (tetrahedron(textured=False), {}),
         (with_relief(), {}),
         (with_relief(), {"image": "webp"}),
+        *(([(tetrahedron(), {"collision": "convex"})]) if importlib.util.find_spec("scipy") else []),
     ]
     files = [tmp_path / f"{i}.glb" for i in range(len(cases))]
     for (base, options), file in zip(cases, files, strict=True):

@@ -44,7 +44,7 @@ def camera() -> ms.Camera:
 
 def plain(page) -> None:
     page.run("document.body.classList.add('plain')")
-    page.still()
+    page.still(400)
 
 
 def expected(base: BaseMesh, view: ms.Camera) -> np.ndarray:

@@ -33,7 +33,9 @@ else:
     )
 
 
-Collider = Annotated[files.Collision | None, tyro.conf.arg(metavar="{drawn,only}", help_behavior_hint="")]
+Collider = Annotated[
+    files.Collision | None, tyro.conf.arg(metavar="{drawn,only,convex}", help_behavior_hint="")
+]
 Image = Annotated[files.TextureImage | None, tyro.conf.arg(metavar="{png,jpg,webp}", help_behavior_hint="")]
 
 
@@ -67,7 +69,8 @@ class Surface(Command):
     image: Image = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     collision: Collider = None
-    """(.glb, USD) A static collider for engines, which is drawn, too, or not. Default: none."""
+    """(.glb, USD) A static collider for engines, which is drawn, too, or not; or (.glb) convex parts of it that
+    Unreal takes for its collider. Default: none."""
     scale: option.Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
     no_preview: bool = False
@@ -149,7 +152,7 @@ class Surface(Command):
         if suffix not in files.BASE_SUFFIXES:
             raise UsageError(f"-o must end in {', '.join(files.BASE_SUFFIXES)}, got {self.output.name!r}")
         files.check_writing(self.output, unlit=self.unlit, image=self.image, collision=self.collision)
-        if suffix in files.PRINTED and self.surface.shape == "open":
+        if suffix in files.PRINTED and self.surface.shape in ("open", "floor"):
             raise UsageError(f"{suffix} is for printing, which wants a solid: --shape closed")
         check_data(self.data, self.missing, self.cameras, self.masks)
         if self.scale is not None and not 0 < self.scale < np.inf:

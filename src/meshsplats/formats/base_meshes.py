@@ -29,8 +29,8 @@ from meshsplats.mesh import SplatMesh
 
 TextureImage = Literal["png", "jpg", "webp"]
 """Kinds of image files of textures."""
-Collision = Literal["drawn", "only"]
-"""Whether a surface that things collide with is drawn, too."""
+Collision = Literal["drawn", "only", "convex"]
+"""Whether a surface that things collide with is drawn, too, and whether convex parts of it collide instead."""
 _BESIDE = (".obj", ".ply", ".usdc", ".usda", ".usd")
 """Formats whose texture is a file of its own."""
 _SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
@@ -125,7 +125,9 @@ def save_base(
         collision: (`.glb`, USD) marks the surface as a static collider. In `.glb` its name ends in ``-col``
             or ``-colonly``, by which Godot imports one; USD: UsdPhysics' CollisionAPI and MeshCollisionAPI.
             ``drawn``: it is drawn, too. ``only``: Godot and renderers of USD (purpose 'guide') leave it out,
-            and it has neither texture nor colours.
+            and it has neither texture nor colours. ``convex``: (`.glb`) it is drawn, and at most 32 convex
+            hulls of its parts are colliders, meshes that nobody draws and that are named ``UCX_surface_00``
+            and so on, by which Unreal makes them the collision of the surface; needs scipy.
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, or has
@@ -183,6 +185,8 @@ def check_writing(
         raise ValueError(f"collision must be one of {', '.join(get_args(Collision))}, got {collision!r}")
     if collision is not None and suffix not in _SHADED:
         raise ValueError(f"collision applies to {', '.join(_SHADED)} only, not to {suffix}")
+    if collision == "convex" and suffix != ".glb":
+        raise ValueError(f"collision 'convex' is for .glb, not for {suffix}")
 
 
 def level_files(path: Path, count: int) -> list[Path]:

@@ -9,9 +9,18 @@ from meshsplats.errors import DataWarning
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, placed_meshes
 
+COLLIDES = {"meshsplats": {"version": 1, "collider": True}}
+"""Extras of the mesh of a collider, which our readers leave out."""
+INVISIBLE = {
+    "name": "invisible",
+    "alphaMode": "MASK",
+    "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0]},
+}
+"""Material of what no viewer draws: nothing of it passes the alpha test."""
+
 
 def shown_meshes(document: GltfDocument) -> list[Placed]:
-    """The meshes of a scene without colliders of ``save_scene``, and without splats where there is more. A
+    """The meshes of a scene without our colliders, and without splats where there is more. A
     DataWarning names the splats."""
     placed = [place for place in placed_meshes(document) if not _is_collider(place.mesh)]
     others = [place for place in placed if not _holds_splats(place.mesh)]

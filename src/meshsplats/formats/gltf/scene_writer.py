@@ -17,6 +17,7 @@ from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
+from meshsplats.formats.gltf.scene_parts import COLLIDES, INVISIBLE
 from meshsplats.formats.gltf.splats_writer import splats_part
 from meshsplats.formats.gltf.writer import mesh_part
 
@@ -98,11 +99,8 @@ def _moved(value: Any, first: dict[str, int]) -> Any:
 def _collider_part(collider: BaseMesh) -> Part:
     chunk = BinaryChunk()
     primitive = _triangles(chunk, collider.vertices, collider.faces)
-    invisible = {"baseColorFactor": [1, 1, 1, 0]}
-    material = {"name": "invisible", "alphaMode": "MASK", "pbrMetallicRoughness": invisible}
-    note = {"meshsplats": {"version": 1, "collider": True}}
-    meshes = [{"name": COLLIDER, "primitives": [primitive], "extras": note}]
-    return chunk.document([placed_node(COLLIDER, collider, mesh=0)], meshes, [material]), chunk
+    meshes = [{"name": COLLIDER, "primitives": [primitive], "extras": COLLIDES}]
+    return chunk.document([placed_node(COLLIDER, collider, mesh=0)], meshes, [dict(INVISIBLE)]), chunk
 
 
 def _surface_part(base: BaseMesh, lit: bool) -> Part:

@@ -1,4 +1,4 @@
-"""Surfaces as binary glTF 2.0: one opaque primitive, with its texture inside."""
+"""Surfaces as binary glTF 2.0: one opaque primitive, with its texture inside, and its collider if it has one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ import numpy as np
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
+from meshsplats.formats.gltf.scene_parts import COLLIDES, INVISIBLE
+from meshsplats.formats.surfaces.convex import convex_parts
 from meshsplats.formats.surfaces.corners import corners_of, normal_file, texture_file
 
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
 _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987
 _WEBP = "EXT_texture_webp"
-_NAMES = {None: "surface", "drawn": "surface-col", "only": "surface-colonly"}
+_NAMES = {None: "surface", "drawn": "surface-col", "only": "surface-colonly", "convex": "surface"}
 """By the suffixes Godot makes a collider; with the second it leaves out the mesh."""
+_UNREAL = "UCX_surface_{:02d}"
+"""By this prefix Unreal makes a mesh a convex collider of the one whose name follows."""
 
 
 def write_surface_glb(
@@ -73,7 +77,21 @@ def write_surface_glb(
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
     name = _NAMES[collision]
     mesh = {"name": name, "primitives": [primitive], "extras": {"meshsplats": note}}
-    document = chunk.document([placed_node(name, base, mesh=0)], [mesh], [material]) | more
+    nodes, meshes, materials = [placed_node(name, base, mesh=0)], [mesh], [material]
+    if collision == "convex":
+        parts = convex_parts(base.vertices, base.faces)
+        nodes[0]["children"] = list(range(1, 1 + len(parts)))
+        materials.append(INVISIBLE)
+        for number, (points, triangles) in enumerate(parts):
+            primitive = {
+                "attributes": {"POSITION": chunk.positions(points)},
+                "indices": chunk.indices(triangles, len(points)),
+                "material": 1,
+            }
+            own = _UNREAL.format(number)
+            meshes.append({"name": own, "primitives": [primitive], "extras": COLLIDES})
+            nodes.append({"name": own, "mesh": 1 + number})
+    document = chunk.document(nodes, meshes, materials) | more
     write_binary(path, document, chunk, what="the surface", advice="; choose fewer faces")
 
 

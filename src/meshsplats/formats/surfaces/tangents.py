@@ -41,8 +41,8 @@ def corner_frames(
     area = steps[0][:, 0] * steps[1][:, 1] - steps[0][:, 1] * steps[1][:, 0]
     signs = np.where(area < 0, -1.0, 1.0)
     along = (edges[0] * steps[1][:, 1:] - edges[1] * steps[0][:, 1:]) * signs[:, None]
-    tangents = _unit(_across(np.repeat(along[:, None], 3, axis=1), normals))
-    ahead, back = (_unit(_across(np.roll(points, k, axis=1) - points, normals)) for k in (-1, 1))
+    tangents = unit(_across(np.repeat(along[:, None], 3, axis=1), normals))
+    ahead, back = (unit(_across(np.roll(points, k, axis=1) - points, normals)) for k in (-1, 1))
     angle = np.arccos(np.clip((ahead * back).sum(axis=2), -1, 1))
     key = np.empty((faces.size, 4), np.int32)
     key[:, 0], key[:, 1] = faces.ravel(), np.repeat(signs, 3)
@@ -50,10 +50,10 @@ def corner_frames(
     group = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
     each = (tangents * angle[..., None]).reshape(-1, 3)
     sums = np.stack([np.bincount(group, each[:, k]) for k in range(3)], axis=1)[group].reshape(-1, 3, 3)
-    mean = _unit(sums)
+    mean = unit(sums)
     lost = ~mean.any(axis=2)  # triangles without an area in the texture: any direction across the normal
     axis = np.eye(3)[np.abs(normals[lost]).argmin(axis=1)]
-    mean[lost] = _unit(_across(axis, normals[lost]))
+    mean[lost] = unit(_across(axis, normals[lost]))
     return Frames(normals, mean, np.repeat(signs[:, None], 3, axis=1))
 
 
@@ -62,6 +62,7 @@ def _across(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return vectors - (vectors * normals).sum(axis=-1, keepdims=True) * normals
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """``vectors`` (..., 3) of length 1; those without length stay."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1)
