@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""File > Export > Splat Mesh, and help for Blender's own glTF exporter, which by itself loses our colours."""
+"""File > Export > Splat Mesh and Gaussian Splats, and help for Blender's own glTF exporter, which by itself
+loses our colours."""
 
 import warnings
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
+
+from meshsplats.formats.splat_formats import written_suffixes
 
 from .work import waiting
 
@@ -15,6 +18,7 @@ FORMATS = [
     (".ply", "Stanford (.ply)", "Triangles with float colours and opacities, as they are shown"),
     (".usdc", "USD (.usdc)", "Colour and opacity as primvars; needs the Python module pxr"),
 ]
+SPLAT_SUFFIXES = written_suffixes()
 LIT = "meshsplats_lit"
 
 
@@ -64,6 +68,47 @@ class ExportMeshSplats(bpy.types.Operator, ExportHelper):
         return {"FINISHED"}
 
 
+class ExportSplats(bpy.types.Operator, ExportHelper):
+    """Export splat meshes as the Gaussian splats that they were made from, with the edits since: those that
+    have all their triangles"""
+
+    bl_idname = "export_scene.meshsplats_splats"
+    bl_label = "Export Gaussian Splats"
+    bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
+
+    filename_ext = ".ply"
+    check_extension = None  # the name decides among the formats, also with two suffixes
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SPLAT_SUFFIXES), options={"HIDDEN"})
+    use_selection: BoolProperty(
+        name="Selected Only", description="Otherwise all visible splat meshes", default=False
+    )
+
+    def execute(self, context):
+        from meshsplats.blender.inside import exporting
+        from meshsplats.formats.gaussians import save_gaussians
+
+        path = self.filepath
+        if not path.lower().endswith(SPLAT_SUFFIXES):
+            path += self.filename_ext
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        try:
+            with waiting(context), warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                objs = exporting.chosen(context.view_layer, selected=self.use_selection)
+                cloud, cut = exporting.exported_splats(objs)
+                save_gaussians(cloud, path)
+        except (ValueError, OSError, ImportError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for warning in caught:
+            self.report({"WARNING"}, str(warning.message))
+        if cut:
+            self.report({"WARNING"}, f"MeshSplats: left out {cut:,} splats that lack some of their triangles")
+        self.report({"INFO"}, f"MeshSplats: {path}, {len(cloud):,} splats")
+        return {"FINISHED"}
+
+
 _stock = None
 """The splat meshes of an export by Blender's exporter, which is not done yet."""
 
@@ -107,14 +152,17 @@ class glTF2ExportUserExtension:
 
 def menu(self, context):
     self.layout.operator(ExportMeshSplats.bl_idname, text="Splat Mesh (.glb, .npz, .ply, .usdc)")
+    self.layout.operator(ExportSplats.bl_idname, text="Gaussian Splats (.ply, .spz, .sog, ...)")
 
 
 def register():
     bpy.utils.register_class(ExportMeshSplats)
+    bpy.utils.register_class(ExportSplats)
     bpy.types.TOPBAR_MT_file_export.append(menu)
 
 
 def unregister():
     _restore()
     bpy.types.TOPBAR_MT_file_export.remove(menu)
+    bpy.utils.unregister_class(ExportSplats)
     bpy.utils.unregister_class(ExportMeshSplats)

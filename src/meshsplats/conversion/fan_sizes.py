@@ -61,7 +61,7 @@ class Fans(NamedTuple):
         """
         drawn = self.opacity
         if compensation:
-            drawn = drawn * _missing(self.areas, self.shadow, self.shapes, self.choice) ** np.float32(
+            drawn = drawn * missing(self.areas, self.shadow, self.shapes, self.choice) ** np.float32(
                 compensation
             )
 
@@ -161,7 +161,7 @@ def ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "fla
     return Shape(pattern(sides, rings, mode), profile)
 
 
-def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
+def missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
     """(n,) mean area of a splat's projection over all directions, divided by that of its ellipses, whose mean
     |cos| is 1/2; 1 where the shape's profile is that of the projection."""
     of_ellipses = ~np.array([shape.fits_projection for shape in shapes])[choice]

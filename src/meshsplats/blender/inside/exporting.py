@@ -1,5 +1,5 @@
-"""Splat meshes out of an open Blender file: as a mesh of ours, in Blender's world, and in a form that
-Blender's own exporters write rightly."""
+"""Splat meshes out of an open Blender file: as a mesh of ours or as splats, in Blender's world, and in a form
+that Blender's own exporters write rightly."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import far_to_near, materials, meshes, objects, stage, stand_ins
+from meshsplats.blender.inside import far_to_near, frame, materials, meshes, objects, stage, stand_ins
 from meshsplats.blender.inside.host import bpy
+from meshsplats.cameras.framing import DEFAULT_UP
 from meshsplats.colors import srgb_to_linear
+from meshsplats.conversion.recovery import recover_splats
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.spherical_harmonics import moved_harmonics
 
 UP = np.array([0.0, 0.0, 1.0])
 LINEAR = "Color linear"
@@ -33,6 +37,17 @@ def exported(objs: Sequence[Any]) -> SplatMesh:
     if any(part.face_splat is None for part in parts):
         parts = [replace(part, face_splat=None) for part in parts]
     return SplatMesh.joined(parts)
+
+
+def exported_splats(objs: Sequence[Any]) -> tuple[GaussianCloud, int]:
+    """The splats of the meshes ``objs``, as ``exported``, with y down as files of splats have it, and how
+    many were left out: those that edits or modifiers have cut.
+
+    Raises:
+        ValueError: as ``exported`` and ``recover_splats``.
+    """
+    cloud, whole = recover_splats(exported(objs))
+    return cloud.transformed(frame.to_blender(np.array(DEFAULT_UP)).T), int((~whole).sum())
 
 
 def chosen(view_layer: Any, *, selected: bool) -> list[Any]:
@@ -57,8 +72,15 @@ def _in_world(obj: Any) -> SplatMesh:
     local = found.vertices.astype(np.float64) - np.array(obj.data.get(objects.ORIGIN, (0, 0, 0)))
     vertices = local @ world[:3, :3].T + world[:3, 3]
     faces = found.faces[:, [0, 2, 1]] if np.linalg.det(world[:3, :3]) < 0 else found.faces
+    harmonics = None if found.harmonics is None else moved_harmonics(found.harmonics, world[:3, :3])
     return replace(
-        found, vertices=vertices.astype(np.float32), faces=faces, up=UP, origin=np.zeros(3), binding=None
+        found,
+        vertices=vertices.astype(np.float32),
+        faces=faces,
+        harmonics=harmonics,
+        up=UP,
+        origin=np.zeros(3),
+        binding=None,
     )
 
 
