@@ -1,16 +1,43 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cutting splats: whole ones, by another object, by opacity and by size."""
+"""Cutting splats: whole ones, by another object, by opacity, by size and by colour, and floaters; changing
+their colours."""
+
+import math
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 
 from .settings import copy_choices
 from .work import waiting
 
 
+def is_splats(obj):
+    return obj is not None and obj.type == "MESH" and "meshsplats_lit" in obj.data
+
+
+def cut(context, obj, mesh, faces, *, action="delete"):
+    """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so
+    again."""
+    from meshsplats.blender.inside import baking, cutting, materials
+
+    baked = any(materials.shows_baked(material) for material in obj.data.materials)
+    separate = action != "delete"
+    made = cutting.cut(obj, mesh, faces, separate=separate, collection=obj.users_collection[0])
+    parts = [obj]
+    if made is not None:
+        copy_choices(made.meshsplats, obj.meshsplats)
+    if action == "hide":  # before light is baked: it casts no shadow
+        cutting.hide(made)
+    elif made is not None:
+        parts.append(made)
+    if baked:
+        baking.bake(context.scene, parts)
+    context.view_layer.objects.active = obj
+
+
 class CutSplats(bpy.types.Operator):
-    """Delete or separate whole splats of the active object: those in the bounds of the other selected object,
-    faint ones or large ones"""
+    """Delete, separate, hide or select whole splats of the active object: those in the bounds of the other
+    selected object, faint ones, large ones or those of a colour"""
 
     bl_idname = "object.meshsplats_cut"
     bl_label = "Cut Splats"
@@ -21,6 +48,8 @@ class CutSplats(bpy.types.Operator):
         items=[
             ("delete", "Delete", "Remove the chosen splats"),
             ("separate", "Separate", "Move the chosen splats to an object of their own"),
+            ("hide", "Hide", "Move them to an object in a collection of its own, which is hidden"),
+            ("select", "Select", "Go to edit mode, where they are selected"),
         ],
     )
     shape: EnumProperty(
@@ -38,13 +67,21 @@ class CutSplats(bpy.types.Operator):
     above_size: FloatProperty(
         name="Size from", description="Radius of a splat; 0: of any size", default=0.0, min=0.0, unit="LENGTH"
     )
+    by_color: BoolProperty(name="Only of a Colour", description="Choose by colour, too", default=False)
+    color: FloatVectorProperty(
+        name="Colour", subtype="COLOR_GAMMA", size=3, default=(1.0, 1.0, 1.0), min=0.0, max=1.0
+    )
+    color_distance: FloatProperty(
+        name="Differs up to",
+        description="Greatest difference from that colour: the distance of red, green and blue, each 0 to 1",
+        default=0.15,
+        min=0.0,
+        max=1.75,
+    )
 
     @classmethod
     def poll(cls, context):
-        obj = context.object
-        return (
-            obj is not None and obj.type == "MESH" and "meshsplats_lit" in obj.data and obj.mode == "OBJECT"
-        )
+        return is_splats(context.object) and context.object.mode == "OBJECT"
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
@@ -70,23 +107,113 @@ class CutSplats(bpy.types.Operator):
                     outside=self.outside,
                     below_opacity=self.below_opacity,
                     above_size=self.above_size,
+                    color=tuple(self.color) if self.by_color else None,
+                    color_distance=self.color_distance,
                 )
-                made = cutting.cut(
-                    obj, mesh, faces, separate=self.action == "separate", collection=obj.users_collection[0]
-                )
+                if self.action == "select":
+                    cutting.select(obj, faces)
+                else:
+                    cut(context, obj, mesh, faces, action=self.action)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        if made is not None:
-            copy_choices(made.meshsplats, obj.meshsplats)
-        context.view_layer.objects.active = obj
         self.report({"INFO"}, f"MeshSplats: {faces.sum():,} triangles of {len(faces):,} were chosen")
         return {"FINISHED"}
 
 
+class CleanSplats(bpy.types.Operator):
+    """Delete floaters of the active object, as the command meshsplats clean does"""
+
+    bl_idname = "object.meshsplats_clean"
+    bl_label = "Clean Splats"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    sparse: FloatProperty(
+        name="Sparse",
+        description="Splats with fewer neighbours than this share of the median; 0: stay",
+        default=0.05,
+        min=0.0,
+        max=1.0,
+    )
+    min_part: FloatProperty(
+        name="Parts below",
+        description="Parts that touch nothing else and have less than this share of all opacity; 0: stay",
+        default=0.01,
+        min=0.0,
+        max=1.0,
+    )
+    max_size: FloatProperty(
+        name="Size from",
+        description="Splats longer than this many radii of the subject",
+        default=1000,
+        min=0.1,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        return CutSplats.poll(context)
+
+    def execute(self, context):
+        from meshsplats.blender.inside import cutting
+        from meshsplats.conversion.cleaning import CleaningRules
+
+        obj = context.object
+        rules = CleaningRules(
+            sparse=self.sparse or None, min_part=self.min_part or None, max_size=self.max_size
+        )
+        try:
+            with waiting(context):
+                mesh, faces = cutting.floaters(obj, rules)
+                if faces.any():
+                    cut(context, obj, mesh, faces)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"MeshSplats: {faces.sum():,} triangles of {len(faces):,} were of floaters")
+        return {"FINISHED"}
+
+
+class AdjustSplats(bpy.types.Operator):
+    """Change hue, saturation, brightness, contrast and opacity of the selected splat meshes"""
+
+    bl_idname = "object.meshsplats_adjust"
+    bl_label = "Adjust Splats"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE")
+    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, max=4.0)
+    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, max=4.0)
+    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, max=4.0)
+    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, max=4.0)
+
+    @classmethod
+    def poll(cls, context):
+        return CutSplats.poll(context)
+
+    def execute(self, context):
+        from meshsplats.blender.inside import adjusting, levels, stand_ins
+
+        values = {name: getattr(self, name) for name in ("saturation", "brightness", "contrast", "opacity")}
+        change = adjusting.Adjustment(hue=math.degrees(self.hue), **values)
+        chosen = {context.object, *(obj for obj in context.selected_objects if is_splats(obj))}
+        every = {level for obj in chosen for level in levels.with_levels(obj)}
+        with waiting(context):
+            for data in {obj.data for obj in every}:
+                adjusting.adjust(data, change)
+            for obj in every:
+                if stand_ins.SHAPE in obj:  # light bounces off the old colours
+                    obj[stand_ins.SHAPE] = ""
+        return {"FINISHED"}
+
+
+CLASSES = (CutSplats, CleanSplats, AdjustSplats)
+
+
 def register():
-    bpy.utils.register_class(CutSplats)
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
 
 
 def unregister():
-    bpy.utils.unregister_class(CutSplats)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

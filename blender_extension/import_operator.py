@@ -63,7 +63,8 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         names = [file.name for file in self.files if file.name]
         # Without a file: the folder, of a model or of levels of detail.
         paths = [os.path.join(self.directory, name) for name in names] or [self.filepath or self.directory]
-        return self.begin(context, Work(paths, {name: getattr(self, name) for name in CHOICES}))
+        choices = {name: getattr(self, name) for name in CHOICES}
+        return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
         from meshsplats.blender.inside import objects

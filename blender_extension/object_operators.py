@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
-from .work import CloudWork, Modal, Work, settle, waiting
+from .work import CloudWork, LightWork, Modal, Work, settle, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -36,7 +36,8 @@ class ConvertAgain(Modal, bpy.types.Operator):
                 copy_choices(obj.meshsplats, source)
                 obj.meshsplats.busy = not bpy.app.background
                 self._names[bpy.path.abspath(obj.meshsplats.path)] = obj.name
-        return self.begin(context, Work(self._names, {name: getattr(source, name) for name in CHOICES}))
+        choices = {name: getattr(source, name) for name in CHOICES}
+        return self.begin(context, Work(self._names, choices | {"fast": context.scene.meshsplats_fast}))
 
     def cancelled(self):
         for name in self._names.values():
@@ -100,7 +101,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
             return {"CANCELLED"}
         for warning in caught:
             self.report({"WARNING"}, str(warning.message))
-        choices = {name: getattr(self, name) for name in CHOICES}
+        choices = {name: getattr(self, name) for name in CHOICES} | {"fast": context.scene.meshsplats_fast}
         return self.begin(context, CloudWork(cloud, f"{source.name} mesh", frame.up_of(source), choices))
 
     def done(self, context, work):
@@ -120,7 +121,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
-class SetShading(bpy.types.Operator):
+class SetShading(Modal, bpy.types.Operator):
     """Change between unlit and lit; edits since the import are kept"""
 
     bl_idname = "object.meshsplats_shading"
@@ -134,23 +135,29 @@ class SetShading(bpy.types.Operator):
         return context.object is not None and context.object.type == "MESH"
 
     def execute(self, context):
-        from meshsplats.blender.inside import levels, objects
+        from meshsplats.blender.inside import foreign, levels, objects
 
-        lit = self.shading == "lit"
         try:
-            with waiting(context):
-                for obj in levels.with_levels(context.object):
-                    if objects.LIT in obj.data:
-                        objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), lit))
-                        obj.meshsplats.shading = self.shading
-                    else:
-                        objects.dress(obj, lit)
-                        # One click: only these settings show the colours of imports correctly.
-                        objects.render_settings(context.scene, objects.splat_objects(context.scene), lit)
+            chosen = levels.with_levels(context.object)
+            # One click: only these settings show the colours of imports correctly.
+            self._foreign = any(objects.LIT not in obj.data for obj in chosen)
+            meshes = {
+                obj.name: objects.as_splat_mesh(obj) if objects.LIT in obj.data else foreign.splat_mesh(obj)
+                for obj in chosen
+            }
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return {"FINISHED"}
+        fast = self.shading == "lit" and context.scene.meshsplats_fast
+        return self.begin(context, LightWork(meshes, self.shading, fast))
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import objects
+
+        take_over(work)
+        if self._foreign:
+            every = objects.splat_objects(context.scene)
+            objects.render_settings(context.scene, every, self.shading == "lit")
 
 
 class SetUpRender(bpy.types.Operator):
@@ -179,7 +186,7 @@ class SetUpRender(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class SetUpStage(bpy.types.Operator):
+class SetUpStage(Modal, bpy.types.Operator):
     """Set up sun, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
 
     bl_idname = "scene.meshsplats_stage"
@@ -203,25 +210,37 @@ class SetUpStage(bpy.types.Operator):
         default=True,
     )
 
-    def execute(self, context):
-        from meshsplats.blender.inside import objects, setting
+    fast: BoolProperty(
+        name="Fast",
+        description="A preview: rougher light and colours, in a fraction of the time",
+        default=False,
+    )
 
-        every = objects.splat_objects(context.scene)
+    def execute(self, context):
+        from meshsplats.blender.inside import objects
+
+        wanted = {}
         try:
-            with waiting(context):
-                for obj in every if self.make_lit else []:
-                    if not obj.data[objects.LIT]:
-                        objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), True))
-                        obj.meshsplats.shading = "lit"
-                setting.hide_start_scene(context.scene)
-                setting.set_up(context.scene, every, self.lights, camera=self.camera)
+            for obj in objects.splat_objects(context.scene):
+                unlit = not obj.data[objects.LIT]
+                if (unlit and self.make_lit) or objects.needs_light(obj, fast=self.fast):
+                    wanted[obj.name] = objects.as_splat_mesh(obj)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return {"FINISHED"}
+        return self.begin(context, LightWork(wanted, "lit", self.fast))
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import objects, setting
+
+        take_over(work)
+        setting.hide_start_scene(context.scene)
+        with waiting(context):
+            every = objects.splat_objects(context.scene)
+            setting.set_up(context.scene, every, self.lights, camera=self.camera, fast=self.fast)
 
 
-class BakeLight(bpy.types.Operator):
+class BakeLight(Modal, bpy.types.Operator):
     """Gather the light of the scene on its lit splat meshes, which then show it without noise. Do so again
     after lamps, sky or other objects have changed"""
 
@@ -234,30 +253,48 @@ class BakeLight(bpy.types.Operator):
         description="Lamps light the splats in every image, slower and with noise; baked light is dropped",
         default=False,
     )
+    fast: BoolProperty(
+        name="Fast", description="A preview: rougher light, in a fraction of the time", default=False
+    )
+    only_active: BoolProperty(
+        name="Only Active", description="Of the active object, not of all", default=False
+    )
 
     def execute(self, context):
         from meshsplats.blender.inside import baking, objects, stand_ins
 
         stand_ins.remove_strays(context.scene)
         lit = [obj for obj in objects.splat_objects(context.scene) if obj.data[objects.LIT]]
+        if self.only_active:
+            lit = [obj for obj in lit if obj == context.object]
         if not lit:
-            self.report({"ERROR"}, "there is no lit splat mesh in the scene: choose Lit for one first")
+            what = "the active object is no lit splat mesh" if self.only_active else "no splat mesh is lit"
+            self.report({"ERROR"}, f"{what}: choose Lit for it first")
             return {"CANCELLED"}
         if self.live:
             baking.forget(lit)
             return {"FINISHED"}
+        self._names = [obj.name for obj in lit]
+        stale = [obj for obj in lit if objects.needs_light(obj, fast=self.fast)]
         try:
-            with waiting(context):
-                renewed = objects.renew_light(context.scene, lit)
-                count = baking.bake(context.scene, lit)
+            meshes = {obj.name: objects.as_splat_mesh(obj) for obj in stale}
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        return self.begin(context, LightWork(meshes, "lit", self.fast))
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import baking
+        from meshsplats.blender.options import CAREFUL, FAST
+
+        renewed = take_over(work)
+        lit = [obj for name in self._names if (obj := bpy.data.objects.get(name)) is not None]
+        with waiting(context):
+            count = baking.bake(context.scene, lit, samples=(FAST if self.fast else CAREFUL).samples)
         if renewed:
             self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")
         if not count:
             self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
-        return {"FINISHED"}
 
 
 class FollowBase(bpy.types.Operator):
@@ -300,6 +337,14 @@ class ChainOperator:
     chain: StringProperty(
         name="Chain", description="Collection of the levels; that of the active object if left out"
     )
+    where: EnumProperty(
+        name="In",
+        items=[
+            ("both", "Both", "In viewports and images"),
+            ("view", "View", "In viewports"),
+            ("render", "Render", "In images"),
+        ],
+    )
 
     def execute(self, context):
         from meshsplats.blender.inside import levels
@@ -308,7 +353,7 @@ class ChainOperator:
         try:
             if chain is None:
                 raise ValueError(f"no chain of levels of detail {self.chain}".rstrip())
-            levels.show(chain, self.chosen_level(context, chain))
+            levels.show(chain, self.chosen_level(context, chain), self.where)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

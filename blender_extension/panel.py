@@ -3,7 +3,7 @@
 
 import bpy
 
-from .cut_operator import CutSplats
+from .cut_operator import AdjustSplats, CleanSplats, CutSplats
 from .import_operator import ImportMeshSplats
 from .object_operators import (
     BakeLight,
@@ -22,6 +22,10 @@ CHAIN, LEVEL = "meshsplats_levels", "meshsplats_level"
 """Properties of the collections of levels of detail; ``meshsplats.blender.inside.levels`` sets them."""
 
 
+BREAK_SPLATS = {"BOOLEAN", "DECIMATE", "REMESH", "SUBSURF", "MULTIRES", "SOLIDIFY", "BEVEL", "WELD"}
+"""Modifiers that make other triangles."""
+
+
 def light_warning(scene, obj):
     """What is wrong with the baked light of ``obj``, or ''."""
     if not obj.data.get("meshsplats_lit") or obj.get("meshsplats_base") is not None:
@@ -29,10 +33,18 @@ def light_warning(scene, obj):
     from meshsplats.blender.inside import baking, stand_ins
 
     if not stand_ins.is_current(obj, counts_only=True):
-        return "Light is of another shape: Bake Light"
+        return "Light was made for other splats: Bake Light"
     if baking.is_older(scene, obj):
         return "Light is older than the scene: Bake Light"
     return ""
+
+
+def modifier_warning(obj):
+    """Which modifier of the splats ``obj`` leaves no whole ones, or ''."""
+    if "meshsplats_lit" not in obj.data:
+        return ""
+    broken = next((m for m in obj.modifiers if m.type in BREAK_SPLATS and m.show_render), None)
+    return "" if broken is None else f"{broken.name} tears splats to strips: Cut Splats cuts whole ones"
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -56,11 +68,15 @@ class MeshSplatsPanel(bpy.types.Panel):
         layout.separator()
         layout.label(text="Light, ground and camera")
         row = layout.row(align=True)
+        fast = context.scene.meshsplats_fast
         for lights in ("sun", "noon", "overcast", "studio"):
-            row.operator(SetUpStage.bl_idname, text=lights.capitalize()).lights = lights
+            button = row.operator(SetUpStage.bl_idname, text=lights.capitalize())
+            button.lights, button.fast = lights, fast
         row = layout.row(align=True)
-        row.operator(BakeLight.bl_idname, text="Bake Light").live = False
+        button = row.operator(BakeLight.bl_idname, text="Bake Light")
+        button.live, button.fast = False, fast
         row.operator(BakeLight.bl_idname, text="Live Light").live = True
+        layout.prop(context.scene, "meshsplats_fast")
         layout.label(text="Render settings")
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
@@ -69,11 +85,17 @@ class MeshSplatsPanel(bpy.types.Panel):
     def _chain(self, layout, chain):
         box = layout.box()
         box.label(text=chain.name, icon="OUTLINER_COLLECTION")
-        row = box.row(align=True)
-        row.label(text="Show level")
-        for child in sorted((c for c in chain.children if LEVEL in c), key=lambda c: c[LEVEL]):
-            button = row.operator(ShowLevel.bl_idname, text=str(child[LEVEL]), depress=not child.hide_render)
-            button.chain, button.level = chain.name, child[LEVEL]
+        children = sorted((c for c in chain.children if LEVEL in c), key=lambda c: c[LEVEL])
+        for where, text, hidden in (
+            ("view", "Level in view", "hide_viewport"),
+            ("render", "Level in render", "hide_render"),
+        ):
+            row = box.row(align=True)
+            row.label(text=text)
+            for child in children:
+                shown = not getattr(child, hidden)
+                button = row.operator(ShowLevel.bl_idname, text=str(child[LEVEL]), depress=shown)
+                button.chain, button.level, button.where = chain.name, child[LEVEL], where
         box.operator(FitLevel.bl_idname, icon="CAMERA_DATA").chain = chain.name
 
     def _object(self, layout, obj):
@@ -92,14 +114,24 @@ class MeshSplatsPanel(bpy.types.Panel):
                 box.label(text=obj["meshsplats_problem"], icon="ERROR")
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
         if "meshsplats_lit" in obj.data:
-            layout.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
-        warning = light_warning(bpy.context.scene, obj)
-        if warning:
-            layout.label(text=warning, icon="ERROR")
-        layout.label(text="Material of this object")
+            row = layout.row(align=True)
+            row.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
+            crop = row.operator(CutSplats.bl_idname, text="Crop to Box")
+            crop.action, crop.shape, crop.outside = "delete", "box", True
+            row = layout.row(align=True)
+            row.operator(CleanSplats.bl_idname, text="Clean")
+            row.operator(AdjustSplats.bl_idname, text="Adjust Colours")
+        for warning in (light_warning(bpy.context.scene, obj), modifier_warning(obj)):
+            if warning:
+                layout.label(text=warning, icon="ERROR")
+        layout.label(text="Material and light of this object")
         row = layout.row(align=True)
         row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"
         row.operator(SetShading.bl_idname, text="Lit").shading = "lit"
+        if obj.data.get("meshsplats_lit"):
+            for live, text in ((False, "Baked"), (True, "Live")):
+                button = row.operator(BakeLight.bl_idname, text=text)
+                button.live, button.only_active, button.fast = live, True, bpy.context.scene.meshsplats_fast
 
 
 def register():

@@ -103,6 +103,11 @@ class MeshSplatsSource(Choices, bpy.types.PropertyGroup):
 
 
 def register():
+    bpy.types.Scene.meshsplats_fast = BoolProperty(
+        name="Fast Light",
+        description="Prepare light for a preview: rougher, in a fraction of the time",
+        default=False,
+    )
     bpy.utils.register_class(MeshSplatsSource)
     bpy.types.Object.meshsplats = PointerProperty(type=MeshSplatsSource)
 
@@ -110,3 +115,4 @@ def register():
 def unregister():
     del bpy.types.Object.meshsplats
     bpy.utils.unregister_class(MeshSplatsSource)
+    del bpy.types.Scene.meshsplats_fast

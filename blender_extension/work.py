@@ -78,7 +78,7 @@ class Work:
     def _at(self, progress, stage):
         if self._stop.is_set():
             raise Stopped
-        self.progress = progress / len(self.paths)
+        self.progress = progress / max(len(self.paths), 1)
         self.stage = stage
 
     def _one(self, path, index):
@@ -129,8 +129,13 @@ class Work:
         from meshsplats.blender.inside import objects
 
         lit = self.choices["shading"] == "lit"
-        self._at(begin + 0.6 * share, "shading normals" if lit else "counting layers")
-        prepared = objects.prepare(mesh, lit)
+        self._at(begin + 0.6 * share, "counting layers")
+        phases = iter((0.6, 0.7, 0.8, 0.9))
+
+        def announce(phase):  # Escape takes effect between phases
+            self._at(begin + next(phases, 0.9) * share, f"{phase} for light")
+
+        prepared = objects.prepare(mesh, lit, fast=self.choices.get("fast", False), announce=announce)
         self._at(begin + share, "building")
         return prepared
 
@@ -146,6 +151,22 @@ class CloudWork(Work):
         self._at(index, "converting")
         mesh = self._converted(self._cloud, self._up)
         return Result("", path, (self._ready(mesh, index, 1.0),))
+
+
+class LightWork(Work):
+    """Prepares ``meshes``, by the names of their objects, unlit or lit."""
+
+    def __init__(self, meshes, shading, fast=False):
+        import bpy
+
+        from meshsplats.blender.inside import stand_ins
+
+        super().__init__(meshes, {"shading": shading, "fast": fast})
+        self._meshes = meshes
+        self.shapes = {name: stand_ins.shape(bpy.data.objects[name].data) for name in meshes}
+
+    def _one(self, path, index):
+        return Result("", path, (self._ready(self._meshes[path], index, 1.0),))
 
 
 class Modal:
@@ -190,10 +211,14 @@ class Modal:
     def _end(self, context):
         for problem in self._work.problems:
             self.report({"WARNING"} if self._work.results else {"ERROR"}, problem)
-        if not self._work.results:
+        if self._work.paths and not self._work.results:
             self.cancelled()
             return {"CANCELLED"}
-        self.done(context, self._work)
+        try:
+            self.done(context, self._work)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
         return {"FINISHED"}
 
     def cancelled(self):
@@ -237,6 +262,23 @@ def settle(operator, context, objs):
         clash = objects.clash(every, operator.shading == "lit")
         if clash:
             operator.report({"WARNING"}, f"MeshSplats: {clash}")
+
+
+def take_over(work):
+    """Gives the objects that ``work``, a ``LightWork``, was about their new meshes, but for those that were
+    edited or deleted meanwhile. Returns the names of those that got theirs."""
+    import bpy
+
+    from meshsplats.blender.inside import objects, stand_ins
+
+    done = []
+    for result in work.results:
+        obj = bpy.data.objects.get(result.name)
+        if obj is not None and stand_ins.shape(obj.data) == work.shapes[result.name]:
+            objects.replace_mesh(obj, result.prepared[0])
+            obj.meshsplats.shading = work.choices["shading"]
+            done.append(result.name)
+    return done
 
 
 def bpy_background():

@@ -36,6 +36,7 @@ bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True)
 (addon,) = [name for name in list(bpy.context.preferences.addons.keys()) if name.endswith("meshsplats")]
 
+bpy.context.scene.meshsplats_fast = True  # what is lit here may be rough
 report["imported"] = sorted(bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"), shading="lit"))
 import meshsplats  # noqa: E402
 
@@ -145,8 +146,8 @@ model.mkdir(parents=True)
 bpy.ops.import_scene.meshsplats(filepath=str(model / "point_cloud.ply"), at_origin=True)
 chair = bpy.context.object
 report["named"] = [chair.name, list(chair.location)]
-report["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio"))
-bpy.ops.scene.meshsplats_stage(lights="studio")
+report["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio", fast=True))
+bpy.ops.scene.meshsplats_stage(lights="studio", fast=True)
 report["staged"] = sorted(c.name for c in scene.collection.children)
 report["camera"] = scene.camera.name
 report["dressed"] = chair.data.materials[0].name.startswith("Splats, lit")
@@ -206,7 +207,7 @@ report["level_materials"] = [c.objects[0].data.materials[0].name[:13] for c in c
 bpy.context.object.meshsplats.shading = "lit"
 bpy.ops.object.meshsplats_convert_again()
 report["level_materials"] += [c.objects[0].data.materials[0].name[:11] for c in collection.children]
-bpy.ops.scene.meshsplats_stage(lights="sun")  # with a camera that just sees the ball and all else
+bpy.ops.scene.meshsplats_stage(lights="sun", fast=True)  # with a camera that just sees the ball and all else
 scene.render.resolution_x = scene.render.resolution_y = 2000
 bpy.ops.scene.meshsplats_fit_level(chain="chain.001")
 shown()
@@ -381,7 +382,7 @@ def only(*objs):
 
 
 ball.rotation_euler, ball.scale = (0, 0, 0), (1, 1, 1)
-bpy.ops.scene.meshsplats_bake_light()
+bpy.ops.scene.meshsplats_bake_light(fast=True)
 report["light"] = {"baked": warning(scene, ball)}
 lamp = next(o for o in scene.objects if o.type == "LIGHT")
 lamp.data.energy *= 2
@@ -391,13 +392,13 @@ only(ball)
 bpy.ops.object.duplicate()
 copy = bpy.context.object
 report["light"]["duplicated"] = warning(scene, copy)
-bpy.ops.scene.meshsplats_bake_light()
+bpy.ops.scene.meshsplats_bake_light(fast=True)
 report["light"]["own"] = [sorted(c.name for c in o.children) for o in (ball, copy)]
 report["light"]["again"] = warning(scene, copy)
 only(ball, copy)
 bpy.ops.object.join()
 report["light"]["joined"] = warning(scene, ball)
-bpy.ops.scene.meshsplats_bake_light()
+bpy.ops.scene.meshsplats_bake_light(fast=True)
 report["light"]["left"] = [name for name in report["light"]["own"][1] if name in scene.objects]
 report["light"]["shadows"] = ball.visible_shadow
 made = [child.name for child in ball.children]

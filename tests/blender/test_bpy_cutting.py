@@ -19,7 +19,7 @@ from meshsplats.gaussians import GaussianCloud
 def ball():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh = convert(ball_splats(400)[0], mode="flat")
-    obj = objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+    obj = objects.add(objects.prepare(mesh, True, fast=True), "ball", bpy.context.collection)
     obj.location = (5, 0, 1)
     obj.rotation_euler = (0, 0, 0.5)
     obj.scale = (2, 2, 2)
@@ -45,6 +45,7 @@ def world_centers(obj):
     return mesh.splats.sums(corners) / mesh.splats.counts[:, None]
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("shape", ["box", "sphere"])
 def test_what_lies_in_a_region_becomes_an_object_at_its_place(ball, shape):
     before, box = world_centers(ball), region((6.5, 0, 3), 1.6)
@@ -85,5 +86,38 @@ def test_faint_and_large_splats():
     assert chosen(below_opacity=0.5) == [1, 3]
     assert chosen(above_size=0.8) == [2, 3]
     assert chosen(below_opacity=0.5, above_size=0.8) == [3]
+    assert chosen(color=(0.5, 0.5, 0.5), color_distance=0.01) == [0, 1, 2, 3]
+    assert chosen(color=(0.5, 0.5, 0.5 + 0.02), color_distance=0.01) == []
+    found, faces = cutting.chosen_splats(obj, above_size=0.8)
+    cutting.select(obj, faces)
+    assert (obj.mode, obj.data.total_face_sel) == ("EDIT", int(faces.sum()))
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert [p.select for p in obj.data.polygons] == faces.tolist()
+    assert sum(v.select for v in obj.data.vertices) == len(obj.data.vertices) // 2
+    part = cutting.cut(obj, found, faces, separate=True, collection=bpy.context.collection)
+    cutting.hide(part)
+    bpy.context.view_layer.update()
+    assert [part.visible_get(), obj.visible_get()] == [False, True]
+    (home,) = part.users_collection
+    home.hide_viewport = False
+    bpy.context.view_layer.update()
+    assert part.visible_get()
+
+
+def test_splats_of_a_colour_and_floaters():
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    cloud = ball_splats(400)[0]
+    stray = GaussianCloud(
+        [[0.0, 5, 0]], [[1.0, 0, 0, 0]], [[0.05, 0.05, 0.05]], [0.9], np.zeros((1, 1, 3)) + 1.7
+    )
+    mesh = convert(GaussianCloud.joined([cloud, stray]), mode="flat")
+    obj = objects.add(objects.prepare(mesh, False), "ball", bpy.context.collection)
+    bpy.context.view_layer.update()
+    found, faces = cutting.chosen_splats(obj, color=(0.8, 0.2, 0.1), color_distance=0.05)
+    red = cloud.colors[:, 1] < 0.4
+    assert 50 < red.sum() < 200
+    assert sorted(set(found.face_splat[faces].tolist())) == np.flatnonzero(red).tolist()
+    found, faces = cutting.floaters(obj)
+    assert set(found.face_splat[faces].tolist()) == {400}
     with pytest.raises(ValueError, match="region encloses nothing"):
         cutting.chosen_splats(obj, region((0, 0, 0), 0.0))

@@ -165,8 +165,10 @@ def test_a_whole_session(packed, tmp_path):
     assert "has the levels 0 to 1, got 7" in report["level_errors"][0]
     assert "no chain of levels of detail nothing" in report["level_errors"][1]
     assert "cameras.json" in report["level_errors"][2]
-    assert report["panel"][:4] == [["chain.001", None], ["Show level", None], ["0", False], ["1", True]]
-    assert report["panel"][4][0] == "scene.meshsplats_fit_level"
+    levels = [["0", False], ["1", True]]
+    rows = [["Level in view", None], *levels, ["Level in render", None], *levels]
+    assert report["panel"][:7] == [["chain.001", None], *rows]
+    assert report["panel"][7][0] == "scene.meshsplats_fit_level"
     waited = report["waited"]
     assert waited["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["FINISHED"]]
     assert (np.diff(waited["progress"]) >= 0).all()
@@ -186,7 +188,7 @@ def test_a_whole_session(packed, tmp_path):
     light = report["light"]
     assert (light["baked"], light["again"]) == ("", "")
     assert light["lamp"] == "Light is older than the scene: Bake Light"
-    assert light["duplicated"] == light["joined"] == "Light is of another shape: Bake Light"
+    assert light["duplicated"] == light["joined"] == "Light was made for other splats: Bake Light"
     assert [len(names) for names in light["own"]] == [2, 2], "each has a stand-in and light points"
     assert light["left"] == [], "those of the copy are gone"
     assert not light["shadows"], "the stand-in casts them"

@@ -37,7 +37,7 @@ def scene():
 
 def imported(chain, scene, *, lit=False):
     """The chain's collection and its objects, as the extension makes them."""
-    prepared = [objects.prepare(mesh, lit) for mesh in chain.meshes]
+    prepared = [objects.prepare(mesh, lit, fast=True) for mesh in chain.meshes]
     objs = objects.add_chain(prepared, chain.name, chain.screen_sizes, scene.collection)
     return levels.chain_of(objs[0]), objs
 
@@ -70,11 +70,12 @@ def watch(scene, camera):
     return obj
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("light", [None, LightOptions(bounces=0, ground="none")], ids=["unlit", "lit"])
 def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chain, light):
     """Whatever level is shown, the file renders as if it were alone."""
     views = orbit(chain.meshes[0], 1, width=40, height=30)
-    options = SceneOptions(light=light)
+    options = SceneOptions(light=light, fast=light is not None)
     alone = []
     for i, mesh in enumerate(chain.meshes):
         draw(mesh, views, blend=tmp_path / f"{i}.blend", options=options)
@@ -103,6 +104,7 @@ def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chai
     assert any(np.abs(alone[i].astype(int) - alone[i - 1]).max() > 20 for i in (1, 2)), "levels differ"
 
 
+@pytest.mark.slow
 def test_the_command_line_saves_a_chain(tmp_path, chain, capsys):
     folder = tmp_path / "owl"
     folder.mkdir()
@@ -113,7 +115,7 @@ def test_the_command_line_saves_a_chain(tmp_path, chain, capsys):
     (folder / "levels.json").write_text(json.dumps({"levels": rows}))
     for i, source in enumerate((folder, folder / "levels.json")):
         command = ["blender", str(source), "-o", str(tmp_path / f"{i}.blend"), "--json"]
-        assert main([*command, "--lit"] if i else command) == 0
+        assert main([*command, "--fast"] if i else command) == 0
         assert json.loads(capsys.readouterr().out)["triangles"] == len(chain.meshes[0].faces)
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / f"{i}.blend"))
         scene = bpy.context.scene
@@ -129,6 +131,7 @@ def test_the_command_line_saves_a_chain(tmp_path, chain, capsys):
             np.testing.assert_allclose(objects.as_splat_mesh(obj).colors, mesh.colors, atol=1e-5)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("lit", [False, True], ids=["unlit", "lit"])
 def test_imported_levels_stand_in_one_place(chain, scene, lit):
     found, objs = imported(chain, scene, lit=lit)
@@ -145,8 +148,9 @@ def test_imported_levels_stand_in_one_place(chain, scene, lit):
     assert len(levels.chains(scene)) == 2
 
 
+@pytest.mark.slow
 def test_stand_ins_hide_with_their_level_and_each_level_is_baked(chain):
-    options = SceneOptions(light=LightOptions())
+    options = SceneOptions(light=LightOptions(), fast=True)
     subjects = []
     for mesh, size in zip(chain.meshes, SIZES, strict=True):
         arrays, facts = subject.prepare(mesh, [], options, 10)
@@ -198,6 +202,17 @@ def test_selection_passes_to_the_level_that_is_shown(chain, scene):
     with pytest.raises(ValueError, match="has the levels 0 to 2, got 3"):
         levels.show(found, 3)
     assert levels.visible_level(found) == 1
+
+
+def test_view_and_images_may_show_different_levels(chain, scene):
+    found, objs = imported(chain, scene)
+    levels.show(found, 2, "view")
+    assert visible(scene) == ([objs[2].name], [objs[0].name])
+    levels.show(found, 1, "render")
+    assert visible(scene) == ([objs[2].name], [objs[1].name])
+    assert [levels.visible_level(found, where) for where in ("view", "render")] == [2, 1]
+    levels.show(found, 0)
+    assert visible(scene) == ([objs[0].name], [objs[0].name])
 
 
 def test_layers_of_levels_do_not_add_up(chain, scene):

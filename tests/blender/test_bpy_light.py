@@ -54,6 +54,7 @@ def test_even_light_shows_the_unlit_image(ball, tmp_path):
     assert np.abs(light_of(made.obj) - 1).max() < 0.03, "nothing shades a ball"
 
 
+@pytest.mark.slow
 def test_the_image_of_the_splats_has_no_noise(ball, tmp_path):
     mesh, view = ball
     made = built(mesh, view, LightOptions(ground="none"))
@@ -74,6 +75,7 @@ def test_the_image_of_the_splats_has_no_noise(ball, tmp_path):
     assert np.mean(live)[None] == pytest.approx(np.mean(images), rel=0.08)
 
 
+@pytest.mark.slow
 def test_lamps_and_other_objects_light_and_shade_the_splats(ball):
     mesh, view = ball
     made = built(mesh, view, LightOptions(sun=(0, 89), sky=0, ground="none"))
@@ -111,7 +113,7 @@ def test_the_unlit_mesh_comes_back_unchanged(ball):
 
 def lit_ball(mesh):
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    return objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+    return objects.add(objects.prepare(mesh, True, fast=True), "ball", bpy.context.collection)
 
 
 def test_painted_colours_of_a_lit_mesh_are_kept(ball):

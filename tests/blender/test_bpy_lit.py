@@ -69,6 +69,7 @@ def test_splats_look_like_the_surface_they_were_taken_from(ball):
     assert 0.95 < splats[inside].mean() / solid[inside].mean() < 1.03
 
 
+@pytest.mark.slow
 def test_layers_do_not_speckle_or_mottle(ball):
     """Away from edges, neighbouring pixels differ as little as on the smooth surface, but for the noise."""
     splats, solid, _, covered = ball
@@ -94,6 +95,7 @@ def test_shadow_falls_where_the_surface_throws_it(ball):
     assert (dark[0] & dark[1]).sum() / (dark[0] | dark[1]).sum() > 0.9
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("tilt", [10, 60, 85])
 @pytest.mark.parametrize("side", [-60, 60])
 def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):

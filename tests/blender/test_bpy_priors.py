@@ -37,7 +37,9 @@ def placed(request):
     """The splats' object, that of its base, and the prior they were made from."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh = prior_mesh()
-    obj = objects.add(objects.prepare(mesh, request.param), "prior", bpy.context.collection)
+    obj = objects.add(
+        objects.prepare(mesh, request.param, fast=request.param), "prior", bpy.context.collection
+    )
     return obj, priors.base_of(obj), MeshPrior(mesh)
 
 

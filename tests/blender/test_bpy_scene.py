@@ -26,6 +26,7 @@ from meshsplats import (
 )
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import meshes, rendering
+from meshsplats.blender.plan import PHASES
 from meshsplats.cli import main
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.gaussians import GaussianCloud
@@ -66,7 +67,7 @@ def test_lit_file_has_everything_in_named_collections(tmp_path):
         convert(cloud),
         cameras()[:1],
         blend=tmp_path / "s.blend",
-        options=SceneOptions(light=light, samples=5),
+        options=SceneOptions(light=light, samples=5, fast=True),
     )
     (tmp_path / "sky.hdr").unlink()  # it is in the file
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
@@ -95,10 +96,11 @@ def test_what_takes_long_before_a_lit_image_is_named(tmp_path):
         convert(ball_splats(200)[0]),
         cameras()[:1],
         blend=tmp_path / "s.blend",
-        options=SceneOptions(light=LightOptions(), samples=1),
-        progress=lambda at: told.append(at.phase),
+        options=SceneOptions(light=LightOptions(), samples=1, fast=True),
+        progress=lambda at: told.append((at.phase, at.left)),
     )
-    assert told == ["surface and colours for light", "building the scene", "gathering light"]
+    assert [phase for phase, _ in told] == list(PHASES)
+    assert all(left.endswith((" s", " min")) for _, left in told)
 
 
 def test_mesh_arrays_arrive_as_they_are():

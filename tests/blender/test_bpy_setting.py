@@ -30,7 +30,7 @@ def empty():
 
 def ball():
     mesh = convert(ball_splats(600)[0], mode="flat")
-    return objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+    return objects.add(objects.prepare(mesh, True, fast=True), "ball", bpy.context.collection)
 
 
 def corners(obj):
@@ -52,19 +52,20 @@ def test_the_origin_lies_under_the_subject(empty):
     again = objects.as_splat_mesh(obj)
     np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-5)
     obj.location = (5, 6, 7)
-    objects.replace_mesh(obj, objects.prepare(again, True))
+    objects.replace_mesh(obj, objects.prepare(again, True, fast=True))
     bpy.context.view_layer.update()
     assert tuple(obj.location) == (5, 6, 7)
     np.testing.assert_allclose(corners(obj)[:, 2].min(), 7, atol=0.12)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("lights", LIGHTS)
 def test_one_click_sets_everything_up(empty, lights):
     obj = ball()
     obj.location = (10, -3, 2)
     bpy.context.view_layer.update()
     for _ in range(2):  # a second click replaces what the first made
-        setting.set_up(empty, [obj], lights)
+        setting.set_up(empty, [obj], lights, fast=True)
     names = sorted(o.name for o in empty.objects)
     lamps = {"sun": ["Sun"], "noon": ["Sun"], "overcast": [], "studio": ["Fill", "Sun"]}[lights]
     assert names == sorted(["ball", "ball light points", "ball stand-in", "Camera", "Ground", *lamps])
@@ -97,24 +98,26 @@ def plate(value: float) -> tuple[SplatMesh, object]:
     return mesh, look_at((0, -1.4, -5), (0, -0.9, 0), width=48, height=36)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("lights", LIGHTS)
 def test_white_looks_white(tmp_path, lights):
     """A white plate (display value 0.95) under each named light, shown by the default exposure."""
     mesh, camera = plate(0.95)
-    options = SceneOptions(light=LIGHTS[lights], samples=32, denoise=True)
+    options = SceneOptions(light=LIGHTS[lights], samples=32, denoise=True, fast=lights != "sun")
     draw(mesh, [camera], images=[tmp_path / "a.png"], options=options)
     image = load_image(tmp_path / "a.png")
     middle = image[14:22, 20:28].mean()
     assert 0.88 * 255 < middle < 254, middle
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.2, 0.3, 0.5)])
 def test_the_ground_fades_into_the_background(tmp_path, background):
     """No hard horizon: from the ground's colour to the background's it takes many rows, in small steps."""
     mesh, _ = plate(0.5)
     small = SplatMesh(mesh.vertices * 0.3, mesh.faces, mesh.colors, normals=mesh.normals)
     camera = look_at((0, -0.5, -3), (-0.7, -0.3, 0), width=24, height=240, fov=6.6)  # 60 degrees high
-    options = SceneOptions(light=LightOptions(), samples=32, background=background, denoise=True)
+    options = SceneOptions(light=LightOptions(), samples=32, background=background, denoise=True, fast=True)
     draw(small, [camera], images=[tmp_path / "a.png"], options=options)
     column = load_image(tmp_path / "a.png").mean(axis=(1, 2))
     np.testing.assert_allclose(column[0], 255 * np.mean(background), atol=2)
@@ -129,7 +132,7 @@ def test_values_of_light_do_not_change_with_exposure(tmp_path):
     mesh, camera = plate(0.5)
     values = []
     for exposure in (0.0, 2.0):
-        options = SceneOptions(light=LightOptions(exposure=exposure), samples=4)
+        options = SceneOptions(light=LightOptions(exposure=exposure), samples=4, fast=True)
         draw(mesh, [camera], images=[tmp_path / "a.exr"], options=options)
         values.append(rendering.read_pixels(tmp_path / "a.exr"))
     np.testing.assert_array_equal(*values)

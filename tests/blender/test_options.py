@@ -21,6 +21,7 @@ from meshsplats.blender.options import LIGHTS, check_environment
         (SceneOptions(threads=0), "threads"),
         (SceneOptions(denoise=True), "denoise is for lit"),
         (SceneOptions(light=LightOptions(), denoise=True, engine="eevee"), "denoise is for lit"),
+        (SceneOptions(fast=True), "fast is for lit images"),
         (SceneOptions(light=LightOptions(sun=(0, 91))), "elevation of -90 to 90"),
         (SceneOptions(light=LightOptions(sun=(float("nan"), 1))), "azimuth"),
         (SceneOptions(light=LightOptions(sun_strength=-1)), "sun_strength must be a number from 0 to"),
@@ -90,6 +91,36 @@ def test_the_estimate(layers, options, seconds):
     assert estimated_seconds(ahead, options) == (None if seconds is None else pytest.approx(seconds))
 
 
+def test_time_left_follows_the_estimate_and_then_the_clock():
+    from meshsplats.blender.launch import Progress
+    from meshsplats.blender.plan import PHASES, Schedule, estimated_seconds, phase_seconds
+
+    ahead = {"mean_layers": 10, "mean_square_layers": 100, "samples": 16, "pixels": 10**6, "triangles": 10**6}
+    options = SceneOptions(light=LightOptions(), samples=16, threads=2)
+    seconds, whole = phase_seconds(ahead, options), estimated_seconds(ahead, options)
+    assert list(seconds) == list(PHASES)
+    assert sum(phase_seconds(ahead, replace(options, fast=True)).values()) < sum(seconds.values()) / 2
+    now = [0.0]
+    schedule = Schedule(ahead, options, lambda: now[0])
+
+    def left(stage, done=0, share=0.0, images=4):
+        text = schedule.with_time(Progress(done, images, share, stage, None)).left
+        return None if text is None else float(text.split()[0]) * (60 if "min" in text else 1)
+
+    assert left("colours") == pytest.approx(whole, rel=0.1)
+    now[0] = 5.0
+    assert left("colours") == pytest.approx(whole - 5, rel=0.1)
+    now[0] = 3 * seconds["colours"]  # six times as long as two threads should take
+    rest = 2 * whole - seconds["colours"]
+    assert left("normals") == pytest.approx(3 * rest, rel=0.1)
+    assert left("colours") is None, "again, for a coarser level: not estimated"
+    assert left("Sample 3/16") is None, "nothing is known of images yet"
+    now[0] += 30
+    assert left("Sample 8/16", 1, 0.5) == pytest.approx(30 / 1.5 * 2.5, abs=5)
+    alone = Progress(0, 1, 0.5, "Sample 8/16", "00:12")
+    assert schedule.with_time(alone) == alone, "Blender's own words"
+
+
 def test_a_named_light_lights():
     from meshsplats.cli.blender import Blender
 
@@ -97,13 +128,15 @@ def test_a_named_light_lights():
     assert Blender(None, None, lights="noon").is_lit
     assert Blender(None, None, lights="noon").named_light() == LIGHTS["noon"]
     assert Blender(None, None, lit=True).named_light() == LIGHTS["sun"]
+    assert Blender(None, None, fast=True).is_lit
 
 
 def test_phases_are_told_at_once(capsys):
     from meshsplats.blender.launch import Progress
-    from meshsplats.cli.blender import _Lines
+    from meshsplats.blender.plan import Lines
+    from meshsplats.cli.messages import say
 
-    show = _Lines()
-    for stage in ("gathering light", "gathering light", "Sample 3/16", "Updating Geometry"):
-        show(Progress(0, 1, 0.0, stage, None))
-    assert capsys.readouterr().err.splitlines() == ["meshsplats: Blender: gathering light"]
+    show = Lines(say)
+    for stage in ("light", "light", "Sample 3/16", "Updating Geometry"):
+        show(Progress(0, 1, 0.0, stage, "20 s"))
+    assert capsys.readouterr().err.splitlines() == ["meshsplats: Blender: light, 20 s left"]

@@ -9,6 +9,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from meshsplats.blender.launch import BlenderError, Progress
+    from meshsplats.blender.plan import Schedule
 
 __all__ = [
     "BlenderError",
@@ -87,7 +89,7 @@ def draw(
 
     Warns with a DataWarning if more layers lie behind each other than Blender can follow (1024).
     """
-    from meshsplats.blender import launch, subject
+    from meshsplats.blender import launch, plan, subject
 
     options = options or SceneOptions()
     options.check()
@@ -113,25 +115,31 @@ def draw(
     cameras = [camera.with_near_plane(finest.vertices) for camera in cameras]
     if layers > MAX_LAYERS:
         _warn(meshes[counted.index((layers, limit))], cameras, layers, options)
-    if announce is not None:
+    tell: Callable[[Progress], object] | None = None
+    if announce is not None or progress is not None:
         samples = options.samples if options.light is not None else options.samples**2
         mean, mean_square = subject.layer_means(finest, cameras, options.threads)
-        announce(
-            {
-                "triangles": len(finest.faces),
-                "layers": layers,
-                "bounce_limit": limit,
-                "samples": samples,
-                "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
-                "mean_layers": mean,
-                "mean_square_layers": mean_square,
-            }
-        )
-    if progress is not None and options.light is not None:
-        progress(launch.Progress(0, len(targets), 0.0, "surface and colours for light", None))
+        ahead = {
+            "triangles": len(finest.faces),
+            "layers": layers,
+            "bounce_limit": limit,
+            "samples": samples,
+            "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
+            "mean_layers": mean,
+            "mean_square_layers": mean_square,
+        }
+        if announce is not None:
+            announce(ahead)
+        if progress is not None:
+            tell = partial(_tell, plan.Schedule(ahead, options), progress)
+
+    def begin(phase: str) -> None:
+        if tell is not None:
+            tell(launch.Progress(0, len(targets), 0.0, phase, None))
+
     subjects = []
     for level, size in zip(meshes, chain.screen_sizes, strict=True):
-        arrays, facts = subject.prepare(level, cameras, options, layers)
+        arrays, facts = subject.prepare(level, cameras, options, layers, begin)
         subjects.append((arrays, facts | {"name": chain.name, "screen_size": size}))
     result = launch.run_job(
         subjects,
@@ -141,9 +149,13 @@ def draw(
         images=targets,
         blend=None if blend is None else Path(blend),
         executable=None if executable is None else Path(executable),
-        progress=progress,
+        progress=tell,
     )
     return result | {"layers": layers, "bounce_limit": limit}
+
+
+def _tell(schedule: Schedule, progress: Callable[[Progress], object], at: Progress) -> None:
+    progress(schedule.with_time(at))
 
 
 def _without_filter(mesh: SplatMesh, cameras: Sequence[Camera]) -> SplatMesh:

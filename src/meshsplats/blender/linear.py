@@ -23,7 +23,7 @@ from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 
 STEPS = 72
-_VIEWS = 24
+VIEWS = 24
 _SIDE = 200
 """Side in pixels of the images around the scene."""
 _CAMERA_SIDE = 480
@@ -44,13 +44,15 @@ def linear_colors(
     cameras: Sequence[Camera] = (),
     *,
     steps: int = STEPS,
+    views: int = VIEWS,
     threads: int | None = None,
 ) -> np.ndarray:
     """(v, 4) float32 RGBA of ``mesh`` for blending in linear light.
 
     Minimises the squared difference of display values over images from around the scene and from ``cameras``,
     before white, black and grey. All vertices of a splat share a factor and an exponent; without
-    ``face_splat`` each vertex has its own. A mesh with ``blending='linear'`` keeps its colours.
+    ``face_splat`` each vertex has its own. A mesh with ``blending='linear'`` keeps its colours. ``views``
+    are around the scene; each of the ``steps`` sees one image.
     """
     if mesh.blending == "linear":
         return mesh.colors
@@ -63,15 +65,15 @@ def linear_colors(
     adam = RowAdam(values, lr=_RATE, betas=(0.5, 0.9), bounds=(-_LIMIT, _LIMIT), eps=1e-12, threads=threads)
     clear = np.log1p(-np.minimum(plain[:, 3], np.float32(0.9999)))
     unmoved = np.zeros_like(mesh.vertices)
-    around, near = _views(mesh, cameras)
-    views, given = around + near, {id(camera) for camera in near}
+    around, near = _views(mesh, cameras, views)
+    seen_from, given = around + near, {id(camera) for camera in near}
     rng = np.random.default_rng(0)
     order: list[int] = []
     targets: dict[int, Rendering] = {}
     for step in range(steps):
         if not order:
-            order = rng.permutation(len(views)).tolist()
-        camera = views[order.pop()]
+            order = rng.permutation(len(seen_from)).tolist()
+        camera = seen_from[order.pop()]
         background = _BACKGROUNDS[step % 3]
         colors, exponent = _with(plain, clear, values, owner)
         samples = 2 if id(camera) in given and 2 * max(camera.width, camera.height) <= _CAMERA_SIDE else 1
@@ -108,7 +110,7 @@ def _with(
     return colors, factors[:, 3]
 
 
-def _views(mesh: SplatMesh, cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
-    """Cameras around ``mesh``, and as many of the given ones, some of them repeated."""
-    given = [camera.within(_CAMERA_SIDE) for camera in subsample(cameras or (), _VIEWS)]
-    return views_around(mesh, _VIEWS, _SIDE), given * (max(1, _VIEWS // len(given)) if given else 0)
+def _views(mesh: SplatMesh, cameras: Sequence[Camera], count: int) -> tuple[list[Camera], list[Camera]]:
+    """``count`` cameras around ``mesh``, and as many of the given ones, some of them repeated."""
+    given = [camera.within(_CAMERA_SIDE) for camera in subsample(cameras or (), count)]
+    return views_around(mesh, count, _SIDE), given * (max(1, count // len(given)) if given else 0)

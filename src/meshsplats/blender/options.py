@@ -97,6 +97,31 @@ lamp on the left, a weaker one on the right."""
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much is done for light before the first lit image."""
+
+    steps: int = 72
+    """Of the fit of colours to linear light."""
+    fit_views: int = 24
+    """Views around the scene that this fit sees."""
+    normal_views: int = 24
+    """Views that tell on which side of a surface a splat is."""
+    surface_views: int = 40
+    """Depth images of which the surface is made that stands in for the splats."""
+    resolution: int = 96
+    """Voxels along the longest side of that surface."""
+    samples: int = 12
+    """Samples at each corner of the points at which light is gathered."""
+
+
+CAREFUL = Effort()
+FAST = Effort(steps=12, fit_views=4, normal_views=12, surface_views=16, resolution=48, samples=4)
+"""For previews: see docs/blender.md for what it costs and loses."""
+FAST_SPLATS, FAST_SAMPLES = 30_000, 4
+"""What the command's previews have by default."""
+
+
+@dataclass(frozen=True)
 class SceneOptions:
     """How Blender renders the mesh."""
 
@@ -112,6 +137,12 @@ class SceneOptions:
     """Cycles, lit: remove noise with OpenImageDenoise."""
     threads: Annotated[int | None, Range(1, math.inf)] = None
     """At most this many; default: all processors."""
+    fast: bool = False
+    """Lit: a rougher surface, colours and light, for a preview."""
+
+    @property
+    def effort(self) -> Effort:
+        return FAST if self.fast else CAREFUL
 
     def check(self) -> None:
         """Raises ValueError for values out of range and choices that contradict each other."""
@@ -122,6 +153,8 @@ class SceneOptions:
             raise ValueError(f"background must be RGB in [0, 1], got {self.background}")
         if self.denoise and (self.light is None or self.engine != "cycles"):
             raise ValueError("denoise is for lit images in Cycles: others have no noise, or another kind")
+        if self.fast and self.light is None:
+            raise ValueError("fast is for lit images: unlit ones need no preparation")
         if self.light is not None:
             self.light.check()
             if self.engine == "eevee" and self.light.ground == "catcher":

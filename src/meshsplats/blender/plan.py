@@ -1,10 +1,26 @@
-"""The work ahead of Blender, in words, with an estimate of the time."""
+"""The work ahead of Blender and where it is, in words, with estimates of the time."""
 
 from __future__ import annotations
 
-from typing import Any
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from meshsplats.blender.options import SceneOptions
+
+if TYPE_CHECKING:
+    from meshsplats.blender.launch import Progress
+
+PHASES = {
+    "colours": (2.0, 20.0, 0.2),
+    "normals": (0.5, 5.0, 0.7),
+    "surface": (3.0, 6.0, 0.3),
+    "building the scene": (0.5, 1.0, 1.0),
+    "light": (2.0, 3.0, 0.2),
+}
+"""What comes before the first lit image: processor seconds, those for each million triangles, and the share
+of both that a fast preview takes."""
 
 
 def in_words(ahead: dict[str, Any], options: SceneOptions, images: int) -> str:
@@ -16,7 +32,7 @@ def in_words(ahead: dict[str, Any], options: SceneOptions, images: int) -> str:
     text += f" ({ahead['mean_layers']:.0f} on average), {samples} sample{'s'[: samples > 1]} per pixel"
     text += ", denoised" if options.denoise else ""
     seconds = estimated_seconds(ahead, options)
-    return text + ("" if seconds is None else f"; about {_duration(seconds)} on {_processors(options)}")
+    return text + ("" if seconds is None else f"; about {duration(seconds)} on {_processors(options)}")
 
 
 def _processors(options: SceneOptions) -> str:
@@ -26,7 +42,7 @@ def _processors(options: SceneOptions) -> str:
     return f"{count} thread{'s'[: count > 1]}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """In words, no more exact than an estimate."""
     if seconds < 90:
         return f"{max(5, 5 * round(seconds / 5))} s"
@@ -47,6 +63,78 @@ def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | N
     ray = 1.1e-6 * ahead["mean_layers"] + 8.3e-9 * ahead["mean_square_layers"] + (1e-6 if lit else 0)
     pixel = ray * ahead["samples"] + (20e-6 if options.denoise else 0)
     busy = pixel * ahead["pixels"] + 1e-6 * ahead["triangles"]
-    if lit:
-        busy += 8 + 35e-6 * ahead["triangles"]
-    return busy / (options.threads or processors())
+    return (busy + sum(phase_seconds(ahead, options).values())) / (options.threads or processors())
+
+
+def phase_seconds(ahead: dict[str, Any], options: SceneOptions) -> dict[str, float]:
+    """Estimated processor seconds of each phase before the first image."""
+    if options.light is None:
+        return {}
+    millions = 1e-6 * ahead["triangles"]
+    return {
+        name: (fixed + each * millions) * (share if options.fast else 1)
+        for name, (fixed, each, share) in PHASES.items()
+    }
+
+
+class Schedule:
+    """Says how much time is left, from the estimates and from how long what is done has taken."""
+
+    def __init__(
+        self, ahead: dict[str, Any], options: SceneOptions, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        from meshsplats._core.library import processors
+
+        self._clock = clock
+        self._start = self._began = clock()
+        self._at = -1
+        self._images_from: float | None = None
+        self._phases = phase_seconds(ahead, options)
+        self._threads = options.threads or processors()
+        whole = estimated_seconds(ahead, options)
+        # Images in EEVEE are not estimated.
+        self._images = 0.0 if whole is None else whole * self._threads - sum(self._phases.values())
+
+    def with_time(self, at: Progress) -> Progress:
+        """``at``, with the time that is left of all."""
+        now = self._clock()
+        if at.phase in self._phases:
+            here = list(self._phases).index(at.phase)
+            if here < self._at:  # again, for a coarser level of a chain
+                return at
+            if here > self._at:
+                self._at, self._began = here, now
+            seconds = list(self._phases.values())
+            done = sum(seconds[:here])
+            pace = (self._began - self._start) / done if done else 1 / self._threads
+            left = pace * (sum(seconds[here:]) + self._images) - (now - self._began)
+            return replace(at, left=duration(max(left, 0.0)))
+        if at.phase or at.images < 2:
+            return at
+        if self._images_from is None:
+            self._images_from = now
+        done = at.done + at.share
+        if not at.done:
+            return at
+        return replace(at, left=duration((now - self._images_from) / done * (at.images - done)))
+
+
+def where(at: Progress) -> str:
+    """``at`` in words."""
+    which = f"image {min(at.done + 1, at.images)} of {at.images}" if at.images > 1 else ""
+    left = f"{at.left} left" if at.left else ""
+    return ", ".join(filter(None, [which if not at.phase else "", at.stage, left]))
+
+
+class Lines:
+    """Says where the work is: each phase as it begins, and else every ``every`` seconds."""
+
+    def __init__(self, say: Callable[[str], object], every: float = 10.0) -> None:
+        self._say, self._every = say, every
+        self._next, self._phase = time.monotonic() + every, ""
+
+    def __call__(self, at: Progress) -> None:
+        if at.stage and (time.monotonic() >= self._next or (at.phase and at.phase != self._phase)):
+            self._phase = at.phase
+            self._next = time.monotonic() + self._every
+            self._say(f"Blender: {where(at)}")

@@ -26,8 +26,8 @@ from meshsplats.surfaces.fusion import MIN_PART, grid_around, signed_distances
 RESOLUTION = 96
 """Voxels along the longest side of the surface's grid."""
 VIEWS = 40
-_SIDE = 288
-"""Side in pixels of the depth images."""
+SIDE = 3
+"""Side in pixels of the depth images, in voxels of the longest side."""
 _BEHIND = 0.7
 """Weight of distances behind a surface: sheets without thickness count as thin parts."""
 _NEAR = 2
@@ -77,6 +77,7 @@ def stand_in(
     cameras: Sequence[Camera] = (),
     *,
     resolution: int = RESOLUTION,
+    views: int = VIEWS,
     threads: int | None = None,
 ) -> StandIn | None:
     """The stand-in of ``mesh``; None where its images show nothing solid.
@@ -86,12 +87,13 @@ def stand_in(
         colors: (v, 4) RGBA, linear light.
         cameras: they see the scene, besides those around it: a room is visible from inside only.
         resolution: voxels along the longest side.
+        views: depth images from around the scene.
     """
     try:
         grid = grid_around(mesh, resolution)
     except ValueError:  # no extent
         return None
-    placed = views_around(mesh, VIEWS, _SIDE, cameras, 8)
+    placed = views_around(mesh, views, SIDE * resolution, cameras, 8)
     field = signed_distances(mesh, placed, grid, behind=_BEHIND, threads=threads)
     vertices, faces, cells = surface_net(field)
     if not len(faces):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
-from meshsplats.blender.options import MAX_LAYERS, SceneOptions
+from meshsplats.blender.options import CAREFUL, MAX_LAYERS, Effort, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.conversion.normals import shading_normals, typical_spacing
@@ -51,8 +51,16 @@ def layer_means(
     return float(np.mean([c.mean() for c in counts])), float(np.mean([(c**2).mean() for c in counts]))
 
 
+Announce = Callable[[str], object]
+"""Is told the name of each phase, of ``plan.PHASES``, as it begins."""
+
+
 def prepare(
-    mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions, layers: int
+    mesh: SplatMesh,
+    cameras: Sequence[Camera],
+    options: SceneOptions,
+    layers: int,
+    announce: Announce = lambda phase: None,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and facts, the fields of ``inside.scene.Subject``; ``layers`` as from ``count``."""
     mesh = mesh if options.light is None else mesh.plain
@@ -78,7 +86,9 @@ def prepare(
     if (harmonics := vertex_harmonics(mesh)) is not None:
         arrays["harmonics"] = harmonics
     if options.light is not None:
-        lit, of_light = lit_subject(mesh, cameras, threads=options.threads)
+        lit, of_light = lit_subject(
+            mesh, cameras, effort=options.effort, threads=options.threads, announce=announce
+        )
         if "light_points" in lit:
             points, normals = lit["light_points"] @ up, lit["light_normals"] @ up
             facts["floor"] = ground_height(facts["floor"], points, normals, of_light["light_spacing"])
@@ -116,21 +126,32 @@ def ground_height(floor: float, heights: np.ndarray, upward: np.ndarray, size: f
 
 
 def lit_subject(
-    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
+    mesh: SplatMesh,
+    cameras: Sequence[Camera] = (),
+    *,
+    effort: Effort = CAREFUL,
+    threads: int | None = None,
+    announce: Announce = lambda phase: None,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Arrays and facts that a lit mesh has besides or instead of those of an unlit one, by the names of
     ``inside.scene.Subject``. A mesh prior, whose shape changes, has no stand-in."""
     mesh = mesh.plain
-    lit, self_shadow = lit_arrays(mesh, cameras, threads=threads)
+    lit, self_shadow = lit_arrays(mesh, cameras, effort=effort, threads=threads, announce=announce)
     arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
     if mesh.binding is None:
-        made, facts["light_spacing"] = _stand_in_arrays(mesh, lit, cameras, threads=threads)
+        announce("surface")
+        made, facts["light_spacing"] = _stand_in_arrays(mesh, lit, cameras, effort, threads)
         arrays |= made
     return arrays, facts
 
 
 def lit_arrays(
-    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
+    mesh: SplatMesh,
+    cameras: Sequence[Camera] = (),
+    *,
+    effort: Effort = CAREFUL,
+    threads: int | None = None,
+    announce: Announce = lambda phase: None,
 ) -> tuple[dict[str, np.ndarray], float]:
     """Arrays for a lit material and its self-shadow distance.
 
@@ -140,8 +161,10 @@ def lit_arrays(
     """
     from meshsplats.blender.linear import linear_colors
 
-    colors = linear_colors(mesh, cameras, threads=threads)
-    normals = shading_normals(mesh, cameras, threads=threads)
+    announce("colours")
+    colors = linear_colors(mesh, cameras, steps=effort.steps, views=effort.fit_views, threads=threads)
+    announce("normals")
+    normals = shading_normals(mesh, cameras, views=effort.normal_views, threads=threads)
     arrays = {"colors": colors, "normals": normals, "faces": _facing_out(mesh, normals)}
     return arrays, SELF_SHADOW * typical_spacing(mesh)
 
@@ -149,15 +172,23 @@ def lit_arrays(
 def _stand_in_arrays(
     mesh: SplatMesh,
     lit: dict[str, np.ndarray],
-    cameras: Sequence[Camera] = (),
-    *,
-    threads: int | None = None,
+    cameras: Sequence[Camera],
+    effort: Effort,
+    threads: int | None,
 ) -> tuple[dict[str, np.ndarray], float]:
     """The stand-in of ``mesh`` by the names that ``inside.scene.Subject`` has for its arrays, and the
     distance of its points, scene units; ``lit`` as from ``lit_arrays``. Empty where nothing is solid."""
     from meshsplats.blender.stand_in import stand_in
 
-    found = stand_in(mesh, lit["normals"], lit["colors"], cameras, threads=threads)
+    found = stand_in(
+        mesh,
+        lit["normals"],
+        lit["colors"],
+        cameras,
+        resolution=effort.resolution,
+        views=effort.surface_views,
+        threads=threads,
+    )
     if found is None:
         return {}, 0.0
     return {

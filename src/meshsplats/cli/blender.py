@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
-from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
-from meshsplats.blender.plan import in_words
+from meshsplats.blender.options import FAST_SAMPLES, FAST_SPLATS, LIGHTS, LightOptions, SceneOptions
+from meshsplats.blender.plan import Lines, in_words, where
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 LIT_SAMPLES = 16
 """Default number of samples per pixel of lit images."""
-_EVERY = 10.0
-"""Seconds between lines of progress, if standard error is no terminal."""
 _TILE_TRIANGLES = 2_000_000
 """Triangles that Blender gets of a tileset: about 700 MB."""
 _FORMATS = (".png", ".exr", ".blend")
@@ -82,7 +80,7 @@ class Blender(Command):
     """
 
     COMMON = (
-        *("input", "output", "lit", "lights", "hdri", "mirror", "glass"),
+        *("input", "output", "lit", "lights", "fast", "hdri", "mirror", "glass"),
         *("engine", "samples", "orbit", "cameras", "azimuth", "elevation", "distance"),
         *("width", "background", "transparent", "executable", "json", "force"),
     )
@@ -106,6 +104,8 @@ class Blender(Command):
     ] = None
     """Light the splats (--lit) by an afternoon sun, the default, a high sun in a clear sky, clouds, or two
     large lamps. The options under "light" change them."""
+    fast: bool = False
+    """A lit preview in seconds (--lit): at most 30,000 splats, 4 samples, rougher light and colours."""
     light: LightArguments = field(default_factory=LightArguments)
     background: str = "white"
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
@@ -223,7 +223,8 @@ class Blender(Command):
             raise UsageError("--background has no effect with --hdri, which is the background")
         samples = self.samples
         if samples is None:
-            samples = LIT_SAMPLES if self.is_lit else 1 if suffix == ".blend" else 2
+            lit = FAST_SAMPLES if self.fast else LIT_SAMPLES
+            samples = lit if self.is_lit else 1 if suffix == ".blend" else 2
         elif suffix == ".blend" and not self.is_lit and samples > 1:
             raise UsageError("--samples: an unlit .blend takes one sample per pixel; render it larger")
         options = SceneOptions(
@@ -233,6 +234,7 @@ class Blender(Command):
             background=None if self.transparent else parse_color(self.background),
             denoise=self.is_lit and self.engine == "cycles" and not self.no_denoise,
             threads=self.threads,
+            fast=self.fast,
         )
         options.check()
         return options
@@ -242,7 +244,7 @@ class Blender(Command):
 
     @property
     def is_lit(self) -> bool:
-        return self.lit or self.lights is not None
+        return self.lit or self.fast or self.lights is not None
 
     def _converted(self, scene: GaussianCloud | SplatMesh) -> SplatMesh:
         if isinstance(scene, SplatMesh):
@@ -253,7 +255,7 @@ class Blender(Command):
 
         # Crossed ellipses stand upright on the surface, where they catch too little light.
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
-        return convert(scene, max_splats=self.max_splats, mode=mode)
+        return convert(scene, max_splats=self.max_splats or (FAST_SPLATS if self.fast else None), mode=mode)
 
     def named_light(self) -> LightOptions:
         """The light of --lights, changed by the options."""
@@ -305,7 +307,7 @@ def _progress_display(total: int) -> Iterator[Callable[[Progress], object]]:
     """A function that shows the progress of Blender: as a bar where stderr is a terminal, else in a line now
     and then."""
     if not sys.stderr.isatty():
-        yield _Lines()
+        yield Lines(say)
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn
@@ -314,21 +316,4 @@ def _progress_display(total: int) -> Iterator[Callable[[Progress], object]]:
     columns = (TextColumn("Blender"), BarColumn(), TextColumn("{task.fields[text]}"))
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=max(total, 1), text="starts")
-        yield lambda at: bar.update(task, completed=at.done + at.share, text=_words(at))
-
-
-class _Lines:
-    def __init__(self) -> None:
-        self._next, self._phase = time.monotonic() + _EVERY, ""
-
-    def __call__(self, at: Progress) -> None:
-        if at.stage and (time.monotonic() >= self._next or (at.phase and at.phase != self._phase)):
-            self._phase = at.phase
-            self._next = time.monotonic() + _EVERY
-            say(f"Blender: {_words(at)}")
-
-
-def _words(at: Progress) -> str:
-    which = f"image {min(at.done + 1, at.images)} of {at.images}" if at.images > 1 else ""
-    left = f"{at.left} left" if at.left else ""
-    return ", ".join(filter(None, [which, at.stage, left]))
+        yield lambda at: bar.update(task, completed=at.done + at.share, text=where(at))

@@ -36,13 +36,13 @@ _CHUNK = 1 << 16
 
 
 def shading_normals(
-    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
+    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, views: int = VIEWS, threads: int | None = None
 ) -> np.ndarray:
     """(v, 3) float32 unit normals of the surface that the splats of ``mesh`` form, pointing outwards.
 
     All vertices of a splat share one. A mesh with normals keeps them. Without ``face_splat``, each triangle
-    counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` see the scene, besides 24
-    around it: a room is visible from inside only.
+    counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` see the scene, besides
+    ``views`` around it: a room is visible from inside only.
     """
     if mesh.normals is not None:
         return mesh.normals
@@ -65,7 +65,7 @@ def shading_normals(
         # Both have trace 1: along the normal the discs' tensor is large, the scatter of the centres small.
         both = discs - np.divide(scatter, size, out=np.zeros_like(scatter), where=size > 0)
         normals[part] = np.linalg.eigh(both)[1][:, :, 2]
-    side = _seen_side(mesh, centers, normals, cell, cameras, threads)
+    side = _seen_side(mesh, centers, normals, cell, cameras, views, threads)
     normals *= np.where(side < 0, -1.0, 1.0)[:, None]
     # Splats that no camera sees have no weight here and take the side of their neighbours.
     trust = np.where(side == 0, 1e-3, 1.0) * weights
@@ -181,13 +181,14 @@ def _seen_side(
     normals: np.ndarray,
     tolerance: float,
     cameras: Sequence[Camera],
+    views: int,
     threads: int | None,
 ) -> np.ndarray:
     """(n,) positive where the cameras that see a centre are on the side of its normal, negative on the other
     one; 0 where none sees it."""
     front, back, upper = np.zeros((3, len(centers)))
     up, middle = guess_up(mesh), scene_bounds(mesh).center
-    for i, camera in enumerate(views_around(mesh, VIEWS, _SIDE, cameras, 16)):
+    for i, camera in enumerate(views_around(mesh, views, _SIDE, cameras, 16)):
         surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
         positions, z = camera.project(centers)
         rows = np.flatnonzero(camera.in_image(positions))
@@ -197,7 +198,7 @@ def _seen_side(
         side = np.einsum("ij,ij->i", normals[visible], away) / np.linalg.norm(away, axis=1)
         front[visible] += np.maximum(side, 0)
         back[visible] += np.maximum(-side, 0)
-        if i >= VIEWS or (camera.center - middle) @ up > 0:
+        if i >= views or (camera.center - middle) @ up > 0:
             upper[visible] += side
     sheet = (np.minimum(front, back) > _BOTH * np.maximum(front, back)) & (upper != 0)
     return np.where(sheet, upper, front - back)

@@ -103,13 +103,15 @@ def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
         for obj in chosen:
             target = targets[obj.name]
             chain = levels.chain_of(obj)
-            before = None if chain is None else levels.visible_level(chain)
-            if before is not None:
+            shown = {} if chain is None else {w: levels.visible_level(chain, w) for w in ("view", "render")}
+            if None in shown.values():  # all levels are hidden, and stay so
+                shown = {}
+            if shown:
                 levels.show(chain, obj[levels.LEVEL])
             with _held([(target, "hide_render", False), (target, "hide_viewport", False)]):
                 _bake(target)
-            if before is not None:
-                levels.show(chain, before)
+            for where, level in shown.items():
+                levels.show(chain, level, where)
             show(obj.data, smoothed(target.data))
     for obj in chosen:
         obj[STATE] = state(scene, obj)
@@ -127,10 +129,12 @@ def state(scene: Any, obj: Any) -> str:
     """A checksum of what lights the splats ``obj``: lamps, sky and the places of all that is rendered."""
     parts: list[Any] = [_numbers(obj.matrix_world)]
     for other in sorted(scene.objects, key=lambda other: other.name):
-        if other.type == "LIGHT" and not other.hide_render:
+        if not _is_rendered(other):
+            continue
+        if other.type == "LIGHT":
             lamp = other.data
             parts += [_numbers(other.matrix_world), lamp.type, _numbers([[lamp.energy, *lamp.color]])]
-        elif other.type == "MESH" and other != obj and other.parent != obj and not other.hide_render:
+        elif other.type == "MESH" and other != obj and other.parent != obj:
             parts += [other.name, _numbers(other.matrix_world), len(other.data.vertices)]
     tree = scene.world.node_tree if scene.world is not None else None
     for node in tree.nodes if tree is not None else ():
@@ -138,6 +142,10 @@ def state(scene: Any, obj: Any) -> str:
             values = [node.inputs["Strength"].default_value, *node.inputs["Color"].default_value]
             parts.append(_numbers([values]))
     return f"{zlib.crc32(repr(parts).encode()):08x}"
+
+
+def _is_rendered(obj: Any) -> bool:
+    return not obj.hide_render and not all(home.hide_render for home in obj.users_collection)
 
 
 def _numbers(rows: Any) -> list[float]:

@@ -1,12 +1,15 @@
-"""Cuts splat meshes between splats: by another object, by opacity and by size."""
+"""Cuts splat meshes between splats: by another object, by opacity, size and colour, and floaters."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from meshsplats.blender.inside import objects
+from meshsplats.blender.inside.host import bpy
+from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, find
 from meshsplats.mesh import SplatMesh
 
 
@@ -18,6 +21,8 @@ def chosen_splats(
     outside: bool = False,
     below_opacity: float = 1.0,
     above_size: float = 0.0,
+    color: Sequence[float] | None = None,
+    color_distance: float = 0.1,
 ) -> tuple[SplatMesh, np.ndarray]:
     """The mesh of the splats ``obj``, and (f,) bool: the triangles of its splats that meet all conditions.
 
@@ -26,6 +31,7 @@ def chosen_splats(
         shape: 'box', the bounds of ``region``, turned as it is, or 'sphere', the ellipsoid within them.
         below_opacity: no corner of the splat is more opaque.
         above_size: least distance of its farthest corner from its centre, scene units.
+        color: display RGB from which its mean colour is at most ``color_distance`` away; None: any colour.
 
     Raises:
         ValueError: not a splat mesh, a mesh prior, or a region without extent.
@@ -47,7 +53,23 @@ def chosen_splats(
     if above_size > 0 and len(found):
         away = np.linalg.norm(corners - centers[splats.of_face][:, None], axis=2).max(axis=1)
         found &= np.maximum.reduceat(away, splats.starts) >= above_size
+    if color is not None and len(found):
+        own = mesh.colors[mesh.faces].astype(np.float64)
+        weight = own[:, :, 3] + 1e-6
+        mean = splats.sums(np.einsum("fk,fkc->fc", weight, own[:, :, :3]))
+        mean /= splats.sums(weight.sum(axis=1))[:, None]
+        found &= np.linalg.norm(mean - np.array(color), axis=1) <= color_distance
     return mesh, found[splats.of_face]
+
+
+def floaters(obj: Any, rules: CleaningRules = FLOATERS) -> tuple[SplatMesh, np.ndarray]:
+    """As ``chosen_splats``: the splats that ``rules`` name, as ``meshsplats clean`` does.
+
+    Raises:
+        ValueError: as ``chosen_splats``; no splat would be left.
+    """
+    mesh, _ = chosen_splats(obj)
+    return mesh, ~find(mesh, rules).kept[mesh.splats.of_face]
 
 
 def _within(region: Any, points: np.ndarray, shape: str) -> np.ndarray:
@@ -72,12 +94,41 @@ def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collect
     count = int(np.count_nonzero(faces))
     if count in (0, len(faces)):
         raise ValueError(f"{'all' if count else 'none'} of the splats meet the conditions: nothing was cut")
-    lit = bool(obj.data[objects.LIT])
+    lit, fast = bool(obj.data[objects.LIT]), bool(obj.get(objects.ROUGH))
     made = None
     if separate:
-        made = objects.add(objects.prepare(mesh.take(np.flatnonzero(faces)), lit), obj.name, collection)
+        prepared = objects.prepare(mesh.take(np.flatnonzero(faces)), lit, fast=fast)
+        made = objects.add(prepared, obj.name, collection)
         away = np.array(made.data[objects.ORIGIN]) - np.array(obj.data[objects.ORIGIN])
         made.matrix_world = obj.matrix_world.copy()
         made.location = obj.matrix_world @ type(made.location)(away.tolist())
-    objects.replace_mesh(obj, objects.prepare(mesh.take(np.flatnonzero(~faces)), lit))
+    objects.replace_mesh(obj, objects.prepare(mesh.take(np.flatnonzero(~faces)), lit, fast=fast))
     return made
+
+
+def hide(obj: Any) -> None:
+    """Hides ``obj``, with what casts its shadows, in viewports and images: in a collection of its own, whose
+    eye and camera in the outliner show all of it again."""
+    home = bpy.data.collections.new(f"{obj.name} hidden")
+    bpy.context.scene.collection.children.link(home)
+    for part in (obj, *obj.children):
+        for other in list(part.users_collection):
+            other.objects.unlink(part)
+        home.objects.link(part)
+    home.hide_viewport = home.hide_render = True
+
+
+def select(obj: Any, faces: np.ndarray) -> None:
+    """Goes to edit mode of ``obj``, the active object, where the triangles ``faces`` (f,) bool are selected,
+    and nothing else."""
+    import bmesh
+
+    bpy.ops.object.mode_set(mode="EDIT")
+    edited = bmesh.from_edit_mesh(obj.data)
+    for elements in (edited.verts, edited.edges, edited.faces):
+        for element in elements:
+            element.select = False
+    edited.faces.ensure_lookup_table()
+    for index in np.flatnonzero(faces).tolist():
+        edited.faces[index].select_set(True)  # with its corners and edges
+    bmesh.update_edit_mesh(obj.data, loop_triangles=False, destructive=False)

@@ -81,13 +81,15 @@ def with_levels(obj: Any) -> list[Any]:
     return [obj] if chain is None else objects_of(chain)
 
 
-def visible_level(chain: Any) -> int | None:
-    """Index of the level of ``chain`` that renders show; None if they show none."""
-    return next((child[LEVEL] for child in collections(chain) if not child.hide_render), None)
+def visible_level(chain: Any, where: str = "render") -> int | None:
+    """Index of the level of ``chain`` that images show, or viewports ('view'); None if they show none."""
+    hidden = "hide_viewport" if where == "view" else "hide_render"
+    return next((child[LEVEL] for child in collections(chain) if not getattr(child, hidden)), None)
 
 
-def show(chain: Any, level: int) -> None:
-    """Makes ``level`` the one level of ``chain`` that is visible, in the viewport and in renders.
+def show(chain: Any, level: int, where: str = "both") -> None:
+    """Makes ``level`` the one level of ``chain`` that is visible: in viewports ('view'), in images
+    ('render'), or in both.
 
     A coarser level that was moved by hand takes the others to its place. Selection and the active object pass
     to the new level.
@@ -98,8 +100,11 @@ def show(chain: Any, level: int) -> None:
     children = collections(chain)
     if level not in [child[LEVEL] for child in children]:
         raise ValueError(f"{chain.name} has the levels 0 to {len(children) - 1}, got {level}")
+    if where == "render":
+        _set_visible(children, level, where)
+        return
     objs = {obj[LEVEL]: obj for obj in objects_of(chain)}
-    before: Any = objs.get(visible_level(chain))
+    before: Any = objs.get(visible_level(chain, "view"))
     finest: Any = objs.get(0)
     after: Any = objs.get(level)
     tied = before is not None and finest is not None and before.parent == finest
@@ -109,7 +114,7 @@ def show(chain: Any, level: int) -> None:
         before.matrix_basis.identity()
     layer = bpy.context.view_layer
     selected = before is not None and before.name in layer.objects and before.select_get()
-    _set_visible(children, level)
+    _set_visible(children, level, where)
     layer.update()
     if after is None or after.name not in layer.objects:
         return
@@ -119,9 +124,12 @@ def show(chain: Any, level: int) -> None:
         after.select_set(True)
 
 
-def _set_visible(children: Iterable[Any], level: int) -> None:
+def _set_visible(children: Iterable[Any], level: int, where: str = "both") -> None:
     for child in children:
-        child.hide_viewport = child.hide_render = child[LEVEL] != level
+        if where != "render":
+            child.hide_viewport = child[LEVEL] != level
+        if where != "view":
+            child.hide_render = child[LEVEL] != level
 
 
 def screen_size(chain: Any, scene: Any) -> float:

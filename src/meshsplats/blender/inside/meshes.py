@@ -75,7 +75,8 @@ def store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
     """Gives the bpy ``mesh`` the harmonics (v, k, 3) of its vertices' splats."""
     for name, fours in zip(HARMONICS, in_fours(harmonics), strict=True):
         for i, four in enumerate(fours):
-            attribute = mesh.attributes.new(f"{name}_{i}", "FLOAT_COLOR", "POINT")
+            own = f"{name}_{i}"
+            attribute = mesh.attributes.get(own) or mesh.attributes.new(own, "FLOAT_COLOR", "POINT")
             attribute.data.foreach_set("color", four.ravel())
 
 

@@ -21,8 +21,8 @@ from meshsplats.blender.inside import (
 )
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
-from meshsplats.blender.options import LightOptions
-from meshsplats.blender.subject import lit_subject, lowest, vertex_harmonics
+from meshsplats.blender.options import CAREFUL, FAST, LightOptions
+from meshsplats.blender.subject import Announce, lit_subject, lowest, vertex_harmonics
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.baking import bake_filter
@@ -43,11 +43,16 @@ WORLD = "meshsplats_world"
 frame is relative to. Blender's places are float32, so objects stand near (0, 0, 0)."""
 LAYERS = "meshsplats_layers"
 """Property of the mesh data: most layers behind each other."""
+ROUGH = "meshsplats_rough"
+"""Property of the object of lit splats: whether surface and colours for light are those of a preview."""
 
 
-def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
+def prepare(
+    mesh: SplatMesh, lit: bool, *, fast: bool = False, announce: Announce = lambda phase: None
+) -> dict[str, Any]:
     """Everything that takes time and does not touch Blender, so that it may run in another thread. Coplanar
-    layers of a mesh prior are separated, as in exports; a filter is baked for images of the whole subject."""
+    layers of a mesh prior are separated, as in exports; a filter is baked for images of the whole subject.
+    ``fast``: a lit mesh for a preview. ``announce`` is told the phases of a lit one, and may raise."""
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
         mesh = prior.pose(lift=prior.export_lift)
@@ -62,11 +67,11 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
         "harmonics": vertex_harmonics(shown),
     }
     if lit:
-        made, facts = lit_subject(mesh)
+        made, facts = lit_subject(mesh, effort=FAST if fast else CAREFUL, announce=announce)
         arrays |= made | facts
     # Splats on a base keep the base's frame.
     origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
-    return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}
+    return arrays | {"mesh": mesh, "lit": lit, "fast": fast, "layers": most_layers(mesh), "origin": origin}
 
 
 def foot(mesh: SplatMesh) -> np.ndarray:
@@ -130,21 +135,31 @@ def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
         bpy.data.meshes.remove(old)
 
 
-def renew_light(scene: Any, objs: Iterable[Any]) -> list[str]:
+def renew_light(scene: Any, objs: Iterable[Any], *, fast: bool = False) -> list[str]:
     """Makes the stand-ins of the lit splats among ``objs`` anew that were edited, joined or duplicated since,
-    and removes those that were left behind in ``scene``. Returns the names of the splats."""
+    or made for previews unless ``fast``, and removes those that were left behind in ``scene``. Returns the
+    names of the splats."""
     stand_ins.remove_strays(scene)
     found = []
     for obj in objs:
-        if obj.data[LIT] and priors.base_of(obj) is None and not stand_ins.is_current(obj):
-            replace_mesh(obj, prepare(as_splat_mesh(obj), True))
+        if needs_light(obj, fast=fast):
+            replace_mesh(obj, prepare(as_splat_mesh(obj), True, fast=fast))
             found.append(obj.name)
     return found
+
+
+def needs_light(obj: Any, *, fast: bool = False) -> bool:
+    """Whether the splats ``obj`` are lit, and their stand-in is not of their shape as it is now, or for
+    previews unless ``fast``."""
+    if not obj.data[LIT] or priors.base_of(obj) is not None:
+        return False
+    return not stand_ins.is_current(obj) or bool(obj.get(ROUGH) and not fast)
 
 
 def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
     if prepared["lit"]:
         obj[stand_ins.SHAPE] = stand_ins.shape(obj.data)
+        obj[ROUGH] = prepared["fast"]
     if "surface_vertices" not in prepared:
         return
     origin = prepared["origin"].astype(np.float32)

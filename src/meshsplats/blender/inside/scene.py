@@ -158,8 +158,8 @@ def build(
         stage.aim(scene, cameras[0], made[0])
     bpy.context.view_layer.objects.active = obj
     if light is not None:
-        announce("gathering light")
-        baking.bake(scene, objects.splat_objects(scene))
+        announce("light")
+        baking.bake(scene, objects.splat_objects(scene), samples=options.effort.samples)
     return Built(scene, obj, made, rotation)
 
 

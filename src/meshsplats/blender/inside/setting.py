@@ -9,7 +9,7 @@ import numpy as np
 
 from meshsplats.blender.inside import baking, meshes, objects, scene, stage
 from meshsplats.blender.inside.host import bpy
-from meshsplats.blender.options import LIGHTS, LightOptions
+from meshsplats.blender.options import CAREFUL, FAST, LIGHTS, LightOptions
 from meshsplats.blender.subject import ground_height, lowest
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
@@ -19,9 +19,12 @@ _AWAY = 2.5
 """Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
 
 
-def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
+def set_up(
+    view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True, fast: bool = False
+) -> LightOptions:
     """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
-    camera that sees all of them at the scene's resolution. Replaces those of an earlier call.
+    camera that sees all of them at the scene's resolution. Replaces those of an earlier call. ``fast``: light
+    for a preview.
 
     Returns:
         The light.
@@ -32,7 +35,7 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
-    objects.renew_light(view, objs)
+    objects.renew_light(view, objs, fast=fast)
     light, bounds = LIGHTS[lights], scene_bounds(points)
     low = lowest(bounds, np.array(UP))
     for obj in objs:
@@ -51,7 +54,7 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
     objects.render_settings(view, objs, True, light)
-    baking.bake(view, objs)
+    baking.bake(view, objs, samples=(FAST if fast else CAREFUL).samples)
     return light
 
 

@@ -1,0 +1,156 @@
+# ruff: noqa: E402
+"""The extension's operators on an object, and its panel, in this process."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats
+
+from meshsplats import load_gaussians, save_gaussians
+from meshsplats.blender.inside import baking, materials, objects, stand_ins
+from meshsplats.gaussians import GaussianCloud
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def extension():
+    sys.path.insert(0, str(ROOT))
+    try:
+        module = importlib.import_module("blender_extension")
+        module.register()
+        yield module
+        module.unregister()
+    finally:
+        sys.path.remove(str(ROOT))
+
+
+@pytest.fixture
+def ball(extension, tmp_path):
+    """Splats in the start scene, with a stray one above them."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    stray = GaussianCloud([[0.0, -5, 0]], [[1.0, 0, 0, 0]], [[0.05] * 3], [0.5], np.zeros((1, 1, 3)))
+    save_gaussians(GaussianCloud.joined([ball_splats(200)[0], stray]), tmp_path / "ball.ply")
+    bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "ball.ply"), at_origin=True)
+    bpy.ops.ed.undo_push(message="before")
+    return bpy.context.object
+
+
+def splat_count(obj) -> int:
+    return len(objects.as_splat_mesh(obj).splats)
+
+
+def test_edits_of_splats_and_the_way_back(ball, tmp_path):
+    name = ball.name
+    assert bpy.ops.object.meshsplats_clean() == {"FINISHED"}
+    ball = bpy.data.objects[name]
+    assert splat_count(ball) == 200
+    assert bpy.ops.object.meshsplats_adjust(saturation=0.0, opacity=0.5) == {"FINISHED"}
+    grey = objects.as_splat_mesh(ball).colors
+    np.testing.assert_allclose(grey[:, 0], grey[:, 2], atol=1e-5)
+    bpy.ops.object.meshsplats_cut(action="select", shape="all", by_color=True, color=(0.7, 0.7, 0.7))
+    assert ball.mode == "EDIT"
+    bpy.ops.export_scene.meshsplats_splats(filepath=str(tmp_path / "out"))
+    assert ball.mode == "OBJECT"
+    found, before = load_gaussians(tmp_path / "out.ply"), load_gaussians(tmp_path / "ball.ply")
+    assert len(found) == 200
+    away = found.means - before.means[:200]
+    np.testing.assert_allclose(away - away[0], 0, atol=1e-4, err_msg="moved to the grid as a whole")
+    red = np.flatnonzero(before.colors[:200, 1] < 0.4)
+    assert np.ptp(found.colors[red], axis=1).max() < 1e-3
+    np.testing.assert_allclose(found.opacities / before.opacities[:200], 0.5, atol=0.05)
+
+
+def test_undo_takes_edits_back(ball):
+    name, count = ball.name, splat_count(ball)
+    for operator, arguments in (
+        (bpy.ops.object.meshsplats_clean, {}),
+        (bpy.ops.object.meshsplats_adjust, {"brightness": 0.5}),
+        (bpy.ops.object.meshsplats_cut, {"shape": "all", "by_color": True, "color": (0.8, 0.2, 0.1)}),
+    ):
+        before = objects.as_splat_mesh(bpy.data.objects[name]).colors.copy()
+        assert operator("EXEC_DEFAULT", True, **arguments) == {"FINISHED"}
+        after = objects.as_splat_mesh(bpy.data.objects[name]).colors
+        assert after.shape != before.shape or (after != before).any()
+        bpy.ops.ed.undo()
+        back = bpy.data.objects[name]
+        bpy.context.view_layer.objects.active = back
+        assert splat_count(back) == count
+        np.testing.assert_array_equal(objects.as_splat_mesh(back).colors, before)
+
+
+@pytest.mark.slow
+def test_fast_light_is_made_carefully_when_asked(ball, extension):
+    """Light of one object, baked or live; what was made for a preview does not pass for the rest."""
+    name = ball.name
+    bpy.ops.object.meshsplats_clean()
+    assert bpy.ops.scene.meshsplats_stage(lights="studio", fast=True) == {"FINISHED"}
+    ball = bpy.data.objects[name]
+    bpy.context.view_layer.objects.active = ball
+    panel = sys.modules["blender_extension.panel"]
+    (material,) = ball.data.materials
+    assert materials.shows_baked(material)
+    assert (ball[objects.ROUGH], panel.light_warning(bpy.context.scene, ball)) == (True, "")
+    assert objects.needs_light(ball)
+    assert not objects.needs_light(ball, fast=True)
+    rough = len(baking.places_of(ball)[0])
+    bpy.ops.scene.meshsplats_bake_light(live=True, only_active=True)
+    assert not materials.shows_baked(material)
+    bpy.ops.scene.meshsplats_bake_light(fast=True, only_active=True)
+    assert materials.shows_baked(material)
+    assert len(baking.places_of(ball)[0]) == rough
+    bpy.context.view_layer.objects.active = bpy.context.scene.camera
+    with pytest.raises(RuntimeError, match="the active object is no lit splat mesh"):
+        bpy.ops.scene.meshsplats_bake_light(only_active=True)
+    # A part that is cut off a baked object shows baked light, too.
+    bpy.context.view_layer.objects.active = ball
+    bpy.ops.object.meshsplats_cut(
+        action="hide", shape="all", by_color=True, color=(0.8, 0.2, 0.1), color_distance=0.05
+    )
+    assert stand_ins.is_current(ball)
+    assert materials.shows_baked(ball.data.materials[0])
+    (home,) = [c for c in bpy.data.collections if c.name.endswith("hidden")]
+    assert len(home.objects) == 3, "the splats, what stands in for them, their points of light"
+    assert home.hide_render
+    assert panel.light_warning(bpy.context.scene, ball) == ""
+    bpy.ops.object.meshsplats_adjust(hue=1.0)
+    assert panel.light_warning(bpy.context.scene, ball).startswith("Light was made for other splats")
+
+
+def test_a_modifier_that_tears_splats_is_named(ball, extension):
+    warning = sys.modules["blender_extension.panel"].modifier_warning
+    assert warning(ball) == ""
+    ball.modifiers.new("Bend", "SIMPLE_DEFORM")
+    assert warning(ball) == ""
+    ball.modifiers.new("Hole", "BOOLEAN")
+    assert warning(ball) == "Hole tears splats to strips: Cut Splats cuts whole ones"
+
+
+def test_the_panel_has_a_button_for_each(ball, extension):
+    drawn = []
+
+    class Layout(SimpleNamespace):
+        def __getattr__(self, name):
+            if name.startswith("__"):
+                raise AttributeError(name)
+
+            def draw(*arguments, **_):
+                if name == "operator":
+                    drawn.append(arguments[0])
+                return Layout()
+
+            return draw
+
+    panel = sys.modules["blender_extension.panel"].MeshSplatsPanel
+    panel._object(None, Layout(), ball)
+    assert {"object.meshsplats_cut", "object.meshsplats_clean", "object.meshsplats_adjust"} <= set(drawn)
+    assert drawn.count("object.meshsplats_cut") == 2, "any, and all outside of a box"
