@@ -187,7 +187,9 @@ def test_the_factor_of_a_texture_is_in_its_picture():
     texture = replace(base.textures[0], factor=(0.5, 1.0, 0.25, 1.0))
     picture = load_image("a.png", pack_surface(replace(base, textures=(texture,))).picture)
     middle = (np.array([[8, 8], [40, 40]]) + 0.5) / 64
-    np.testing.assert_allclose(picture[[8, 40], [8, 40]] / 255, texture.at(middle)[:, :3], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(
+        picture[[8, 40], [8, 40]] / 255, texture.at(middle)[:, :3], atol=0.5 / 255 + 1e-6
+    )
 
 
 def test_what_a_surface_is_not():

@@ -82,8 +82,8 @@ class Surface(Command):
     image: Image = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     collision: Collider = None
-    """(.glb, USD) A static collider for engines, which is drawn, too, or not; or (.glb) convex parts of it that
-    Unreal takes for its collider. Default: none."""
+    """(.glb, USD) A static collider for engines, which is drawn, too, or not; or (.glb) convex parts of it
+    that Unreal takes for its collider. Default: none."""
     scale: Number = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
     no_preview: bool = False
