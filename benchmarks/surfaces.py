@@ -2,12 +2,14 @@
 
     python benchmarks/surfaces.py --data ../shared/data playbot guitar truck
     python benchmarks/surfaces.py --data ../shared/data --faces 40000 lego
+    python benchmarks/surfaces.py --data ../shared/data --fans playbot guitar
 
 For each scene the surface with default options, by images of degree 0. Its images, 2 x 2 samples, are
 compared with those of the splats (degree 0, means over areas, on white) from the standard cameras, eight of
 400 pixels at the given distances. lego is fitted to photographs and compared with those that are held out.
 "colours" is the same surface with colours of vertices, as fused; "opaque" are the splats' own images, each
-pixel opaque in its own colour or white: what an opaque surface of these colours could reach at best.
+pixel opaque in its own colour or white: what an opaque surface of these colours could reach at best. With
+--fans the splats as triangles are compared in place of surfaces: `convert`, no fine-tuning, `.glb`.
 
 FLIP is the difference that people see where two images take turns (Andersson and others 2020; 0: none, 1: the
 largest), by its authors' package: pip install flip-evaluator. LPIPS needs networks that no package brings.
@@ -17,6 +19,7 @@ Seconds are those of the processor, of all threads.
 from __future__ import annotations
 
 import tempfile
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -75,11 +78,33 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
     return float(evaluate(*pair, "LDR", applyMagma=False)[1])
 
 
-def scores(base: BaseMesh, truth: Truth, threads: int | None) -> tuple[str, str]:
+def scores(shown: BaseMesh | ms.SplatMesh, truth: Truth, threads: int | None) -> tuple[str, str]:
     """Mean PSNR in dB and mean FLIP."""
-    drawn = [ms.draw_surface(base, camera, threads=threads) for camera in truth.cameras]
+    drawn = [
+        ms.render(shown, camera, background=(1, 1, 1), samples=2, threads=threads).color
+        if isinstance(shown, ms.SplatMesh)
+        else ms.draw_surface(shown, camera, threads=threads)
+        for camera in truth.cameras
+    ]
     differences = [flip(*pair) for pair in zip(drawn, truth.images, strict=True)]
     return f"{mean_psnr(drawn, truth.images):.2f}", f"{np.mean(differences):.4f}"
+
+
+def of_fans(options: Namespace) -> None:
+    """The table of splats as triangles."""
+    with Report(options) as report, tempfile.TemporaryDirectory() as folder:
+        report.table("scene", "compared with", "triangles", "fans dB", "FLIP", "MB", "seconds")
+        for name in options.scenes:
+            cloud = SCENES[name].cloud(options.data).of_degree(0)
+            watch = Stopwatch()
+            mesh = ms.convert(cloud, threads=options.threads)
+            seconds = watch.processor
+            path = Path(folder) / "fans.glb"
+            ms.save_mesh(mesh, path)
+            for truth in truths(name, options.data, None, options.threads):
+                found = scores(mesh, truth, options.threads)
+                size = f"{path.stat().st_size / 1e6:.1f}"
+                report.row(name, truth.name, f"{len(mesh.faces):,}", *found, size, f"{seconds:.1f}")
 
 
 def main() -> None:
@@ -88,7 +113,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--faces", type=int, default=20_000)
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--fans", action="store_true")
     options = parser.parse_args()
+    if options.fans:
+        of_fans(options)
+        return
     threads = options.threads
     with Report(options) as report, tempfile.TemporaryDirectory() as folder:
         report.table(

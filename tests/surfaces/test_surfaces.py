@@ -26,9 +26,11 @@ from meshsplats import (
     save_gaussians,
 )
 from meshsplats.cli import main
+from meshsplats.conversion import convert
+from meshsplats.demo_scene import make_scene
 from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
-from meshsplats.surfaces import make_surface
+from meshsplats.surfaces import make_surface, making
 from meshsplats.surfaces.fusion import isosurface
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.manifold import split_pinches
@@ -140,6 +142,18 @@ def test_a_print_is_a_solid_for_another_library(tmp_path, suffix):
     assert solid.body_count == 1
     assert solid.volume == pytest.approx(4 / 3 * np.pi * 8, rel=0.08)
     assert solid.bounds[0] == pytest.approx([0, 0, 0], abs=1e-5)
+
+
+@needs_extra
+def test_depth_images_of_many_splats_are_of_merged_ones(monkeypatch):
+    cloud, counts = make_scene(300), []
+    monkeypatch.setattr(
+        making, "convert", lambda splats, **how: counts.append(len(splats)) or convert(splats, **how)
+    )
+    for most in (1000, 100):
+        monkeypatch.setattr(making, "MOST_SPLATS", most)
+        assert len(make_surface(cloud, shape="closed", **QUICK).faces) > 100
+    assert counts == [300, 100]
 
 
 @needs_extra

@@ -30,7 +30,7 @@ from meshsplats.mesh import SplatMesh
 TextureImage = Literal["png", "jpg", "webp"]
 """Kinds of image files of textures."""
 Collision = Literal["drawn", "only", "convex"]
-"""Whether a surface that things collide with is drawn, too, or convex parts of it collide instead."""
+"""Whether a surface that things collide with is drawn, too; or convex parts of it collide instead."""
 _BESIDE = (".obj", ".ply", ".usdc", ".usda", ".usd")
 """Formats whose texture is a file of its own."""
 _SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")

@@ -16,6 +16,7 @@ from meshsplats.binding import Binding
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import convert
+from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -23,6 +24,7 @@ from meshsplats.rendering import render
 from meshsplats.surfaces.atlas import cells, cells_side, unwrap
 from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors
+from meshsplats.surfaces.floor import missing_ground
 from meshsplats.surfaces.fusion import coarser, collapsed, grid_around, isosurface, signed_distances
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
@@ -39,12 +41,16 @@ if TYPE_CHECKING:
 ProgressOf = Callable[[str, int, int], object]
 """Called with the name of a phase, how much of it is done, and how much there is."""
 
+MOST_SPLATS = 1_000_000
+"""Splats of which depth images are drawn; more are merged. Their mesh takes about a gigabyte."""
 _COARSE = 2
 """The first rounds compare images, and have textures, whose sides are smaller by this factor."""
 _MAP = 4
 """Sides of normal maps are smaller than those of textures by this factor: voxels are coarser than texels."""
 _LATER = 0.3
 """Steps of the vertices in the last round, relative to those before."""
+_FLOOR = 4
+"""New ground has at most as many triangles as the surface divided by this."""
 _BOX_SIDE = 128
 """Sides of the depth images by which the box of a place is found."""
 _BOX_SHARE = 0.02
@@ -183,6 +189,8 @@ def _fused(
     triangles, where a normal map wants them."""
     mesh = scene
     if isinstance(mesh, GaussianCloud):
+        # Voxels are far larger than the splats of so many.
+        mesh = simplify_in_blocks(mesh, MOST_SPLATS, threads=threads)
         # As wide as viewers draw splats: gaps between them would be holes in the surface.
         mesh = convert(mesh, cameras=sources.depth, look="splats", colors="base", threads=threads)
     grid = (
@@ -211,7 +219,26 @@ def _fused(
         vertices, faces = collapsed(vertices, faces, options.faces)
     if not sources.closed:
         vertices, faces = close_holes(vertices, faces)
-    return grid.low + grid.voxel * vertices, faces, relief
+    vertices = grid.low + grid.voxel * vertices
+    if options.shape == "floor":
+        vertices, faces = _floored(scene, vertices, faces, sources, grid.voxel)
+    return vertices, faces, relief
+
+
+def _floored(
+    scene: GaussianCloud | SplatMesh,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    sources: Sources,
+    voxel: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The surface with the ground that it lacks."""
+    found, cameras = sources.found, sources.depth
+    up = guess_up(scene, cameras) if found is None else found.up
+    points, ground = missing_ground(vertices, faces, cameras, up.astype(np.float64), voxel)
+    if len(ground) > len(faces) // _FLOOR:
+        points, ground = collapsed(points, ground, max(2, len(faces) // _FLOOR))
+    return np.concatenate([vertices, points]), np.concatenate([faces, ground + np.int32(len(vertices))])
 
 
 def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, threads: int | None) -> Grid:

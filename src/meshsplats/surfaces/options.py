@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypedDict
 
 from meshsplats._options import Advanced, Range, With, check_options
 
-Shape = Literal["auto", "closed", "open"]
+Shape = Literal["auto", "closed", "open", "floor"]
 
 MAX_RESOLUTION = 512
 """Maximum number of voxels along the longest side of the grid."""
@@ -30,7 +30,8 @@ class SurfaceOptions:
     """Keep the relief of the finest triangles as a normal map, of a quarter of the texture's side."""
     shape: Shape = "auto"
     """closed: a solid that can be seen from all sides; what no image sees becomes interior. open: only what
-    images see, for rooms, streets and gardens. auto: closed for objects, open for places."""
+    images see, for rooms, streets and gardens. floor: open, but for the ground below and between the views,
+    for walking. auto: closed for objects, open for places."""
     resolution: Annotated[int, Range(8, MAX_RESOLUTION)] = 256
     """Voxels along the longest side, from whose surface triangles are made. Memory grows with its
     cube."""

@@ -1,4 +1,4 @@
-"""Surfaces as binary glTF 2.0: one opaque primitive with its texture inside, and a collider if it has one."""
+"""Surfaces as binary glTF 2.0: one opaque primitive, with its texture inside; colliders beside it."""
 
 from __future__ import annotations
 
