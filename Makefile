@@ -54,7 +54,7 @@ CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help dawn demo fuzz fuzz-core test test-slow test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
+.PHONY: help dawn node-packages demo fuzz fuzz-core test test-slow test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
 	test-memory test-threads test-windows test-arm64 wheels release docs lint format clean
 .DEFAULT_GOAL := help
 
@@ -109,6 +109,18 @@ dawn:
 	  || { echo 'Installing Dawn into $(DAWN)'; mkdir -p $(DAWN); \
 	    npm install --silent --fetch-retries 1 --no-fund --no-audit --prefix $(DAWN) webgpu@$(DAWN_VERSION) && touch $(DAWN)/$(DAWN_VERSION); } \
 	  || echo 'Dawn cannot be installed here: its tests are skipped'
+
+# Programs of others that tests compare with, from npm; without them, these tests are skipped. splat-transform from 3 on
+# keeps SPZ in the axes of .ply, against its specification.
+NODE := build/node
+NODE_PACKAGES := gltf-validator@2.0.0-dev.3.10 @playcanvas/splat-transform@2.7.1 three@0.187.0 \
+	@gltf-transform/cli@4.5.1 meshoptimizer@1.3.0
+node-packages: $(NODE)/installed
+$(NODE)/installed: Makefile
+	@echo 'Installing packages of npm into $(@D)'
+	@mkdir -p $(@D)
+	@npm install --silent --fetch-retries 1 --no-fund --no-audit --prefix $(@D) $(NODE_PACKAGES)
+	@touch $@
 
 # One wheel serves all versions of Python.
 PACKAGE_FILES := $(foreach kind,py wgsl js html css,$(shell find src -name '*.$(kind)'))

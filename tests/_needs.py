@@ -13,6 +13,8 @@ REMEDIES = {
     "browser": "Chromium: apt install chromium, or CHROMIUM=/path/to/it",
     "gpu": "a Vulkan driver: apt install mesa-vulkan-drivers libvulkan1 (on the processor), or that of a GPU",
     "dawn": "Dawn for node: make dawn, which needs npm (apt install nodejs npm)",
+    "node": "packages of npm: make node-packages, or MESHSPLATS_NODE_FOLDER=folder/that/has/them",
+    "qemu": "an emulator of other processors: apt install qemu-user",
 }
 VARIABLE = "MESHSPLATS_REQUIRE"
 

@@ -42,12 +42,11 @@ def node_package() -> Callable[[str], Path]:
     """Gives the folder where a package of npm is installed, which no test installs itself."""
 
     def found(name: str) -> Path:
-        folder = os.environ.get("MESHSPLATS_NODE_FOLDER")
-        if not folder or shutil.which("node") is None or not (Path(folder) / "node_modules" / name).exists():
-            pytest.skip(
-                f"{name} is not here: npm install {name} in a folder, and name it in MESHSPLATS_NODE_FOLDER"
-            )
-        return Path(folder)
+        own = Path(__file__).parents[1] / "build" / "node"
+        folder = Path(os.environ.get("MESHSPLATS_NODE_FOLDER") or own)
+        if shutil.which("node") is None or not (folder / "node_modules" / name).exists():
+            lacking("node", f"{name} is not here")
+        return folder
 
     return found
 

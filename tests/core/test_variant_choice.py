@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from _needs import lacking
 
 from meshsplats._core import library
 
@@ -45,7 +46,6 @@ def test_the_best_variant_is_that_of_the_flags_that_linux_lists():
 
 @x86_64
 @linux
-@pytest.mark.skipif(EMULATOR is None, reason="qemu-x86_64 is not installed")
 @pytest.mark.parametrize(
     ("processor", "expected"),
     [
@@ -58,10 +58,12 @@ def test_the_best_variant_is_that_of_the_flags_that_linux_lists():
     ],
 )
 def test_an_emulated_processor_gets_the_variant_that_it_runs(processor, expected):
+    if EMULATOR is None:
+        lacking("qemu", "qemu-x86_64 is not installed")
     path = library.library_path("baseline")
     code = "import ctypes, sys\nanswer = ctypes.CDLL(sys.argv[1]).ms_best_variant\n"
     code += "answer.restype = ctypes.c_char_p\nprint(answer().decode())"
     python = os.path.realpath(sys.executable)
-    command = [str(EMULATOR), "-cpu", processor, python, "-I", "-S", "-c", code, str(path)]
+    command = [EMULATOR, "-cpu", processor, python, "-I", "-S", "-c", code, str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.stdout.strip() == expected, done.stderr
