@@ -93,9 +93,7 @@ class Making:
         self, cloud: GaussianCloud, cameras: Sequence[Camera], job: Job, up: np.ndarray | None
     ) -> Camera | None:
         """The camera of the preview of a place, from which the splats look right; None: one in front."""
-        if cameras or not job.preview:
-            return None
-        found = views_of_a_place(cloud, 1, {"width": 800, "height": 800, "up": up})
+        found = views_of_a_place(cloud, job.source, 1, up=up, given=cameras or None) if job.preview else None
         return found[0] if found else None
 
     def _stream_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:

@@ -39,6 +39,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer import content
 from meshsplats.viewer.content import Content
+from meshsplats.viewpoints.showing import opening_beside
 
 if TYPE_CHECKING:
     from meshsplats.viewer.page import Page
@@ -174,11 +175,13 @@ class View(Command):
             return [view.camera for view in photographs.views]
         if self.cameras is not None:
             return load_cameras(self.cameras, origin=scene.origin)
-        beside = cameras_beside(self.input, scene.origin)
+        splats = isinstance(scene, GaussianCloud)
+        opening = opening_beside(self.input, scene.origin) if splats else None
+        first, beside = [] if opening is None else [opening], cameras_beside(self.input, scene.origin)
         if beside is not None:
-            return beside
-        lens = {"width": 800, "height": 800, "up": None if self.up is None else parse_up(self.up)}
-        return views_of_a_place(scene, FOUND_VIEWS, lens) or []
+            return [*first, *beside]
+        up = None if self.up is None else parse_up(self.up)
+        return views_of_a_place(scene, self.input, FOUND_VIEWS, up=up) or first
 
     def _announce(self, shown: Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""
