@@ -28,6 +28,25 @@ def test_findings_about_splats_follow_the_arguments_of_the_reader(tmp_path):
     json.dumps(found, allow_nan=False)
 
 
+def test_what_kind_of_scene_splats_show(tmp_path, monkeypatch):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    found = describe(tmp_path / "scene.ply")
+    assert (found["scene"], found["scene_confidence"]) == ("object", 1.0)
+    assert (found["up_found"], found["up_confidence"]) == ([0.0, -1.0, 0.0], 0.0)
+    assert found["view_depth"] > 0
+    told = save_named_up(tmp_path)
+    assert told["up"] == pytest.approx([0, 0, 1])
+    assert "up_found" not in told
+    monkeypatch.setattr("meshsplats.viewpoints.finding.first_impression", lambda cloud, **_: None)
+    assert "scene" not in describe(tmp_path / "scene.ply")
+
+
+def save_named_up(folder):
+    """What is found in a file that names its up."""
+    save_gaussians(replace(few_splats(), up=np.array([0.0, 0, 1])), folder / "up.ply")
+    return describe(folder / "up.ply")
+
+
 def test_findings_about_a_mesh(tmp_path):
     mesh = convert(few_splats())
     save_mesh(mesh, tmp_path / "mesh.npz")

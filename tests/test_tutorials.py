@@ -12,6 +12,7 @@ from _photographs import write_photographs
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main
 from meshsplats.demo_scene import make_scene
+from meshsplats.demo_scene.room import make_room
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.rendering import render_splats
 
@@ -64,6 +65,14 @@ def test_from_a_splat_file(tmp_path, monkeypatch, capsys):
     for block in blocks(TUTORIALS / "from_a_splat_file.md", "python"):
         exec(compile(block, "tutorial", "exec"), {})
     assert {"scores", "look", "tuned.npz", "tuned.glb"} <= {p.name for p in tmp_path.iterdir()}
+
+
+@pytest.mark.slow
+def test_places(tmp_path, monkeypatch, capsys):
+    save_gaussians(make_room(3000), tmp_path / "room.ply")
+    monkeypatch.chdir(tmp_path)
+    run_all(TUTORIALS / "places.md", capsys)
+    assert {"cameras.json", "round", "tuned.npz", "scores"} <= {p.name for p in tmp_path.iterdir()}
 
 
 @pytest.mark.slow

@@ -27,7 +27,9 @@ from urllib.parse import unquote, urlsplit
 
 ROOT = Path(__file__).resolve().parents[1]
 NAVIGATION = {
-    "Tutorials": ["docs/tutorials/from_a_splat_file", "docs/tutorials/from_photographs"],
+    "Tutorials": [
+        *("docs/tutorials/from_a_splat_file", "docs/tutorials/places", "docs/tutorials/from_photographs")
+    ],
     "Using it": [
         *("docs/install", "docs/commands", "docs/python", "docs/files", "docs/quality", "docs/options"),
         "docs/view-dependent-colour",

@@ -84,8 +84,8 @@ class Surroundings:
     """Writes what is noted beside the outputs, with which it appears."""
     preview: Callable[..., None]
     """Draws a scene to a file, from a camera or None."""
-    opening: Callable[[GaussianCloud], Camera | None]
-    """The camera of the preview of a place; None: one in front."""
+    opening: Callable[[GaussianCloud, Path, Sequence[Camera] | None], Camera | None]
+    """The camera of the preview of splats from a file, and given cameras; None: one in front."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Maker:
         mesh = convert(cloud, product.conversion, preset=product.preset, cameras=seen, up=product.up)
         mesh = product.files.prepared(mesh, seen)
         times = {"read": read - start, "convert": time.perf_counter() - read}
-        opening = self.around.opening(cloud) if job.preview and not seen else None
+        opening = self.around.opening(cloud, job.source, seen) if job.preview else None
         return {
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,

@@ -57,8 +57,10 @@ def describe(path: Path, reading: Mapping[str, Any] | None = None) -> dict[str, 
         cloud = load_gaussians(path, **(reading or {}))
         warn_of_strays_in(cloud)
         found |= {"format": format_of(path)} | _in_time(path) | _splats(cloud)
-        if cameras := cameras_beside(path, np.zeros(3)):
+        cameras = cameras_beside(path, np.zeros(3))
+        if cameras:
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
+        found |= _seen(cloud, guess_up(cloud, cameras) if cameras else None)
     elif kind == "mesh":
         mesh = load_mesh(path)
         warn_of_strays_in(mesh)
@@ -145,6 +147,22 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
         "flatness_median": float(np.float32(np.median(flatness))),
         "estimated_triangles": round(len(tried.faces) * share),
         "estimated_vertices": round(len(tried.vertices) * share),
+    }
+
+
+def _seen(cloud: GaussianCloud, up: np.ndarray | None) -> dict[str, Any]:
+    """What kind of scene it is and which way is up, as splats show; ``up``: what the cameras tell."""
+    from meshsplats.viewpoints.finding import first_impression
+
+    scene = first_impression(cloud, up=up)
+    if scene is None:
+        return {}
+    told = up is not None or cloud.up is not None
+    return {
+        "scene": scene.kind,
+        "scene_confidence": round(scene.confidence, 2),
+        **({} if told else {"up_found": _rounded(scene.up), "up_confidence": round(scene.up_confidence, 2)}),
+        "view_depth": float(f"{scene.extent:.6g}"),
     }
 
 

@@ -11,7 +11,7 @@ import pytest
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli.images import ViewOptions
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.viewpoints import finding
+from meshsplats.viewpoints import finding, showing
 from meshsplats.viewpoints.walking import keys_of, short_round, walk
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -113,7 +113,7 @@ def place(monkeypatch) -> GaussianCloud:
     def found(cloud, count, **_):
         return finding.FoundCameras("place", 0.4, UP, 1.0, 0.0, 3.0, tuple(views(count)))
 
-    monkeypatch.setattr(finding, "find_cameras", found)
+    monkeypatch.setattr(showing, "find_cameras", found)
     points = np.random.default_rng(2).normal(size=(30, 3))
     turns = np.tile([1.0, 0, 0, 0], (30, 1))
     return GaussianCloud(points, turns, np.full((30, 3), 0.01), np.full(30, 0.9), np.zeros((30, 1, 3)))

@@ -19,6 +19,7 @@ from meshsplats._json import read_json
 from meshsplats._kinds import need_all, need_path
 from meshsplats.camera import Camera
 from meshsplats.cameras.camera_path import cameras_of_path, is_camera_path
+from meshsplats.cameras.viewer_settings import start_camera
 from meshsplats.errors import DataWarning, FileFormatError
 
 MAX_CAMERAS = 20_000
@@ -32,12 +33,13 @@ def load_cameras(
     They are relative to the point ``origin`` (3,) of the world, which is to be that of the scene that they
     look at, ``GaussianCloud.origin`` or ``SplatMesh.origin``.
 
-    Three forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
+    Four forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
     4x4 matrix and OpenCV axes; ``name``, ``near`` (then it follows the scene), and cx and cy (then the
     image's centre) may be missing. Another is the ``cameras.json`` that INRIA's 3DGS trainer writes:
     ``{img_name, width, height, position, rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and
     the principal point at the image's centre. The third is nerfstudio's ``camera_path.json``, whose cameras
-    are in the frame of the splats that ``ns-export`` writes. For a folder, its ``cameras.json`` is read.
+    are in the frame of the splats that ``ns-export`` writes. The fourth is the start camera in the
+    ``settings.json`` of SuperSplat's viewer. For a folder, its ``cameras.json`` is read.
 
     Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
     format, and OSError if it cannot be opened.
@@ -53,6 +55,8 @@ def load_cameras(
     if is_camera_path(entries):
         found = cameras_of_path(entries, path, MAX_CAMERAS)
         return [camera.relative_to(point) for camera in found]
+    if (start := start_camera(entries, path)) is not None:
+        return [start.relative_to(point)]
     if not isinstance(entries, list):
         other = isinstance(entries, dict) and "frames" in entries
         what = " with 'frames', a data set: read it with load_dataset or --data" if other else ""
@@ -69,13 +73,25 @@ def load_cameras(
     return [camera.relative_to(point) for camera in found]
 
 
+def model_folder(source: Path) -> Path | None:
+    """The folder of a trained model, with a ``cameras.json``, that ``source`` is, or that it lies in as
+    ``point_cloud/iteration_N`` or a file there; else None."""
+    folder = source if source.is_dir() else source.absolute().parent
+    if re.fullmatch(r"iteration_[0-9]+", folder.name) and folder.absolute().parent.name == "point_cloud":
+        folder = folder.absolute().parent.parent
+    elif folder != source:
+        return None
+    return folder if (folder / "cameras.json").is_file() else None
+
+
 def cameras_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
-    """The training cameras in a model folder ``source``, relative to ``origin``; None where there are none. A
-    DataWarning says where they cannot be read."""
-    if not (source / "cameras.json").is_file():
+    """The training cameras of the ``model_folder`` of ``source``, relative to ``origin``; None where there
+    are none. A DataWarning says where they cannot be read."""
+    folder = model_folder(source)
+    if folder is None:
         return None
     try:
-        return load_cameras(source, origin=origin)
+        return load_cameras(folder, origin=origin)
     except FileFormatError as error:
         warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
         return None

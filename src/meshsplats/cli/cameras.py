@@ -11,7 +11,8 @@ import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
-from meshsplats.cameras.files import cameras_beside
+from meshsplats.cameras.files import cameras_beside, model_folder
+from meshsplats.cameras.framing import guess_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions, load_scene, optional_up
@@ -20,6 +21,7 @@ from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 from meshsplats.viewpoints.sheet import contact_sheet
+from meshsplats.viewpoints.showing import opened_with
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,17 @@ class Cameras(Command):
         up = optional_up(self.up)
         given = cameras_beside(self.input, scene.origin)
         if given is not None:
-            say(f"{self.input} has {len(given)} cameras of its own, which --cameras {self.input} takes")
+            folder = model_folder(self.input)
+            say(f"{folder} has {len(given)} cameras of its own, which --cameras {folder} takes")
+            up = guess_up(scene, given) if up is None else up
         found = find_cameras(
             scene, self.count, up=up, width=self.width, height=self.height, threads=self.threads
         )
+        side = self.width, self.width if self.height is None else self.height
+        cameras = opened_with(found.cameras, self.input, scene.origin, side)
         with together():
-            save_cameras(found.cameras, self.output, origin=scene.origin)
-            save_image(preview, contact_sheet(scene, found.cameras, threads=self.threads))
+            save_cameras(cameras, self.output, origin=scene.origin)
+            save_image(preview, contact_sheet(scene, cameras, threads=self.threads))
         self._print_result(found, scene.origin, preview, time.perf_counter() - start)
 
     def _print_result(self, found: FoundCameras, origin: np.ndarray, preview: Path, seconds: float) -> None:

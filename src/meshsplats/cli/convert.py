@@ -174,8 +174,8 @@ class Convert(ConvertCommand):
         for path, config in zip(job.outputs, job.configs, strict=False):
             write_configuration(config, "convert", self.alone(job, path))
 
-    def _opening(self, cloud: GaussianCloud) -> Camera | None:
-        found = views_of_a_place(cloud, 1, {"width": 800, "height": 800, "up": optional_up(self.up)})
+    def _opening(self, cloud: GaussianCloud, source: Path, given: Sequence[Camera] | None) -> Camera | None:
+        found = views_of_a_place(cloud, source, 1, up=optional_up(self.up), given=given or None)
         return found[0] if found else None
 
     def _changes(self, job: Job, index: int) -> str | None:

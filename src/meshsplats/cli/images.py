@@ -35,8 +35,9 @@ class ViewOptions:
     """Cameras and image size. Orbit, dome, look-around, cameras and data exclude each other."""
 
     orbit: option.Count = None
-    """N views on a circle around the subject; in splats of a place, on a round through views found in it,
-    unless --elevation, --azimuth, --distance, --look-at, --fov or --focal-length is given."""
+    """N views on a circle around the subject; in splats of a place, on a round through its own cameras or
+    views found in it, unless --elevation, --azimuth, --distance, --look-at, --fov or --focal-length is
+    given."""
     dome: option.Count = None
     """N views spread evenly over the upper half of a sphere around the subject."""
     look_around: option.Count = None
@@ -131,11 +132,11 @@ class ViewOptions:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
             lens["fov"] = 75.0 if fov is None else fov
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
-        if not self._placed and cameras_beside(source, scene.origin) is None:
-            told = None if self.up is None else lens["up"]
+        if not self._placed:
+            side, told = (width, lens["height"]), None if self.up is None else lens["up"]
             number = count if self.orbit is None else self.orbit
             film = (film or self.orbit is not None) and number > 1
-            if views := views_of_a_place(scene, number, lens | {"up": told}, film):
+            if views := views_of_a_place(scene, source, number, side=side, up=told, film=film):
                 return views
         lens["fov"] = 45.0 if fov is None else fov
         target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
@@ -202,27 +203,15 @@ class DrawOptions:
 
 
 def views_of_a_place(
-    scene: GaussianCloud | SplatMesh, count: int, lens: dict[str, Any], film: bool = False
+    scene: GaussianCloud | SplatMesh, source: Path, count: int, **options: Any
 ) -> list[Camera] | None:
-    """``count`` views of splats that are no object, as ``find_cameras`` finds them, or with ``film`` on a
-    round through some; says what was found. ``lens``: width, height, and up or None."""
-    from meshsplats.rendering.layers import fragments
-    from meshsplats.rendering.previews import FRAGMENTS, preview_camera
-    from meshsplats.viewpoints.finding import find_cameras
-    from meshsplats.viewpoints.walking import keys_of, walk
+    """``default_views``; says where they come from."""
+    from meshsplats.viewpoints.showing import default_views
 
-    if not isinstance(scene, GaussianCloud) or not len(scene):
+    if (shown := default_views(scene, source, count, **options)) is None:
         return None
-    if fragments(scene, preview_camera(scene), 1) > FRAGMENTS:
-        return None  # splats as large as the scene: there is nothing to find, and it would take long
-    found = find_cameras(scene, keys_of(count) if film else count, **lens)
-    if found.kind == "object":
-        return None
-    if film:
-        say(f"{found.in_words()}: seen on a round through {len(found.cameras)} views that were found")
-        return walk(found.cameras, count, found.up)
-    say(f"{found.in_words()}: seen from views that were found")
-    return list(found.cameras)
+    say(shown[1])
+    return shown[0]
 
 
 def announce_cost(

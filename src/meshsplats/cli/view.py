@@ -37,6 +37,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer import content
 from meshsplats.viewer.content import Content
+from meshsplats.viewpoints.showing import opening_beside
 
 if TYPE_CHECKING:
     from meshsplats.viewer.page import Page
@@ -183,11 +184,14 @@ class View(Command):
             return [view.camera for view in photographs.views]
         if self.cameras is not None:
             return load_cameras(self.cameras, origin=scene.origin)
-        beside = cameras_beside(self.input, scene.origin)
-        if beside is not None or isinstance(scene, BaseMesh):
-            return beside or []
-        lens = {"width": 800, "height": 800, "up": optional_up(self.up)}
-        return views_of_a_place(scene, FOUND_VIEWS, lens) or []
+        if isinstance(scene, BaseMesh):
+            return cameras_beside(self.input, scene.origin) or []
+        splats = isinstance(scene, GaussianCloud)
+        opening = opening_beside(self.input, scene.origin) if splats else None
+        first, beside = [] if opening is None else [opening], cameras_beside(self.input, scene.origin)
+        if beside is not None:
+            return [*first, *beside]
+        return views_of_a_place(scene, self.input, FOUND_VIEWS, up=optional_up(self.up)) or first
 
     def _announce(self, shown: Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""

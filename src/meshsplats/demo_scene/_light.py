@@ -35,6 +35,8 @@ class Patch:
     """Share of light transmitted from the back."""
     occlusion: np.ndarray | None = None
     """(n,) share of the sky light that arrives, apart from occlusion by other objects; None: all of it."""
+    sunlit: np.ndarray | None = None
+    """(n,) the same of the key light."""
 
 
 def diffuse(patch: Patch, blockers: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
@@ -57,7 +59,8 @@ def diffuse(patch: Patch, blockers: tuple[np.ndarray, np.ndarray, np.ndarray]) -
         if density > 1:  # ambient occlusion by a sphere: cosine times solid angle
             cosine = np.clip((patch.normals * to).sum(1) / distance, 0, 1)
             sky *= 1 - outside * cosine * np.clip(radius / distance, 0, 1) ** 2 * 0.75
-    light = column(key * np.exp(-shadow)) * [1.75, 1.60, 1.36]
+    key = key * np.exp(-shadow) * (1.0 if patch.sunlit is None else patch.sunlit)
+    light = column(key) * [1.75, 1.60, 1.36]
     upwards = 0.5 - 0.5 * patch.normals[:, 1]
     light = light + column(sky * (0.14 + 0.26 * upwards)) * [0.80, 0.94, 1.14]
     linear = np.clip(patch.albedo, 0, 1) * light

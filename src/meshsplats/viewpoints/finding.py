@@ -18,11 +18,13 @@ from meshsplats.cameras.placing import (
     outside_cameras,
 )
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.viewpoints.kind import Kind, kind_from_inside, kind_from_outside
-from meshsplats.viewpoints.sample import Sample
-from meshsplats.viewpoints.search import find_places
+from meshsplats.rendering.layers import fragments
+from meshsplats.rendering.previews import FRAGMENTS, preview_camera
+from meshsplats.viewpoints.kind import Kind, kind_from_inside, kind_from_outside, usual_depth
+from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
+from meshsplats.viewpoints.search import FEW, Places, find_places
 from meshsplats.viewpoints.upright import find_upright
-from meshsplats.viewpoints.views import NEAR_SHARE, choose_views
+from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, choose_views
 
 MOST = 96
 """Views that are looked for, each checked with all splats; more are variations of these."""
@@ -104,34 +106,73 @@ def find_cameras(
     height = width if height is None else height
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
-    given = unit_up(up) if up is not None else None if cloud.up is None else guess_up(cloud)
-    first_up = guess_up(cloud) if given is None else given
+    given, first_up = _told_up(cloud, up)
     kind, confidence = kind_from_outside(cloud, first_up, threads)
     if kind == "object" and not anywhere:
-        cameras = outside_cameras(
-            cloud,
-            count,
-            elevations=SURROUNDED_ELEVATIONS if has_surroundings(cloud) else OBJECT_ELEVATIONS,
-            up=first_up,
-            width=width,
-            height=height,
-        )
-        bounds = scene_bounds(cloud)
-        ground = float((bounds.points @ first_up).min())
-        extent = float(np.linalg.norm(cameras[0].center - bounds.center))
-        return FoundCameras(
-            kind, confidence, first_up, float(given is not None), ground, extent, tuple(cameras)
-        )
+        return _around(cloud, confidence, given, count, width, height)
     sample = Sample(cloud, first_up, threads)
     places = find_places(sample)
-    upright = find_upright(sample, places, first_up)
-    found_up, sure = (upright.up, upright.confidence) if given is None else (given, 1.0)
-    if kind is None:
-        kind, confidence = kind_from_inside(sample, places, found_up)
-    views = choose_views(sample, places, found_up, min(count, MOST), width, height)
+    scene = _within(sample, places, kind, confidence, given)
+    views = choose_views(sample, places, scene.up, min(count, MOST), width, height)
     extent = float(np.median([_depth(camera) for camera in views]))
     cameras = [replace(camera, name=f"view_{i:04d}") for i, camera in enumerate(varied(views, count))]
-    return FoundCameras(kind, confidence, found_up, sure, upright.ground, extent, tuple(cameras))
+    return replace(scene, extent=extent, cameras=tuple(cameras))
+
+
+def first_impression(
+    cloud: GaussianCloud, *, up: Sequence[float] | np.ndarray | None = None, threads: int | None = None
+) -> FoundCameras | None:
+    """What ``find_cameras`` says of a scene, without cameras: from a smaller sample and fewer places, in a
+    fraction of its time. Where one of the two is not sure, they may differ.
+
+    None for an empty scene, and for splats so large that looking at them takes long.
+    """
+    if not worth_a_look(cloud):
+        return None
+    given, first_up = _told_up(cloud, up)
+    kind, confidence = kind_from_outside(cloud, first_up, threads)
+    if kind == "object":
+        return replace(_around(cloud, confidence, given, 1, 400, 400), cameras=())
+    sample = Sample(cloud, first_up, threads, SMALL_SAMPLE)
+    return _within(sample, find_places(sample, FEW), kind, confidence, given)
+
+
+def worth_a_look(cloud: GaussianCloud) -> bool:
+    """Whether there is anything to see, within a reasonable time: not in splats as large as their scene."""
+    return len(cloud) > 0 and fragments(cloud, preview_camera(cloud), 1) <= FRAGMENTS
+
+
+def _told_up(
+    cloud: GaussianCloud, up: Sequence[float] | np.ndarray | None
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """The direction that the caller or the cloud names, or None; and the one to begin with."""
+    given = unit_up(up) if up is not None else None if cloud.up is None else guess_up(cloud)
+    return given, guess_up(cloud) if given is None else given
+
+
+def _around(
+    cloud: GaussianCloud, confidence: float, given: np.ndarray | None, count: int, width: int, height: int
+) -> FoundCameras:
+    """An object and ``count`` cameras of a dome around it."""
+    up = guess_up(cloud) if given is None else given
+    elevations = SURROUNDED_ELEVATIONS if has_surroundings(cloud) else OBJECT_ELEVATIONS
+    cameras = outside_cameras(cloud, count, elevations=elevations, up=up, width=width, height=height)
+    bounds = scene_bounds(cloud)
+    ground = float((bounds.points @ up).min())
+    extent = float(np.linalg.norm(cameras[0].center - bounds.center))
+    return FoundCameras("object", confidence, up, float(given is not None), ground, extent, tuple(cameras))
+
+
+def _within(
+    sample: Sample, places: Places, kind: Kind | None, confidence: float, given: np.ndarray | None
+) -> FoundCameras:
+    """A scene that is seen from ``places``, without cameras; ``kind``: as it looks from outside."""
+    upright = find_upright(sample, places, guess_up(sample.cloud) if given is None else given)
+    up, sure = (upright.up, upright.confidence) if given is None else (given, 1.0)
+    if kind is None:
+        kind, confidence = kind_from_inside(sample, places, up)
+    extent = usual_depth(sample, places, places.worth >= NEARLY * places.worth.max())
+    return FoundCameras(kind, confidence, up, sure, upright.ground, extent, ())
 
 
 def _depth(camera: Camera) -> float:

@@ -30,6 +30,8 @@ LANDSCAPE = 50_000
 """...and its number of splats, at least."""
 FLOWN_OVER = 1.5
 """Spread of places above a landscape, in depths of their views: less, and they surround a subject."""
+MOST_DEPTHS = 400
+"""Views, at most, whose depths tell what is usual."""
 MOST_SURE = 0.45
 """How sure it is at most whether a scene is a ring or a place: they look much alike."""
 
@@ -98,7 +100,13 @@ def kind_from_inside(sample: Sample, places: Places, up: np.ndarray) -> tuple[Ki
     return ("ring" if inward > 0 else "place"), float(np.clip(0.2 + 0.1 * abs(inward), 0, MOST_SURE))
 
 
+def usual_depth(sample: Sample, places: Places, good: np.ndarray) -> float:
+    """Median of the depths of some of the ``good`` (k, DIRECTIONS) views from ``places``."""
+    views = np.argwhere(good)
+    views = views[:: -(-len(views) // MOST_DEPTHS)]
+    return float(np.median([sample.depth_along(places.depth[i], sample.gaze[j]) for i, j in views]))
+
+
 def _flown_over(sample: Sample, best: Places) -> bool:
-    views = np.argwhere(best.worth >= 0.9 * best.worth.max(axis=1, keepdims=True))
-    depth = np.median([sample.depth_along(best.depth[i], sample.gaze[j]) for i, j in views])
-    return bool(np.linalg.norm(best.places.std(axis=0)) > FLOWN_OVER * depth)
+    good = best.worth >= 0.9 * best.worth.max(axis=1, keepdims=True)
+    return bool(np.linalg.norm(best.places.std(axis=0)) > FLOWN_OVER * usual_depth(sample, best, good))

@@ -7,6 +7,7 @@ splats look small; the noise behind walls, which no photograph shows, looks coar
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,10 +16,12 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.rendering.api import render_splats
+from meshsplats.rendering.api import Rendering, render_splats
 
 SAMPLE = 50_000
 """Number of splats that panoramas show."""
+SMALL_SAMPLE = 16_000
+"""The same for a first impression."""
 WIDEST = 5.0
 """Largest factor by which the splats of a sample are widened to close surfaces again."""
 SIDE = 24
@@ -28,6 +31,8 @@ SHARP_SIDE = 300
 noise, and in surfaces that no photograph shows from there."""
 CHECK_SIDE = 800
 """The same for images in which single views are checked, of twice the angle."""
+REACH = 4.0
+"""Standard deviations from its centre at which a splat is beyond sight."""
 CONE = 32.0
 """Half the angle of view of a direction of a panorama, degrees."""
 DIRECTIONS = 96
@@ -37,6 +42,11 @@ BINS = np.arange(-8.5, -1.0, 0.5)
 """Logarithms of angles that histograms are made of."""
 BLOCK = 1 << 20
 """Splats that are looked at together."""
+MOST = 4_000_000
+"""Splats of a scene that views are checked with, at most..."""
+MOST_IN_VIEW = 400_000
+"""...and of those in one view: over a hundred for each of its pixels, which hide no hole. Of more, every so
+many stand for all, wider."""
 LEVELS = 255
 """Shares are rounded to this many parts: sums of whole numbers have the same bits in any order."""
 
@@ -67,12 +77,14 @@ def angle_as_color(angle: np.ndarray) -> np.ndarray:
 
 
 class AllSplats:
-    """All splats of a scene: a sample hides holes."""
+    """All splats of a scene, as far as views can tell: a sample as small as that of panoramas hides holes."""
 
     def __init__(self, cloud: GaussianCloud, threads: int | None) -> None:
-        self.cloud, self.threads = cloud, threads
-        self.sizes = sizes_of(cloud.scales)
-        self.reach = 4 * cloud.scales.max(axis=1)
+        step = -(-len(cloud) // MOST)
+        self.cloud = cloud if step == 1 else cloud.take(np.arange(0, len(cloud), step))
+        self.threads, self.wider = threads, float(step) ** 0.5
+        self.sizes = sizes_of(self.cloud.scales)
+        self.reach = REACH * self.wider * self.cloud.scales.max(axis=1)
 
     def look(self, camera: Camera, sharp_side: int = CHECK_SIDE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What ``camera`` sees.
@@ -93,6 +105,8 @@ class AllSplats:
             beside = np.maximum(np.abs(x[:, 0]), np.abs(x[:, 1])) - self.reach[start : start + BLOCK]
             rows.append(start + np.flatnonzero((x[:, 2] > 0) & (beside < slope * x[:, 2])))
         chosen = np.concatenate(rows)
+        step = max(1, -(-len(chosen) // MOST_IN_VIEW))
+        chosen, wider = chosen[::step], np.float32(self.wider * step**0.5)
         if not len(chosen):
             return np.full((camera.height, camera.width), -9.0), *np.zeros((2, camera.height, camera.width))
         whole = self.cloud
@@ -103,7 +117,7 @@ class AllSplats:
         cloud = GaussianCloud(
             means,
             np.take(whole.quaternions, chosen, axis=0),
-            np.take(whole.scales, chosen, axis=0),
+            np.take(whole.scales, chosen, axis=0) * wider,
             np.take(whole.opacities, chosen),
             coded(np.stack([angle, deep, deep * deep], axis=1)),
             whole.kernel,
@@ -124,16 +138,17 @@ class AllSplats:
 class Sample:
     """Splats of a scene, in its frame, and a frame of directions that moves with the scene."""
 
-    def __init__(self, cloud: GaussianCloud, up: np.ndarray | None, threads: int | None) -> None:
-        self.whole, self.threads = AllSplats(cloud, threads), threads
+    def __init__(
+        self, cloud: GaussianCloud, up: np.ndarray | None, threads: int | None, most: int = SAMPLE
+    ) -> None:
+        self.cloud, self.threads = cloud, threads
         n = len(cloud)
-        thin, wider = replace(cloud, sh=cloud.sh[:, :1]), 1.0
-        if n > SAMPLE:
-            rows = np.sort(np.random.default_rng(0).choice(n, SAMPLE, replace=False))
-            thin = cloud.take(rows)
-            wider = min((n / SAMPLE) ** 0.5, WIDEST)
-            thin = replace(thin, scales=thin.scales * np.float32(wider), sh=thin.sh[:, :1])
-        self.thin = thin
+        thin, wider = cloud, 1.0
+        if n > most:
+            thin = cloud.take(np.sort(np.random.default_rng(0).choice(n, most, replace=False)))
+            wider = min((n / most) ** 0.5, WIDEST)
+        self.thin = thin = replace(thin, scales=thin.scales * np.float32(wider), sh=thin.sh[:, :1])
+        self.reach = REACH * thin.scales.max(axis=1)
         self.means = thin.means.astype(np.float64)
         self.size = sizes_of(thin.scales).astype(np.float64) / wider
         self.normals = _normals(thin)
@@ -148,6 +163,11 @@ class Sample:
         weight = (self.gaze @ self.rays.T > np.cos(np.radians(CONE))) * length**-3  # solid angles of pixels
         self.cone = np.round(weight / weight.sum(axis=1, keepdims=True) * 2**20)
         self.cone_sum = self.cone.sum(axis=1)
+
+    @cached_property
+    def whole(self) -> AllSplats:
+        """All splats, against which views are checked."""
+        return AllSplats(self.cloud, self.threads)
 
     def _rays(self, k: int) -> np.ndarray:
         c = (np.arange(SIDE) + 0.5) / SIDE * 2 - 1
@@ -172,20 +192,11 @@ class Sample:
             (DIRECTIONS, bins) shares of the view that opaque pixels of an angle take, (DIRECTIONS,) mean
             alpha, and (6 * SIDE * SIDE,) the distance of each pixel along ``rays``, inf where it is empty.
         """
-        away = np.linalg.norm(self.means - place, axis=1) + 1e-9 * self.radius
-        shown = np.stack([angle_as_color(self.size / away), np.clip(self.near / away, 0, 1)], axis=1)
-        shown = np.concatenate([shown, shown[:, :1]], axis=1)
-        cloud = replace(self.thin, sh=coded(shown))
-        drawn = [
-            render_splats(
-                cloud,
-                self._face(place, k, self.near),
-                background=(0, 0, 0),
-                threads=self.threads,
-                dilation=0.3 * (SIDE / SHARP_SIDE) ** 2,
-            )
-            for k in range(6)
-        ]
+        apart = (self.means - place) @ self.axes.T
+        away = np.linalg.norm(apart, axis=1) + 1e-9 * self.radius
+        angle = angle_as_color(self.size / away)
+        shown = coded(np.stack([angle, np.clip(self.near / away, 0, 1), angle], axis=1))
+        drawn = [self._drawn(place, k, apart, shown) for k in range(6)]
         color = np.concatenate([image.color.reshape(-1, 3) for image in drawn]).astype(np.float64)
         alpha = np.concatenate([image.alpha.ravel() for image in drawn]).astype(np.float64)
         solid = np.round(np.clip((alpha - 0.7) / 0.25, 0, 1) * LEVELS)  # surfaces have no holes, noise has
@@ -199,6 +210,30 @@ class Sample:
         scale = self.cone_sum[:, None] * LEVELS
         seen = (self.cone @ np.round(alpha * LEVELS)) / scale[:, 0]
         return (self.cone @ shares) / scale, seen, depth
+
+    def _drawn(self, place: np.ndarray, k: int, apart: np.ndarray, shown: np.ndarray) -> Rendering:
+        """Face ``k`` of the panorama from ``place``: of the splats that reach into it.
+
+        Args:
+            apart: (n, 3) of the splats from there, along ``axes``.
+            shown: (n, 1, 3) their harmonics.
+        """
+        ahead = apart[:, k % 3] if k < 3 else -apart[:, k % 3]
+        beside = np.abs(np.delete(apart, k % 3, axis=1)).max(axis=1)
+        rows = np.flatnonzero((ahead > 0) & (beside < ahead + self.reach))
+        thin = self.thin
+        cloud = GaussianCloud(
+            *(np.take(v, rows, axis=0) for v in (thin.means, thin.quaternions, thin.scales, thin.opacities)),
+            np.take(shown, rows, axis=0),
+            thin.kernel,
+        )
+        return render_splats(
+            cloud,
+            self._face(place, k, self.near),
+            background=(0, 0, 0),
+            threads=self.threads,
+            dilation=0.3 * (SIDE / SHARP_SIDE) ** 2,
+        )
 
     def depth_along(self, depth: np.ndarray, gaze: np.ndarray) -> float:
         """Mean of the logarithm of ``depth`` (of a panorama) in the view along ``gaze`` (3,), as a depth."""

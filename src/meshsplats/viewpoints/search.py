@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from meshsplats.viewpoints.sample import BINS, DIRECTIONS, Sample, merit
 
 ROUNDS = (120, 80, 60)
 """Numbers of places: first all over the scene, then around the best ones so far."""
+FEW = (48, 32, 20)
+"""The same for a first impression."""
 ANGLES = (0.003, 0.02)
 """The first places are as far from a splat as makes it look this large, radians."""
 NATURAL = np.exp(np.arange(-7.0, -3.4, 0.25))
@@ -64,8 +67,9 @@ def _weighed(shares: np.ndarray, natural: float, finer: float) -> np.ndarray:
     return np.einsum("kdb,b->kd", shares, merit(BINS, natural, finer), optimize=False)
 
 
-def find_places(sample: Sample) -> Places:
-    """Places along the normals of splats, as far away as their size says, then near the best ones."""
+def find_places(sample: Sample, rounds: Sequence[int] = ROUNDS) -> Places:
+    """Places along the normals of splats, as far away as their size says, then near the best ones; as many as
+    the ``rounds`` say."""
     rng = np.random.default_rng(0)
     weight = sample.thin.opacities.astype(np.float64)
     weight = weight / weight.sum() if weight.sum() > 0 else np.full(len(weight), 1 / len(weight))
@@ -73,7 +77,7 @@ def find_places(sample: Sample) -> Places:
     shares: list[np.ndarray] = []
     alpha: list[np.ndarray] = []
     depth: list[np.ndarray] = []
-    for number, count in enumerate(ROUNDS):
+    for number, count in enumerate(rounds):
         if number == 0:
             rows = rng.choice(len(weight), count, p=weight)
             away = sample.size[rows] / np.exp(

@@ -11,6 +11,8 @@ from meshsplats.viewpoints.search import Places
 
 PEAKS = 1200
 """Directions among which the normals of large planes are found."""
+CELLS = 20
+"""Normals that agree within a share of 1 in so many are looked at together."""
 PLANE = 0.96
 """Cosine between a plane's normal and those of its splats, at least."""
 FLOOR, SURE = 0.1, 0.2
@@ -89,6 +91,7 @@ def _area_in_pictures(sample: Sample, best: Places) -> np.ndarray:
 
 def _planes(normals: np.ndarray, area: np.ndarray, axes: np.ndarray) -> list[tuple[float, np.ndarray]]:
     """Shares of the area that face one way, and the mean normal of each, largest first."""
+    normals, area = _gathered(normals, area, axes)
     grid = fibonacci(2 * PEAKS)[:PEAKS] @ axes  # one of each pair of opposites
     cosine = np.abs(normals.astype(np.float32) @ grid.T.astype(np.float32))
     share = np.einsum("ng,n->g", cosine > PLANE, area, optimize=False)
@@ -103,6 +106,23 @@ def _planes(normals: np.ndarray, area: np.ndarray, axes: np.ndarray) -> list[tup
                 normal = mean / max(float(np.linalg.norm(mean)), 1e-30) if on.any() else normal
             found.append((float(share[k]), normal))
     return found[:5]
+
+
+def _gathered(normals: np.ndarray, area: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(k, 3) mean normals, up to their sign, and (k,) areas of splats that face within ``1 / CELLS`` of one
+    way: far fewer than the splats."""
+    along = normals @ axes.T
+    first = np.abs(along).argmax(axis=1)
+    rows = np.arange(len(along))
+    along = along * np.sign(along[rows, first])[:, None]
+    cells = np.floor(along * CELLS).astype(int) + CELLS
+    keys = ((first * (2 * CELLS + 1) + cells[:, 0]) * (2 * CELLS + 1) + cells[:, 1]) * (
+        2 * CELLS + 1
+    ) + cells[:, 2]
+    _, cell = np.unique(keys, return_inverse=True)
+    sums = np.stack([np.bincount(cell, along[:, k] * area) for k in range(3)], axis=1)
+    length = np.maximum(np.linalg.norm(sums, axis=1), 1e-300)
+    return (sums / length[:, None]) @ axes, np.bincount(cell, area)
 
 
 def _ground(height: np.ndarray, weight: np.ndarray) -> float:

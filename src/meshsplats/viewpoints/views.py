@@ -31,8 +31,10 @@ RICH = 0.3
 """Least number of splats that a view shows, as a share of what good views show: noise has few."""
 UNCOMMON = 0.4
 """Least weight of a splat that few of the best places show."""
-NEARBY = 0.35
-"""Distance, in spreads of the places and units of direction, within which views show much the same."""
+NEARBY = 0.7
+"""Distance, in spreads of the places and units of direction, within which views show much the same..."""
+ALIKE = 0.12
+"""...and that within which they are as bad as each other, likely."""
 SIDE = 56
 """Pixels of a side of the images in which views are checked."""
 WIDEST, WIDE, NARROWEST = 84.0, 60.0, 40.0
@@ -180,9 +182,8 @@ class Chooser:
                 k = int(np.argmax(np.where(open_ones, gain, -1)))
             open_ones[k] = False
             if np.isfinite(limit) and self.checked(k).widest(limit) is None:
-                # What lies close by is as bad, likely.
                 apart = ((self.spots - self.spots[k]) ** 2).sum(axis=1)
-                open_ones &= apart > (NEARBY / 3) ** 2
+                open_ones &= apart > ALIKE**2
                 failed += 1
                 continue
             chosen.append(k)

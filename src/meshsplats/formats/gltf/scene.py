@@ -109,16 +109,11 @@ class Skinning:
 
 def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
     """Each mesh of the scene, once for each of its nodes and instances."""
-    nodes, scenes = document.items("nodes"), document.items("scenes")
-    if not scenes and not nodes:
+    nodes = document.items("nodes")
+    if not document.items("scenes") and not nodes:
         yield from (Placed(mesh, np.eye(4)) for mesh in document.items("meshes"))
         return
-    if scenes:
-        scene = document.item("scenes", document.json.get("scene", 0), "the file")
-        roots = _indices(document, scene.get("nodes", []), "nodes of a scene")
-    else:
-        roots = _root_nodes(document)
-    matrices = _world_matrices(document, roots)
+    matrices = _scene_matrices(document)
     for index, matrix in matrices.items():
         node = nodes[index]
         if "mesh" not in node:
@@ -131,6 +126,20 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
             yield from (Placed(mesh, matrix @ own) for own in _instances(document, extensions[INSTANCING]))
         else:
             yield Placed(mesh, matrix, joints)
+
+
+def placed_nodes(document: GltfDocument) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Each node of the scene and (4, 4) from its frame to the scene's."""
+    nodes = document.items("nodes")
+    yield from ((nodes[index], matrix) for index, matrix in _scene_matrices(document).items())
+
+
+def _scene_matrices(document: GltfDocument) -> dict[int, np.ndarray]:
+    """``_world_matrices`` of the file's scene, or of all nodes where it has none."""
+    if not document.items("scenes"):
+        return _world_matrices(document, _root_nodes(document))
+    scene = document.item("scenes", document.json.get("scene", 0), "the file")
+    return _world_matrices(document, _indices(document, scene.get("nodes", []), "nodes of a scene"))
 
 
 def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray]) -> np.ndarray:

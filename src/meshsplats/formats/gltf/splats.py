@@ -74,6 +74,11 @@ def names_splats(document: GltfDocument) -> bool:
     return any(document.uses(name) for name in _EXTENSIONS)
 
 
+def has_own_frame(document: GltfDocument) -> bool:
+    """Whether the file is ours and notes the frame that its splats had, in which they are read."""
+    return any("meshsplats" in dict_or_empty(mesh.get("extras")) for mesh in document.items("meshes"))
+
+
 def placed_clouds(document: GltfDocument, *, strict: bool) -> list[tuple[GaussianCloud, np.ndarray]]:
     """The splats of each primitive, in the frame of its node, and (4, 4) from there to the scene's."""
     return [

@@ -1,0 +1,120 @@
+"""The views that commands show of splats where no option names any: given ones first, then found ones."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from meshsplats._json import read_json
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import cameras_beside
+from meshsplats.cameras.framing import guess_up, unit_up
+from meshsplats.cameras.viewer_settings import NAME, start_camera
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.gltf.cameras import cameras_in_gltf
+from meshsplats.formats.splat_formats import splat_suffixes
+from meshsplats.formats.splat_paths import files_named
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.viewpoints.finding import find_cameras, worth_a_look
+from meshsplats.viewpoints.kind import kind_from_outside
+from meshsplats.viewpoints.walking import keys_of, walk
+
+
+def opening_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
+    """The view with which the splats ``source`` are to open, relative to ``origin``; None if none is given.
+
+    It is the first camera inside a glTF file, or the start camera of SuperSplat's viewer: that of a
+    ``settings.json`` in the folder, which has no other splats. A DataWarning says where it cannot be read.
+    """
+    folder = source if source.is_dir() else source.absolute().parent
+    path = folder / NAME
+    try:
+        if source.is_file() and source.suffix.lower() in (".glb", ".gltf"):
+            camera = next(iter(cameras_in_gltf(source)), None)
+        elif path.is_file() and (folder == source or len(files_named(folder, splat_suffixes())) <= 1):
+            camera = start_camera(read_json(path), path)
+        else:
+            return None
+    except FileFormatError as error:
+        warnings.warn(f"{error}; the start camera is not used", DataWarning, stacklevel=2)
+        return None
+    return None if camera is None else camera.relative_to(np.asarray(origin, np.float64))
+
+
+def opened_with(
+    cameras: Sequence[Camera], source: Path, origin: np.ndarray, side: tuple[int, int]
+) -> list[Camera]:
+    """As many cameras, beginning with ``opening_beside`` where there is one, in images of ``side`` pixels."""
+    opening = opening_beside(source, origin)
+    first = [] if opening is None else [_in_shape(opening, side)]
+    return [*first, *cameras][: len(cameras)]
+
+
+def default_views(
+    scene: GaussianCloud | SplatMesh,
+    source: Path,
+    count: int,
+    *,
+    side: tuple[int, int] = (800, 800),
+    up: np.ndarray | None = None,
+    film: bool = False,
+    given: Sequence[Camera] | None = None,
+) -> tuple[list[Camera], str] | None:
+    """Up to ``count`` views of splats that are no object, and a line that says where they come from. None for
+    objects, which are seen from all around, and for meshes.
+
+    The cameras of a model folder come first, then those that ``find_cameras`` finds. A start camera
+    (``opening_beside``) is the first of these, and of an object, too, where one view is asked for.
+
+    Args:
+        source: the file or folder of the splats.
+        side: width and height of the images, pixels.
+        up: (3,) direction, where the user names it.
+        film: the views are on a smooth round.
+        given: cameras relative to the scene's origin, in place of those of the folder.
+    """
+    if not isinstance(scene, GaussianCloud) or not len(scene):
+        return None
+    if count == 1 and not film and (opening := opening_beside(source, scene.origin)) is not None:
+        return [_in_shape(opening, side)], "seen as the start camera beside or inside the file does"
+    if not worth_a_look(scene):
+        return None
+    given = (cameras_beside(source, scene.origin) or []) if given is None else given
+    if given:
+        toward = guess_up(scene, given) if up is None else unit_up(up)
+        if kind_from_outside(scene, toward)[0] == "object":
+            return None
+        some = _spread(given, keys_of(count) if film else count)
+        views = [_in_shape(camera.with_near_plane(scene.means), side) for camera in some]
+        if film:
+            return walk(
+                views, count, toward
+            ), f"seen on a round through {len(views)} of its {len(given)} cameras"
+        return views, f"seen from {len(views)} of its {len(given)} cameras"
+    number = keys_of(count) if film else count
+    found = find_cameras(scene, number, up=up, width=side[0], height=side[1])
+    if found.kind == "object":
+        return None
+    if film:
+        words = f"seen on a round through {len(found.cameras)} views that were found"
+        return walk(found.cameras, count, found.up), f"{found.in_words()}: {words}"
+    views = opened_with(found.cameras, source, scene.origin, side)
+    return views, f"{found.in_words()}: seen from views that were found"
+
+
+def _spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """Up to ``count`` of the cameras, from all over their list."""
+    count = min(count, len(cameras))
+    return [cameras[i * len(cameras) // count] for i in range(count)]
+
+
+def _in_shape(camera: Camera, side: tuple[int, int]) -> Camera:
+    """The view in an image of another size, whose shorter side spans the same angle."""
+    (width, height), now = side, min(camera.width, camera.height)
+    focal = camera.fx * min(side) / now, camera.fy * min(side) / now
+    return replace(camera, fx=focal[0], fy=focal[1], cx=width / 2, cy=height / 2, width=width, height=height)

@@ -1,0 +1,120 @@
+"""What commands show of splats by default: given views first, then found ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshsplats.cameras.files import save_cameras
+from meshsplats.cameras.trajectories import look_at
+from meshsplats.errors import DataWarning
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.viewpoints import showing
+from meshsplats.viewpoints.finding import FoundCameras
+from meshsplats.viewpoints.showing import default_views, opening_beside
+
+UP = np.array([0.0, -1.0, 0.0])
+START = {"camera": {"position": [1, 2, 3], "target": [0, 0, 0], "fov": 60}}
+
+
+def views(count: int, height: float = 1.0):
+    return [look_at((i, height, 0), (i, height, 1), width=60, height=40, near=0.1) for i in range(count)]
+
+
+def splats(count: int = 40) -> GaussianCloud:
+    points = np.random.default_rng(2).normal(size=(count, 3))
+    turns = np.tile([1.0, 0, 0, 0], (count, 1))
+    return GaussianCloud(
+        points, turns, np.full((count, 3), 0.01), np.full(count, 0.9), np.zeros((count, 1, 3))
+    )
+
+
+@pytest.fixture
+def kind(monkeypatch):
+    """Splats that look like what the list says: a place, at first."""
+    looks = ["place"]
+
+    def found(cloud, count, **options):
+        cameras = tuple(views(count, height=2.0))
+        return FoundCameras(looks[0], 0.4, UP, 1.0, 0.0, 3.0, cameras)
+
+    monkeypatch.setattr(showing, "find_cameras", found)
+    monkeypatch.setattr(showing, "kind_from_outside", lambda cloud, up: (looks[0], 0.4))
+    return looks
+
+
+def heights(cameras) -> set[float]:
+    return {round(float(camera.center[1]), 6) for camera in cameras}
+
+
+def model(folder: Path, count: int = 10) -> Path:
+    save_cameras(views(count), folder / "cameras.json")
+    return folder
+
+
+def test_found_views_where_none_are_given(kind, tmp_path):
+    cameras, words = default_views(splats(), tmp_path, 4, side=(80, 80))
+    assert heights(cameras) == {2.0}
+    assert "views that were found" in words
+    assert len(default_views(splats(), tmp_path, 30, film=True)[0]) == 30
+
+
+def test_cameras_of_a_model_come_before_found_ones(kind, tmp_path):
+    cameras, words = default_views(splats(), model(tmp_path), 5, side=(90, 120))
+    assert heights(cameras) == {1.0}
+    assert [camera.center[0] for camera in cameras] == [0, 2, 4, 6, 8]
+    assert "5 of its 10 cameras" in words
+    for camera in cameras:  # the shorter side spans what it did
+        assert (camera.width, camera.height) == (90, 120)
+        assert camera.fx / 90 == pytest.approx(views(1)[0].fx / 40)
+        assert (camera.cx, camera.cy) == (45, 60)
+    film, words = default_views(splats(), tmp_path, 30, film=True)
+    assert len(film) == 30
+    assert "round through 10 of its 10 cameras" in words
+    given, _ = default_views(splats(), tmp_path, 5, given=views(3, height=5.0))
+    assert heights(given) == {5.0}
+
+
+def test_objects_and_meshes_are_seen_from_all_around(kind, tmp_path):
+    kind[0] = "object"
+    assert default_views(splats(), tmp_path, 4) is None
+    assert default_views(splats(), model(tmp_path), 4) is None
+    kind[0] = "place"
+    mesh = SplatMesh(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), np.zeros((3, 4)))
+    assert default_views(mesh, tmp_path, 4) is None
+    nothing = splats().take(np.arange(0))
+    assert default_views(nothing, tmp_path, 4) is None
+    huge = replace(splats(2000), scales=np.full((2000, 3), 50.0))  # would take long
+    assert default_views(huge, tmp_path, 4) is None
+
+
+def test_the_start_camera_is_the_first_view(kind, tmp_path):
+    (tmp_path / "settings.json").write_text(json.dumps(START))
+    cameras, _ = default_views(splats(), tmp_path, 4)
+    assert np.allclose(cameras[0].center, [-1, -2, 3])
+    assert len(cameras) == 4
+    assert heights(cameras[1:]) == {2.0}
+    assert heights(default_views(splats(), tmp_path, 4, film=True)[0]) == {2.0}
+    kind[0] = "object"
+    ((only,), words) = default_views(splats(), tmp_path, 1)
+    assert np.allclose(only.center, [-1, -2, 3])
+    assert "start camera" in words
+
+
+def test_a_start_camera_is_of_the_only_splats_of_its_folder(tmp_path):
+    source = tmp_path / "a.ply"
+    source.touch()
+    assert opening_beside(source) is None
+    (tmp_path / "settings.json").write_text(json.dumps(START))
+    assert np.allclose(opening_beside(source, (1, 0, 0)).center, [-2, -2, 3])
+    (tmp_path / "b.sog").touch()
+    assert opening_beside(source) is None
+    assert opening_beside(tmp_path) is not None
+    (tmp_path / "settings.json").write_text(json.dumps({"camera": {"position": [1], "target": [0, 0, 0]}}))
+    with pytest.warns(DataWarning, match="the start camera is not used"):
+        assert opening_beside(tmp_path) is None
