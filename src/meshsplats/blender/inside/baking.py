@@ -111,7 +111,8 @@ def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
             with _held([(target, "hide_render", False), (target, "hide_viewport", False)]):
                 _bake(target)
             for where, level in shown.items():
-                levels.show(chain, level, where)
+                if level is not None:
+                    levels.show(chain, level, where)
             show(obj.data, smoothed(target.data))
     for obj in chosen:
         obj[STATE] = state(scene, obj)
