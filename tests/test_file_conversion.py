@@ -25,7 +25,7 @@ PLAIN = Surroundings(
     place=lambda scene: scene,
     record=record,
     preview=lambda scene, path, camera=None: path.write_bytes(b"drawn"),
-    opening=lambda cloud: None,
+    opening=lambda cloud, source, seen: None,
 )
 
 
