@@ -130,10 +130,10 @@ class ViewOptions:
             lens["fov"] = 75.0 if fov is None else fov
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
         if not self._placed:
-            side, told = (width, lens["height"]), None if self.up is None else lens["up"]
+            shape, told = (width, lens["height"]), None if self.up is None else lens["up"]
             number = count if self.orbit is None else self.orbit
             film = (film or self.orbit is not None) and number > 1
-            if views := views_of_a_place(scene, source, number, side=side, up=told, film=film):
+            if views := views_of_a_place(scene, source, number, side=shape, up=told, film=film):
                 return views
         lens["fov"] = 45.0 if fov is None else fov
         target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)

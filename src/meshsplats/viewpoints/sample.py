@@ -223,7 +223,10 @@ class Sample:
         rows = np.flatnonzero((ahead > 0) & (beside < ahead + self.reach))
         thin = self.thin
         cloud = GaussianCloud(
-            *(np.take(v, rows, axis=0) for v in (thin.means, thin.quaternions, thin.scales, thin.opacities)),
+            np.take(thin.means, rows, axis=0),
+            np.take(thin.quaternions, rows, axis=0),
+            np.take(thin.scales, rows, axis=0),
+            np.take(thin.opacities, rows),
             np.take(shown, rows, axis=0),
             thin.kernel,
         )
