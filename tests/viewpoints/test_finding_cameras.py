@@ -12,11 +12,13 @@ from conftest import shared_data
 from meshsplats._geometry import quaternions_of
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.placing import outside_cameras
+from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.viewpoints.finding import FoundCameras, find_cameras
+from meshsplats.viewpoints.finding import FoundCameras, find_cameras, first_impression
+from meshsplats.viewpoints.sample import AllSplats, Sample
 from meshsplats.viewpoints.views import Checked
 
 HALF = np.array([2.0, 1.3, 3.0])
@@ -28,14 +30,16 @@ def room(count: int = 20_000, noise: int = 8000) -> GaussianCloud:
     """A room with a table in it, closed and sharp from within, in a cloud of large splats."""
     rng = np.random.default_rng(3)
     area = np.repeat([HALF[1] * HALF[2], HALF[0] * HALF[2], HALF[0] * HALF[1]], 2)
-    wall = rng.choice(6, count, p=area / area.sum())
+    table = count // 12
+    ends = np.round(np.cumsum(area) / area.sum() * (count - table)).astype(int)
+    wall = np.append(np.repeat(np.arange(6), np.diff(ends, prepend=0)), np.full(table, 3))
     axis, side = wall // 2, np.where(wall % 2, 1.0, -1.0)
-    points = rng.uniform(-1, 1, (count, 3)) * HALF
-    points[np.arange(count), axis] = side * HALF[axis]
-    table = slice(0, count // 12)
-    points[table] = np.array([0.9, 0.9, -1.4]) + rng.uniform(-0.4, 0.4, (count // 12, 3))
-    points[table, 1] = 0.5
-    axis[table] = 1
+    even = 2 * ((0.5 + np.arange(count)[:, None] * 1.32471795724 ** -np.array([1, 2])) % 1) - 1
+    points = np.stack([side * (axis == k) for k in range(3)], axis=1)
+    for k in range(3):
+        points[axis == k, k - 2], points[axis == k, k - 1] = even[axis == k].T
+    points *= HALF
+    points[-table:] = np.array([0.9, 0.5, -1.4]) + 0.4 * points[-table:] / HALF * [1, 0, 1]
     scales = np.full((count, 3), 0.045)
     scales[np.arange(count), axis] = 0.002
     shell = rng.normal(size=(noise, 3))
@@ -152,6 +156,52 @@ def test_the_widest_lens_of_a_good_picture(found):
     assert view.widest(1) == 2
     assert view.widest(0.01) is None
     assert view.with_lens(2, 800, 600).fx == pytest.approx(found.cameras[0].fx * 2 * 600 / 400)
+
+
+@pytest.mark.slow
+def test_a_first_impression_says_what_the_search_does(found):
+    scene = first_impression(room(), threads=2)
+    assert scene.kind in ("place", "ring")
+    assert scene.cameras == ()
+    assert scene.up @ found.up > np.cos(np.radians(2))
+    assert abs(scene.ground - found.ground) < 0.1
+    assert 0.5 < scene.extent / found.extent < 2
+    told = first_impression(replace(room(4000), up=np.array([0.0, -0.8, 0.6])), threads=2)
+    assert told.up_confidence == 1
+    assert told.up @ [0, -0.8, 0.6] > 1 - 1e-6
+
+
+def test_a_first_impression_of_an_object_and_of_nothing():
+    small = room(400, 0)
+    scene = first_impression(small)
+    assert (scene.kind, scene.cameras) == ("object", ())
+    assert (scene.up == [0, -1, 0]).all()
+    assert first_impression(small.take(np.arange(0))) is None
+    assert first_impression(replace(room(), scales=np.full((28_000, 3), 40.0))) is None  # takes long
+
+
+def test_faces_of_a_panorama_leave_out_what_they_do_not_show():
+    sample = Sample(room(3000, 500), np.array([0.0, -1, 0]), 1)
+    place = np.array([0.4, -0.2, 0.9])
+    shares, alpha, depth = sample.panorama(place)
+    sample.reach = np.full_like(sample.reach, np.inf)
+    for mine, whole in zip((shares, alpha, depth), sample.panorama(place), strict=True):
+        assert (np.isfinite(mine) == np.isfinite(whole)).mean() > 0.999
+        both = np.isfinite(mine) & np.isfinite(whole)
+        assert np.abs(mine[both] - whole[both]).mean() < 0.004
+
+
+@pytest.mark.parametrize(("limit", "count"), [("MOST", 60_000), ("MOST_IN_VIEW", 20_000)])
+def test_some_of_many_splats_show_what_all_do(limit, count, monkeypatch):
+    camera = look_at((0, 0, -2), (0.2, 0.1, 2), width=24, height=24, fov=70, near=0.02)
+    cloud = room(120_000, 100)
+    cloud = replace(cloud, scales=cloud.scales * np.float32(0.5))
+    angle, alpha, spread = AllSplats(cloud, 2).look(camera)
+    monkeypatch.setattr(f"meshsplats.viewpoints.sample.{limit}", count)
+    few_angle, few_alpha, few_spread = AllSplats(cloud, 2).look(camera)
+    assert np.abs(few_alpha - alpha).mean() < 0.04
+    assert np.abs(few_angle - angle).mean() < 0.1
+    assert np.abs(few_spread - spread).mean() < 0.05
 
 
 @pytest.mark.slow

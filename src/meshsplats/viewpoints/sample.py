@@ -226,7 +226,7 @@ class Sample:
             np.take(thin.means, rows, axis=0),
             np.take(thin.quaternions, rows, axis=0),
             np.take(thin.scales, rows, axis=0),
-            np.take(thin.opacities, rows, axis=0),
+            np.take(thin.opacities, rows),
             np.take(shown, rows, axis=0),
             thin.kernel,
         )
