@@ -212,7 +212,7 @@ class SetUpStage(Modal, bpy.types.Operator):
 
     fast: BoolProperty(
         name="Fast",
-        description="A preview: rougher light and colours, in a fraction of the time",
+        description="A preview: rougher light and colours, in less time",
         default=False,
     )
 
@@ -253,9 +253,7 @@ class BakeLight(Modal, bpy.types.Operator):
         description="Lamps light the splats in every image, slower and with noise; baked light is dropped",
         default=False,
     )
-    fast: BoolProperty(
-        name="Fast", description="A preview: rougher light, in a fraction of the time", default=False
-    )
+    fast: BoolProperty(name="Fast", description="A preview: rougher light, in less time", default=False)
     only_active: BoolProperty(
         name="Only Active", description="Of the active object, not of all", default=False
     )

@@ -105,7 +105,7 @@ class MeshSplatsSource(Choices, bpy.types.PropertyGroup):
 def register():
     bpy.types.Scene.meshsplats_fast = BoolProperty(
         name="Fast Light",
-        description="Prepare light for a preview: rougher, in a fraction of the time",
+        description="Prepare light for a preview: rougher, in less time",
         default=False,
     )
     bpy.utils.register_class(MeshSplatsSource)
