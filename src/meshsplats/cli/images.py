@@ -14,7 +14,8 @@ from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome, look_around, orbit
-from meshsplats.cli.common import Count, File, Folder, Missing, Number, Point, Text, check_data, parse_up
+from meshsplats.cli import option
+from meshsplats.cli.common import check_data, parse_up
 from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.datasets.views import Dataset
 from meshsplats.gaussians import GaussianCloud
@@ -23,6 +24,8 @@ from meshsplats.mesh import SplatMesh
 OrderOfBlending = Annotated[
     Literal["fragment", "splat"] | None, tyro.conf.arg(metavar="{fragment,splat}", help_behavior_hint="")
 ]
+EXCLUSIVE_VIEWS = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
+"""Options of views of which one may be given."""
 LONG_SECONDS = 10
 """Images that take longer than this, as far as can be estimated, are announced."""
 
@@ -31,41 +34,41 @@ LONG_SECONDS = 10
 class ViewOptions:
     """Cameras and image size. Orbit, dome, look-around, cameras and data exclude each other."""
 
-    orbit: Count = None
+    orbit: option.Count = None
     """N views on a circle around the subject; in splats of a place, on a round through its own cameras or
     views found in it, unless --elevation, --azimuth, --distance, --look-at, --fov or --focal-length is
     given."""
-    dome: Count = None
+    dome: option.Count = None
     """N views spread evenly over the upper half of a sphere around the subject."""
-    look_around: Count = None
+    look_around: option.Count = None
     """N views from the middle of the scene, such as a room, in one full turn."""
-    cameras: File = None
+    cameras: option.File = None
     """Camera file: a JSON list, a cameras.json of a 3DGS trainer, a camera_path.json of nerfstudio; or the
     model folder that has one."""
-    data: Folder = None
+    data: option.Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
     """With --data: factor by which images are smaller than the photographs."""
-    missing: Missing = "error"
-    elevation: Number = None
+    missing: option.Missing = "error"
+    elevation: option.Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
     """Degrees of the first view: 0 from the front, 90 from the subject's right-hand side in that view."""
     distance: float = 1.0
     """Multiple of the distance from which the subject just fits the image."""
-    look_at: Point = None
+    look_at: option.Point = None
     """Point to look at and to circle, in the coordinates of the file. Default: the middle of the subject."""
-    fov: Number = None
+    fov: option.Number = None
     """Field of view across the shorter side of the image, degrees. Default: 45; 75 with --look-around."""
-    focal_length: Number = None
+    focal_length: option.Number = None
     """Focal length in mm on 35 mm film, whose 36 mm span the image width: 50 is normal, 85 for portraits, 24
     wide. In place of --fov."""
-    up: Text = None
+    up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
     folder, of the file, else -y, as in COLMAP's scenes."""
-    width: Count = None
+    width: option.Count = None
     """Image width in pixels. With --cameras or --data, images are scaled to this width."""
-    height: Count = None
+    height: option.Count = None
     """Image height in pixels. Default: the width. Not with --cameras or --data."""
 
     @property
@@ -130,10 +133,10 @@ class ViewOptions:
             lens["fov"] = 75.0 if fov is None else fov
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
         if not self._placed:
-            shape, told = (width, lens["height"]), None if self.up is None else lens["up"]
+            size, told = (width, lens["height"]), None if self.up is None else lens["up"]
             number = count if self.orbit is None else self.orbit
             film = (film or self.orbit is not None) and number > 1
-            if views := views_of_a_place(scene, source, number, side=shape, up=told, film=film):
+            if views := views_of_a_place(scene, source, number, side=size, up=told, film=film):
                 return views
         lens["fov"] = 45.0 if fov is None else fov
         target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
@@ -152,11 +155,7 @@ class ViewOptions:
                 else "give --downscale or --width"
             )
         check_data(self.data, self.missing)
-        modes = [
-            name
-            for name in ("orbit", "dome", "look_around", "cameras", "data")
-            if getattr(self, name) is not None
-        ]
+        modes = [name for name in EXCLUSIVE_VIEWS[0] if getattr(self, name) is not None]
         if len(modes) > 1:
             raise UsageError(f"give one of {', '.join(map(flag, modes))}, not several")
         if self.fov is not None and self.focal_length is not None:
@@ -178,22 +177,21 @@ class ViewOptions:
 class DrawOptions:
     """How images are rendered."""
 
-    background: Text = None
+    background: option.Text = None
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with --data that of the
     model folder or of the photographs."""
-    samples: Count = None
+    samples: option.Count = None
     """Side of the sample grid in each pixel: 2 means 2 x 2. Default: what the mesh needs at this size, 2 to
     8; 1 for splats, whose filter is as wide as a pixel. compare: of the mesh."""
-    sh_degree: Count = None
+    sh_degree: option.Count = None
     """Render splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
-    max_layers: Count = None
+    max_layers: option.Count = None
     """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default:
     all."""
     order: OrderOfBlending = None
     """Order in which the triangles of a mesh are blended: exact at every sample, or whole splats by their
     centres. Default: that of the mesh."""
-    threads: Count = None
-    """Maximum number of threads. Default: all processors."""
+    threads: option.Threads = None
     device: Literal["cpu", "gpu"] = "cpu"
     """Where meshes are rendered. gpu: by WebGPU, on any graphics card (extra gpu)."""
 
@@ -229,8 +227,3 @@ def announce_cost(
     ):
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
-
-
-def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
-    """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
-    return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]
