@@ -863,6 +863,31 @@ def test_a_trained_mesh_outlives_a_failure_to_write_its_splats(ball, tmp_path, m
     assert fan_count(load_mesh(tmp_path / "mesh.npz")) <= 100
 
 
+def test_splats_are_made_up_for_after_ctrl_c_while_they_were_fitted(ball, tmp_path, monkeypatch, capsys):
+    from meshsplats.training import as_splats
+
+    fit = as_splats.fit_splats
+
+    def stopped(*_args, **_more):
+        raise Interrupted(3, signal.SIGINT)
+
+    monkeypatch.setattr(as_splats, "fit_splats", stopped)
+    views, splats = ball.train[:4], tmp_path / "splats.ply"
+    folder = write_photographs(
+        tmp_path / "photos", [view.camera for view in views], [straight(view) for view in views]
+    )
+    words = ["train", str(folder), "-o", str(tmp_path / "mesh.npz"), "--steps", "1", "--start-splats", "100"]
+    words += ["--max-splats", "100", "--test-every", "0", "--as-splats", str(splats)]
+    assert main(words) == 128 + signal.SIGINT
+    assert "--resume --force goes on to it" in capsys.readouterr().err
+    assert not splats.exists()
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    monkeypatch.setattr(as_splats, "fit_splats", fit)
+    assert main([*words, "--resume", "--force"]) == 0
+    assert same(load_mesh(tmp_path / "mesh.npz"), mesh)
+    assert len(load_gaussians(splats)) > fan_count(mesh)
+
+
 def straight(view) -> np.ndarray:
     """(h, w, 4) image with straight colours, as .png files have them."""
     image = view.load()
