@@ -20,7 +20,7 @@ from meshsplats.rendering.api import Rendering, render_splats
 
 SAMPLE = 50_000
 """Number of splats that panoramas show."""
-SMALL_SAMPLE = 16_000
+SMALL_SAMPLE = 32_000
 """The same for a first impression."""
 WIDEST = 5.0
 """Largest factor by which the splats of a sample are widened to close surfaces again."""
