@@ -337,8 +337,7 @@ def test_options_that_a_surface_has_not(folder, surface, tmp_path, capsys):
 
 
 def test_a_mesh_with_several_textures_is_shown_in_its_colours(tmp_path, surface):
-    import trimesh
-
+    trimesh = pytest.importorskip("trimesh")
     visuals = [
         trimesh.visual.TextureVisuals(
             uv=np.eye(3)[:, :2],

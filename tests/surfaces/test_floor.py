@@ -11,6 +11,7 @@ import meshsplats as ms
 from meshsplats.cli import main
 from meshsplats.surfaces.floor import CELL, TUCKED, missing_ground
 
+pytest.importorskip("scipy", reason="install meshsplats[base]")
 needs_extra = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("skimage", "fast_simplification")),
     reason="install meshsplats[base]",
