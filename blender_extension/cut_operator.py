@@ -7,12 +7,8 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 
-from .settings import copy_choices
+from .settings import copy_choices, is_splat_mesh
 from .work import waiting
-
-
-def is_splats(obj):
-    return obj is not None and obj.type == "MESH" and "meshsplats_lit" in obj.data
 
 
 def cut(context, obj, mesh, faces, *, action="delete"):
@@ -81,7 +77,7 @@ class CutSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return is_splats(context.object) and context.object.mode == "OBJECT"
+        return is_splat_mesh(context.object) and context.object.mode == "OBJECT"
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
@@ -195,7 +191,7 @@ class AdjustSplats(bpy.types.Operator):
 
         values = {name: getattr(self, name) for name in ("saturation", "brightness", "contrast", "opacity")}
         change = adjusting.Adjustment(hue=math.degrees(self.hue), **values)
-        chosen = {context.object, *(obj for obj in context.selected_objects if is_splats(obj))}
+        chosen = {context.object, *(obj for obj in context.selected_objects if is_splat_mesh(obj))}
         every = {level for obj in chosen for level in levels.with_levels(obj)}
         with waiting(context):
             for data in {obj.data for obj in every}:

@@ -10,6 +10,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from meshsplats.formats.splat_formats import written_suffixes
 
+from .settings import is_splat_mesh
 from .work import waiting
 
 FORMATS = [
@@ -19,10 +20,37 @@ FORMATS = [
     (".usdc", "USD (.usdc)", "Colour and opacity as primvars; needs the Python module pxr"),
 ]
 SPLAT_SUFFIXES = written_suffixes()
-LIT = "meshsplats_lit"
 
 
-class ExportMeshSplats(bpy.types.Operator, ExportHelper):
+class Export(ExportHelper):
+    """Mix-in for operators that export splat meshes: ``save`` writes some objects, and says what it wrote."""
+
+    use_selection: BoolProperty(
+        name="Selected Only", description="Otherwise all visible splat meshes", default=False
+    )
+
+    def execute(self, context):
+        from meshsplats.blender.inside import exporting
+
+        path = self.filepath
+        if not path.lower().endswith(self.suffixes):
+            path += self.suffix
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        try:
+            with waiting(context), warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                written = self.save(exporting.chosen(context.view_layer, selected=self.use_selection), path)
+        except (ValueError, OSError, ImportError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for warning in caught:
+            self.report({"WARNING"}, str(warning.message))
+        self.report({"INFO"}, f"MeshSplats: {path}, {written}")
+        return {"FINISHED"}
+
+
+class ExportMeshSplats(Export, bpy.types.Operator):
     """Export splat meshes with colours and opacities, where they are and as their modifiers make them"""
 
     bl_idname = "export_scene.meshsplats"
@@ -30,45 +58,32 @@ class ExportMeshSplats(bpy.types.Operator, ExportHelper):
     bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
 
     filename_ext = ".glb"
+    suffixes = tuple(suffix for suffix, *_ in FORMATS)
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix, *_ in FORMATS), options={"HIDDEN"})
     format: EnumProperty(name="Format", description="Of a name without suffix", items=FORMATS)
-    use_selection: BoolProperty(
-        name="Selected Only", description="Otherwise all visible splat meshes", default=False
-    )
+
+    @property
+    def suffix(self):
+        return self.format
 
     def check(self, context):
         stem = self.filepath
-        for suffix, *_ in FORMATS:
+        for suffix in self.suffixes:
             stem = stem.removesuffix(suffix)
         changed = stem + self.format
         different, self.filepath = changed != self.filepath, changed
         return different
 
-    def execute(self, context):
+    def save(self, objs, path):
         from meshsplats.blender.inside import exporting
         from meshsplats.formats.meshes import save_mesh
 
-        path = self.filepath
-        if not path.lower().endswith(tuple(suffix for suffix, *_ in FORMATS)):
-            path += self.format
-        if context.mode != "OBJECT":
-            bpy.ops.object.mode_set(mode="OBJECT")
-        try:
-            with waiting(context), warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
-                objs = exporting.chosen(context.view_layer, selected=self.use_selection)
-                mesh = exporting.exported(objs)
-                save_mesh(mesh, path)
-        except (ValueError, OSError, ImportError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        for warning in caught:
-            self.report({"WARNING"}, str(warning.message))
-        self.report({"INFO"}, f"MeshSplats: {path}, {len(objs)} objects, {len(mesh.faces):,} triangles")
-        return {"FINISHED"}
+        mesh = exporting.exported(objs)
+        save_mesh(mesh, path)
+        return f"{len(objs)} objects, {len(mesh.faces):,} triangles"
 
 
-class ExportSplats(bpy.types.Operator, ExportHelper):
+class ExportSplats(Export, bpy.types.Operator):
     """Export splat meshes as the Gaussian splats that they were made from, with the edits since: those that
     have all their triangles"""
 
@@ -76,37 +91,22 @@ class ExportSplats(bpy.types.Operator, ExportHelper):
     bl_label = "Export Gaussian Splats"
     bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
 
-    filename_ext = ".ply"
+    filename_ext = suffix = ".ply"
+    suffixes = SPLAT_SUFFIXES
     check_extension = None  # the name decides among the formats, also with two suffixes
     filter_glob: StringProperty(default=";".join(f"*{s}" for s in SPLAT_SUFFIXES), options={"HIDDEN"})
-    use_selection: BoolProperty(
-        name="Selected Only", description="Otherwise all visible splat meshes", default=False
-    )
 
-    def execute(self, context):
+    def save(self, objs, path):
         from meshsplats.blender.inside import exporting
         from meshsplats.formats.gaussians import save_gaussians
 
-        path = self.filepath
-        if not path.lower().endswith(SPLAT_SUFFIXES):
-            path += self.filename_ext
-        if context.mode != "OBJECT":
-            bpy.ops.object.mode_set(mode="OBJECT")
-        try:
-            with waiting(context), warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
-                objs = exporting.chosen(context.view_layer, selected=self.use_selection)
-                cloud, cut = exporting.exported_splats(objs)
-                save_gaussians(cloud, path)
-        except (ValueError, OSError, ImportError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        for warning in caught:
-            self.report({"WARNING"}, str(warning.message))
+        cloud, cut = exporting.exported_splats(objs)
+        save_gaussians(cloud, path)
         if cut:
-            self.report({"WARNING"}, f"MeshSplats: left out {cut:,} splats that lack some of their triangles")
-        self.report({"INFO"}, f"MeshSplats: {path}, {len(cloud):,} splats")
-        return {"FINISHED"}
+            warnings.warn(
+                f"MeshSplats: left out {cut:,} splats that lack some of their triangles", stacklevel=1
+            )
+        return f"{len(cloud):,} splats"
 
 
 _stock = None
@@ -117,7 +117,7 @@ def glTF2_pre_export_callback(export_settings):
     """Gives splat meshes the names and nodes that Blender's glTF exporter knows."""
     global _stock
     _restore()
-    objs = [obj for obj in bpy.context.scene.objects if obj.type == "MESH" and LIT in obj.data]
+    objs = [obj for obj in bpy.context.scene.objects if is_splat_mesh(obj)]
     if objs:
         from meshsplats.blender.inside import exporting
 

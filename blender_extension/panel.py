@@ -16,7 +16,7 @@ from .object_operators import (
     SetUpStage,
     ShowLevel,
 )
-from .settings import draw_choices
+from .settings import LIT, draw_choices
 
 CHAIN, LEVEL = "meshsplats_levels", "meshsplats_level"
 """Properties of the collections of levels of detail; ``meshsplats.blender.inside.levels`` sets them."""
@@ -28,7 +28,7 @@ BREAK_SPLATS = {"BOOLEAN", "DECIMATE", "REMESH", "SUBSURF", "MULTIRES", "SOLIDIF
 
 def light_warning(scene, obj):
     """What is wrong with the baked light of ``obj``, or ''."""
-    if not obj.data.get("meshsplats_lit") or obj.get("meshsplats_base") is not None:
+    if not obj.data.get(LIT) or obj.get("meshsplats_base") is not None:
         return ""
     from meshsplats.blender.inside import baking, stand_ins
 
@@ -41,7 +41,7 @@ def light_warning(scene, obj):
 
 def modifier_warning(obj):
     """Which modifier of the splats ``obj`` leaves no whole ones, or ''."""
-    if "meshsplats_lit" not in obj.data:
+    if LIT not in obj.data:
         return ""
     broken = next((m for m in obj.modifiers if m.type in BREAK_SPLATS and m.show_render), None)
     return "" if broken is None else f"{broken.name} tears splats to strips: Cut Splats cuts whole ones"
@@ -113,7 +113,7 @@ class MeshSplatsPanel(bpy.types.Panel):
             if obj.get("meshsplats_problem"):
                 box.label(text=obj["meshsplats_problem"], icon="ERROR")
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
-        if "meshsplats_lit" in obj.data:
+        if LIT in obj.data:
             row = layout.row(align=True)
             row.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
             crop = row.operator(CutSplats.bl_idname, text="Crop to Box")
@@ -128,7 +128,7 @@ class MeshSplatsPanel(bpy.types.Panel):
         row = layout.row(align=True)
         row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"
         row.operator(SetShading.bl_idname, text="Lit").shading = "lit"
-        if obj.data.get("meshsplats_lit"):
+        if obj.data.get(LIT):
             for live, text in ((False, "Baked"), (True, "Live")):
                 button = row.operator(BakeLight.bl_idname, text=text)
                 button.live, button.only_active, button.fast = live, True, bpy.context.scene.meshsplats_fast

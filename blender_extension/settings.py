@@ -4,6 +4,14 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
+LIT = "meshsplats_lit"
+"""Property of the data of splat meshes; ``meshsplats.blender.inside.objects`` sets it."""
+
+
+def is_splat_mesh(obj):
+    """Whether the object is a splat mesh; it may be None."""
+    return obj is not None and obj.type == "MESH" and LIT in obj.data
+
 
 class Choices:
     """Properties shared by the import operator and by the objects it made."""

@@ -7,8 +7,8 @@ import time
 import bpy
 from bpy.app.handlers import persistent
 
-LIT = "meshsplats_lit"
-"""Property of the data of splat meshes; ``meshsplats.blender.inside.objects`` sets it."""
+from .settings import is_splat_mesh
+
 SAME = 0.99998
 """Cosine between two directions, a third of a degree apart, above which the order stays."""
 
@@ -20,7 +20,7 @@ _wanted = {}
 
 
 def has_splats(scene):
-    return any(obj.type == "MESH" and LIT in obj.data for obj in scene.objects)
+    return any(map(is_splat_mesh, scene.objects))
 
 
 def blends(space, scene):

@@ -10,7 +10,7 @@ from _splats import few_splats
 
 import meshsplats as ms
 from meshsplats.evaluation.mesh_files import MeshFileOptions
-from meshsplats.file_conversion import Maker, Product, Surroundings, seen_from
+from meshsplats.file_conversion import Callbacks, Converter, Product, seen_from
 from meshsplats.jobs import jobs
 
 
@@ -19,7 +19,7 @@ def record(job):
         path.write_text("noted")
 
 
-PLAIN = Surroundings(
+PLAIN = Callbacks(
     load=ms.load_gaussians,
     stream=ms.stream_gaussians,
     place=lambda scene: scene,
@@ -37,7 +37,7 @@ def job(tmp_path):
 
 
 def test_a_mesh_appears_in_every_format_with_its_record_and_preview(job, tmp_path):
-    result = Maker(Product(scale=2.0), PLAIN).made(job, [])
+    result = Converter(Product(scale=2.0), PLAIN).made(job, [])
     mesh = ms.convert(ms.load_gaussians(job.source))
     assert (result["converted"], result["triangles"]) == (mesh.splat_count, len(mesh.faces))
     for path in job.outputs:
@@ -49,9 +49,9 @@ def test_a_mesh_appears_in_every_format_with_its_record_and_preview(job, tmp_pat
 def test_blocks_give_the_mesh_of_the_whole(job):
     one = replace(job, outputs=job.outputs[1:], configs=job.configs[1:])
     files = MeshFileOptions(alpha="blend")
-    Maker(Product(files=files), PLAIN).made(one, None)
+    Converter(Product(files=files), PLAIN).made(one, None)
     whole = one.outputs[0].read_bytes()
-    result = Maker(Product(in_blocks=True), PLAIN).made(one, None)
+    result = Converter(Product(in_blocks=True), PLAIN).made(one, None)
     assert one.outputs[0].read_bytes() == whole
     assert result["splats"] == len(few_splats())
 
@@ -61,16 +61,16 @@ def test_splats_are_chosen_and_a_mesh_is_none(job, tmp_path, budget):
     product = Product(as_splats=True, conversion=ms.ConversionOptions(max_splats=3, budget=budget))
     assert product.merges == (budget == "merge")
     splats = replace(job, outputs=(tmp_path / "c.splat",), configs=())
-    assert Maker(product, PLAIN).made(splats, [])["written"] == 3
+    assert Converter(product, PLAIN).made(splats, [])["written"] == 3
     ms.save_mesh(ms.convert(few_splats()), tmp_path / "m.npz")
     with pytest.raises(ms.FileFormatError, match="not splats"):
-        Maker(product, PLAIN).made(replace(splats, source=tmp_path / "m.npz"), [])
+        Converter(product, PLAIN).made(replace(splats, source=tmp_path / "m.npz"), [])
 
 
 def test_an_error_in_one_format_leaves_no_file_of_another(job, tmp_path):
     wrong = replace(job, outputs=(job.outputs[0], tmp_path / "b.none"))
     with pytest.raises(ValueError, match="does not name a mesh format"):
-        Maker(Product(), PLAIN).made(wrong, [])
+        Converter(Product(), PLAIN).made(wrong, [])
     assert not job.outputs[0].exists()
 
 

@@ -61,6 +61,13 @@ def direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
     return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
 
 
+def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) at right angles to each other and to the unit vector ``up``."""
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= np.linalg.norm(first)
+    return first, np.cross(up, first)
+
+
 def vertex_normals(
     vertices: np.ndarray,
     faces: np.ndarray,

@@ -72,8 +72,8 @@ class Product:
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """What a program does for the maker of its files."""
+class Callbacks:
+    """What a program does for the converter of its files."""
 
     load: Callable[[Path], GaussianCloud]
     stream: Callable[[Path], SplatStream]
@@ -89,12 +89,12 @@ class Surroundings:
 
 
 @dataclass(frozen=True)
-class Maker:
+class Converter:
     """Makes the outputs of jobs. Cameras that ``made`` gets are in the world; None: those of each input, if
     it has some."""
 
     product: Product
-    around: Surroundings
+    callbacks: Callbacks
 
     def made(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``. Returns counts, scores and seconds, for JSON."""
@@ -114,18 +114,18 @@ class Maker:
         """The files that are written within the block appear together with their records: a mesh without one
         cannot be told from a stranger's. The preview, which takes longer, comes later."""
         with together():
-            self.around.record(job)
+            self.callbacks.record(job)
             yield
 
     def _mesh(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         product, start = self.product, time.perf_counter()
-        cloud = self.around.load(job.source)
+        cloud = self.callbacks.load(job.source)
         seen = seen_from(cameras, job.source, cloud.origin)
         read = time.perf_counter()
         mesh = convert(cloud, product.conversion, preset=product.preset, cameras=seen, up=product.up)
         mesh = product.files.prepared(mesh, seen)
         times = {"read": read - start, "convert": time.perf_counter() - read}
-        opening = self.around.opening(cloud, job.source, seen) if job.preview else None
+        opening = self.callbacks.opening(cloud, job.source, seen) if job.preview else None
         return {
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
@@ -136,7 +136,7 @@ class Maker:
 
     def _mesh_in_blocks(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         product, start = self.product, time.perf_counter()
-        source = self.around.stream(job.source)
+        source = self.callbacks.stream(job.source)
         seen = seen_from(cameras, job.source, source.origin)
         blocks = convert_blocks(
             source, product.conversion, preset=product.preset, cameras=seen, up=product.up
@@ -156,7 +156,7 @@ class Maker:
 
     def _splats_in_blocks(self, job: Job) -> dict[str, Any]:
         start = time.perf_counter()
-        source = self.around.stream(job.source)
+        source = self.callbacks.stream(job.source)
         options, count, degree, kernels = self.product.conversion, 0, 0, set()
         for block in source:
             count += len(worth_drawing(block, options))
@@ -197,13 +197,13 @@ class Maker:
         choice = files.choice(mesh, job.outputs, cameras)
         order = files.order(mesh, job.outputs, cameras)
         chosen = time.perf_counter()
-        placed = self.around.place(scaled(mesh, self.product.scale))
+        placed = self.callbacks.place(scaled(mesh, self.product.scale))
         with self._recorded(job):
             files.save(placed, job.outputs, choice, order)
         comparing = "choose alpha" if order is None else "solve order"
         times |= {comparing: chosen - start, "save": time.perf_counter() - chosen}
         if job.preview:
-            self.around.preview(mesh, job.preview, opening)
+            self.callbacks.preview(mesh, job.preview, opening)
         return {
             "triangles": len(mesh.faces),
             "vertices": len(mesh.vertices),
@@ -221,7 +221,7 @@ class Maker:
 
     def _splats(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         start, product = time.perf_counter(), self.product
-        cloud = self._upright(self.around.load(job.source))
+        cloud = self._upright(self.callbacks.load(job.source))
         options = product.conversion
         merging, count = options.budget != "drop", options.max_splats
         kept = choose_splats(
@@ -233,7 +233,7 @@ class Maker:
         if merging and count is not None:
             seen = seen_from(cameras, job.source, kept.origin)
             kept = simplify(kept, count, cameras=seen or None)
-        result = self.around.place(scaled(kept, product.scale))
+        result = self.callbacks.place(scaled(kept, product.scale))
         with self._recorded(job):
             taken = splat_options([written_ending(path.name) for path in job.outputs], **product.of_splats)
             for path, own in zip(job.outputs, taken, strict=True):
@@ -244,14 +244,14 @@ class Maker:
                     save_scene(path, splats=result, mesh=mesh, collider=collider)
         seconds = time.perf_counter() - start
         if job.preview:
-            self.around.preview(kept, job.preview)
+            self.callbacks.preview(kept, job.preview)
         return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
 
     def _part(self, path: Path | None) -> SplatMesh | None:
         """A mesh to write beside the splats, as they are."""
         if path is None:
             return None
-        part: SplatMesh = self.around.place(scaled(self._upright(load_mesh(path)), self.product.scale))
+        part: SplatMesh = self.callbacks.place(scaled(self._upright(load_mesh(path)), self.product.scale))
         return part
 
     def _upright(self, scene: Any) -> Any:

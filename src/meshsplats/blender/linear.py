@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats.blender.options import CAREFUL
 from meshsplats.camera import Camera
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import views_around
@@ -22,8 +23,6 @@ from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 
-STEPS = 72
-VIEWS = 24
 _SIDE = 200
 """Side in pixels of the images around the scene."""
 _CAMERA_SIDE = 480
@@ -43,8 +42,8 @@ def linear_colors(
     mesh: SplatMesh,
     cameras: Sequence[Camera] = (),
     *,
-    steps: int = STEPS,
-    views: int = VIEWS,
+    steps: int = CAREFUL.steps,
+    views: int = CAREFUL.fit_views,
     threads: int | None = None,
 ) -> np.ndarray:
     """(v, 4) float32 RGBA of ``mesh`` for blending in linear light.

@@ -111,7 +111,7 @@ class Effort:
     resolution: int = 96
     """Voxels along the longest side of that surface."""
     samples: int = 12
-    """Samples at each corner of the points at which light is gathered."""
+    """Samples at each of the three corners of a point at which light is gathered."""
 
 
 CAREFUL = Effort()

@@ -17,15 +17,13 @@ import numpy as np
 from meshsplats._cells import Cells
 from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
+from meshsplats.blender.options import CAREFUL
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.normals import typical_spacing, unit, views_around
 from meshsplats.mesh import SplatMesh
 from meshsplats.surfaces.fusion import MIN_PART, grid_around, signed_distances
 
-RESOLUTION = 96
-"""Voxels along the longest side of the surface's grid."""
-VIEWS = 40
 SIDE = 3
 """Side in pixels of the depth images, in voxels of the longest side."""
 _BEHIND = 0.7
@@ -76,8 +74,8 @@ def stand_in(
     colors: np.ndarray,
     cameras: Sequence[Camera] = (),
     *,
-    resolution: int = RESOLUTION,
-    views: int = VIEWS,
+    resolution: int = CAREFUL.resolution,
+    views: int = CAREFUL.surface_views,
     threads: int | None = None,
 ) -> StandIn | None:
     """The stand-in of ``mesh``; None where its images show nothing solid.

@@ -43,7 +43,7 @@ from meshsplats.cli.messages import (
 )
 from meshsplats.cli.records import changes_since, write_configuration
 from meshsplats.errors import DataWarning
-from meshsplats.file_conversion import Maker, Surroundings, seen_from
+from meshsplats.file_conversion import Callbacks, Converter, seen_from
 from meshsplats.formats.mesh_formats import mesh_format_to_write
 from meshsplats.formats.outputs import CONFIGURATION, beside, means_splats
 from meshsplats.formats.splat_formats import written_ending
@@ -153,7 +153,7 @@ class Convert(ConvertCommand):
         """Writes the outputs of ``job``; counts, scores and seconds."""
         if not (self.as_splats or self.stream):
             self.check_kind(job)
-        around = Surroundings(
+        callbacks = Callbacks(
             load=partial(self.reading.load, up=self.up),
             stream=self._opened,
             place=partial(written, origin=self.origin),
@@ -161,7 +161,7 @@ class Convert(ConvertCommand):
             preview=draw_preview,
             opening=self._opening,
         )
-        return Maker(self.product(), around).made(job, cameras)
+        return Converter(self.product(), callbacks).made(job, cameras)
 
     def _opened(self, source: Path) -> SplatStream:
         """The splats of an input in blocks, relative to the origin that is asked for."""

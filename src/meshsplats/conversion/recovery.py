@@ -1,5 +1,4 @@
-"""Splats out of a converted mesh, wherever the triangles of a splat are all there: the way back from an
-edit."""
+"""Splats out of a converted mesh, wherever the triangles of a splat are all there, after an edit, say."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from meshsplats._geometry import level_axes
 from meshsplats.conversion.fans import Pattern, Shape
 
 RADIUS = 2.6
@@ -50,9 +51,7 @@ def star(ellipses: int, sides: int) -> Shape:
     turn = 2 * np.pi * np.arange(sides) / sides
     points, faces = [np.zeros((1, 3))], []
     for k, axis in enumerate(_axes(ellipses)):
-        first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        first /= np.linalg.norm(first)
-        second = np.cross(axis, first)
+        first, second = level_axes(axis)
         points.append(np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second)
         rim = 1 + k * sides + np.arange(sides)
         faces.append(np.stack([np.zeros_like(rim), rim, np.roll(rim, -1)], axis=1))

@@ -243,14 +243,15 @@ def run_start(
     *,
     frozen: np.ndarray | None = None,
     loss: Loss | None = None,
+    kind: type[State] = State,
 ) -> RunStart:
-    """Begins or resumes the run in the folder of ``journal``."""
+    """Begins or resumes the run in the folder of ``journal``, with a state of this ``kind``."""
     views, near = len(dataset.train), dataset.with_near_planes(mesh.vertices)
     fingerprints = ("", "")
     if journal is not None:
         fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if journal is None or not options.resume:
-        state = State.begin(mesh, views, config, options.threads, frozen=frozen, device=options.device)
+        state = kind.begin(mesh, views, config, options.threads, frozen=frozen, device=options.device)
         if journal is not None:
             journal.begin(config.to_dict())
         return RunStart(config, near, mesh, state, journal, fingerprints, loss)
@@ -263,7 +264,7 @@ def run_start(
 
     found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
-    state = State.resume(
+    state = kind.resume(
         found.arrays, blending, order_of(mesh, config), views, config, options.threads, options.device
     )
     return RunStart(

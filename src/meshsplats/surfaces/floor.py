@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._geometry import level_axes
 from meshsplats.camera import Camera
 
 CELL = 2.0
@@ -89,10 +90,7 @@ def missing_ground(
 
 def _plan_of(vertices: np.ndarray, eyes: np.ndarray, up: np.ndarray, cell: float) -> _Plan:
     """The plan around the surface and what lies below the cameras."""
-    side = np.eye(3)[np.abs(up).argmin()]
-    first = np.cross(up, side)
-    first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(up, first), up])
+    axes = np.stack([*level_axes(up), up])
     level = np.concatenate([vertices, eyes]) @ axes[:2].T
     low, high = level.min(axis=0) - cell, level.max(axis=0) + cell
     rows, columns = np.ceil((high - low) / cell).astype(int)

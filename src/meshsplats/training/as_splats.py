@@ -11,6 +11,7 @@ import numpy as np
 
 from meshsplats._geometry import quaternions_of
 from meshsplats.conversion.profiles import fit_profile
+from meshsplats.conversion.recovery import THICKNESS
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.blended import Blended
@@ -20,13 +21,12 @@ from meshsplats.finetuning.step import with_sample_share
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Need
+from meshsplats.rendering.looks import DILATION
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growth import corners_of, fan_count, select_fans
 from meshsplats.training.initial import fans_of
 
-THICKNESS = 0.02
-"""Standard deviation across a fan, as a share of the smaller one in it: viewers need one above 0."""
 FITTED_SIDES = 4
 """Triangles of the fan that stands for a splat while it is fitted. With the low-pass filter of splats, images
 of such fans and of splats are 36 dB apart in a room of 100,000; with six sides 36, with two rings 40."""
@@ -36,8 +36,6 @@ COLOR_RATE, POSITION_RATE = 0.005, 0.03
 """Learning rates of the fit. Twice and four times those of colours lose 0.1 and 0.5 dB in such a room."""
 HALVED = 0.5
 """Fans that become two splats, as a share of all. Of none, 0.2 dB less; of all, 0.1 in 60 steps."""
-DILATION = 0.3
-"""Variance in square pixels that viewers of splats add to them (``render_splats``)."""
 
 
 def splats_of_fans(mesh: SplatMesh) -> GaussianCloud:
@@ -116,9 +114,7 @@ def fit_splats(
     halved = _halved(mesh, dataset.train, config)
     fans = fans_of(splats_of_fans(halved), FITTED_SIDES)
     fans = replace(fans, harmonics=halved.harmonics, order="splat", filter_px2=DILATION, origin=mesh.origin)
-    start = run_start(fans, dataset, config, run, None)
-    state = _FansOfSplats.begin(fans, len(dataset.train), config, run.threads, device=run.device)
-    start = replace(start, state=state)
+    start = run_start(fans, dataset, config, run, None, kind=_FansOfSplats)
     loop = TrainingLoop(start, start.clock(run), Blended(config), run, on_progress, plain=False)
     return splats_of_fans(loop.run())
 

@@ -20,6 +20,7 @@ from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.base_meshes import load_base
+from meshsplats.formats.surfaces.corners import has_whole_texture
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
@@ -137,7 +138,7 @@ def surface_or(load: Callable[[Any], Scene], path: str | os.PathLike[str]) -> Sc
         # They are of meshes that may have a texture, which is read by load_base alone.
         hints = (NoTextureWarning, NoColorsWarning)
         base = load_base(path) if any(issubclass(each.category, hints) for each in caught) else None
-    if base is not None and len(base.textures) == 1 and base.textured_faces().all():
+    if base is not None and has_whole_texture(base):
         return base
     for each in caught:
         warnings.warn(each.message, stacklevel=2)

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
+from meshsplats._geometry import level_axes, rotation_rows
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import look_at
@@ -286,10 +286,7 @@ def _normals(cloud: GaussianCloud) -> np.ndarray:
 def _frame(points: np.ndarray, up: np.ndarray, radius: float) -> np.ndarray:
     """(3, 3) rows right, up, forward of a frame that follows the ``points`` (n, 3): right is their longest
     level axis, towards their longer tail."""
-    helper = np.eye(3)[np.abs(up).argmin()]
-    first = np.cross(up, helper)
-    first /= np.linalg.norm(first)
-    level = np.stack([first, np.cross(up, first)])
+    level = np.stack(level_axes(up))
     flat = points @ level.T
     away = np.linalg.norm(flat, axis=1, keepdims=True)
     flat = flat / np.maximum(away / (2 * radius), 1)  # strays do not turn it

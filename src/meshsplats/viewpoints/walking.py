@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshsplats._geometry import level_axes
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import look_at
@@ -37,9 +38,7 @@ def walk(cameras: Sequence[Camera], count: int, up: Sequence[float] | np.ndarray
     if not cameras or count < 1:
         raise ValueError(f"a walk needs a camera and a frame, got {len(cameras)} and {count}")
     upward = unit_up(up)
-    first = np.cross(upward, np.eye(3)[np.abs(upward).argmin()])
-    first /= np.linalg.norm(first)
-    second = np.cross(upward, first)
+    first, second = level_axes(upward)
     places = np.array([camera.center for camera in cameras])
     gaze = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     lens = np.log([[camera.fx, camera.near or 1.0] for camera in cameras])

@@ -16,6 +16,7 @@ import numpy as np
 from meshsplats.blender.inside import levels, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIGHT
+from meshsplats.blender.options import CAREFUL
 
 POINT = "light_point"
 """Attribute of the splats: index of the point whose light each vertex takes."""
@@ -25,8 +26,6 @@ SIZE = "meshsplats_spacing"
 """Property of the points' mesh: distance of neighbouring points, scene units."""
 STATE = "meshsplats_light_state"
 """Property of the splats: the ``state`` of the scene when their light was baked."""
-SAMPLES = 12
-"""Samples at each of the three corners that a point has."""
 _AGREE = 4
 """Power of the cosine between the normals of two points that share their light."""
 _WIDTH = 1.0
@@ -76,7 +75,7 @@ def places_of(obj: Any) -> tuple[np.ndarray, np.ndarray, float]:
     return (a + b + c) / 3, normals, target.data[SIZE] * obj.matrix_world.median_scale
 
 
-def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
+def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
     """Gathers the light of ``scene`` on the splat objects ``objs`` and shows them in it.
 
     Everything in the scene lights them and casts shadows on them, their own stand-ins, too. The render

@@ -88,9 +88,14 @@ def normal_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]:
     return suffix, encode_image(f"a{suffix}", base.normal_map.astype(np.float32) / 255)
 
 
+def has_whole_texture(base: BaseMesh) -> bool:
+    """Whether one texture is on all faces."""
+    return len(base.textures) == 1 and bool(base.textured_faces().all())
+
+
 def check_texture(base: BaseMesh) -> None:
     """ValueError for a mesh that is not textured as a surface is: with one texture on all faces, or none."""
-    if base.textured and not (len(base.textures) == 1 and base.textured_faces().all()):
+    if base.textured and not has_whole_texture(base):
         raise ValueError(f"a surface has one texture on all faces, this mesh has {len(base.textures)}")
 
 
