@@ -18,7 +18,9 @@ from PIL import Image
 
 from meshsplats._core.kernels import round_fans
 from meshsplats.cli import main
+from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset, View, ViewImage
+from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
@@ -28,7 +30,7 @@ from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.reports import Reports
 from meshsplats.finetuning.run import TrainingLoop, run_start
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import ONE_SAMPLE_SHARE, with_sample_share
+from meshsplats.finetuning.step import BY_SPLAT_SHARE, ONE_SAMPLE_SHARE, with_shares
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
@@ -465,11 +467,21 @@ def test_photographs_have_one_sample_a_pixel_at_first(ball, start, monkeypatch):
     assert drawn == [1, 1, 2, 2, 3, 3]
 
 
-def test_by_default_photographs_without_alpha_have_one_sample_a_pixel_at_first(ball, room):
-    for data, share in ((ball, 0.0), (room, ONE_SAMPLE_SHARE)):
-        assert with_sample_share(train_config(), data.train).one_sample_share == share
-        assert with_sample_share(make_config(), data.train).one_sample_share == 0
-        assert with_sample_share(train_config(one_sample_share=0.3), data.train).one_sample_share == 0.3
+def test_shares_of_photographs_with_and_without_alpha_and_of_images_of_splats(ball, room):
+    drawn = splat_dataset(make_scene(200), train=2, test=1, width=16, placement="object")
+    for data, one_sample, by_splat in (
+        (ball, 0.0, BY_SPLAT_SHARE),
+        (room, ONE_SAMPLE_SHARE, BY_SPLAT_SHARE),
+        (drawn, 0.0, 0.0),
+    ):
+        for config in (train_config(), make_config()):
+            found = with_shares(config, data.train)
+            assert (found.one_sample_share, found.by_splat_share) == (one_sample, by_splat)
+        assert with_shares(make_config("paper"), data.train) == make_config("paper")
+        cut = with_shares(make_config(opacity="cutoff"), data.train)
+        assert (cut.one_sample_share, cut.by_splat_share) == (0.0, None)
+        given = train_config(one_sample_share=0.3, by_splat_share=0.2)
+        assert with_shares(given, data.train) == given
 
 
 @pytest.mark.usefixtures("start_found_once")
@@ -519,6 +531,27 @@ def test_fans_are_blended_whole_at_first_and_in_their_final_order_then(room, mon
     assert drawn == ["splat"] * 6 + [last] * 4
     assert scored == [last] * 3
     assert mesh.order == last
+
+
+def test_fine_tuning_on_photographs_blends_fans_whole_at_first_too(start, ball, monkeypatch):
+    drawn = []
+
+    def noted(self, triangles, *more, **options):
+        drawn.append(triangles.order)
+        return tape(self, triangles, *more, **options)
+
+    tape = CpuEngine.tape
+    monkeypatch.setattr(CpuEngine, "tape", noted)
+    frozen = np.zeros(len(start.vertices), bool)
+    frozen[::2] = True
+    for changes, first in (({}, 6), ({"by_splat_share": 0.0}, 0), ({"order": "splat"}, 10)):
+        drawn.clear()
+        config = make_config(steps=10, prune_epochs=0.1, **changes)
+        mesh = finetune(start, ball, config, run=RunOptions(report_every=0), frozen=frozen)
+        assert drawn[:10] == ["splat"] * first + ["fragment"] * (10 - first)  # then plain colours
+        assert mesh.order == ("splat" if first == 10 else "fragment")
+        kept = np.flatnonzero(frozen)
+        assert np.isin(start.vertices[kept][:20], mesh.vertices).all()
 
 
 def test_the_unit_of_the_scene_does_not_matter(start):

@@ -167,6 +167,7 @@ def measure_pace(
     state = State.begin(mesh, len(views), config, threads, device=device)
     listing = drawing_order(mesh, quick=True) if config.order == "file" else None
     phase = first_phase(config, mesh, state, listing=listing)
+    state = phase.before_step(state, phase.usual)
     steps = []
     for number in range(2):  # the first one allocates
         start = time.perf_counter()

@@ -36,7 +36,6 @@ class TrainConfig(FinetuneConfig):
         Literal["mesh", "display", "linear"], Fixed("while training: fine-tune the result with another")
     ] = "mesh"
     order: Literal["mesh", "fragment", "splat"] = "mesh"
-    one_sample_share: float | None = None
     exposure: bool | None = None
     opacity_decay: float = 0.003
     epsilon: float = 1e-8
@@ -64,9 +63,6 @@ class TrainConfig(FinetuneConfig):
     """First share of the run, in which images have a quarter of the photographs' sides."""
     half_share: Annotated[float, Range(0, 1), Advanced] = 0.6
     """Share of the run until which they have half of them; then they have all."""
-    by_splat_share: Annotated[float, Range(0, 1), Advanced] = 0.6
-    """First share of the run, in which fans are blended whole, by their centres, which takes two thirds of
-    the time of exact order; then they are in the order of the result. No difference with order 'splat'."""
     background: BackgroundMode = "mixed"
     """Background of the images. random: a new colour in every step, which masked photographs show around the
     subject, and others where nothing covers it. mixed: random in every fourth step, otherwise that of the

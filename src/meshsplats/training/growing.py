@@ -16,7 +16,6 @@ from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, view_of_step
 from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
 from meshsplats.training.config import TrainConfig
 from meshsplats.training.growth import NearFields, corners_of, fan_count, grow, score, select_fans
 from meshsplats.training.schedule import budget, events_passed, image_factor
@@ -45,22 +44,13 @@ class Growing:
         self, config: TrainConfig, start: SplatMesh, views: Sequence[View], fraction: float, cache_bytes: int
     ) -> None:
         self.config = config
-        self._steps = Blended(config)
+        self._steps = Blended(config, order_of(start, config))
         self._store = ImageCache(cache_bytes // REDUCED_PART)
         self._reduced: dict[float, Sequence[View]] = {}
         self._first_fans = fan_count(start)
         self._near = NearFields.around(views, start)
         self._events = events_passed(config, fraction)
         self._loss_sums, self._loss_counts = np.zeros((2, len(views)))
-        self._order = order_of(start, config)
-
-    def ordered(self, state: State, fraction: float) -> State:
-        """``state`` with its fans in the order in which steps blend them after ``fraction`` of the run."""
-        order: Order = "splat" if fraction < self.config.by_splat_share else self._order
-        if state.mesh.order == order:
-            return state
-        mesh = replace(state.result(), order=order)
-        return state.rebuild(mesh, np.arange(len(mesh.vertices)))
 
     def plan(self, view: View, step: int, fraction: float) -> Plan:
         return self._steps.plan(view, step, fraction)
@@ -71,6 +61,9 @@ class Growing:
             # With alpha, some steps have a random background: what is opaque must be covered.
             self._reduced[factor] = reduced_views(opaque_views(views), factor, self._store)
         return self._reduced[factor]
+
+    def before_step(self, state: State, fraction: float) -> State:
+        return self._steps.before_step(state, fraction)
 
     def after_step(self, state: State, moment: Moment) -> tuple[Growing, State]:
         config, clock = self.config, moment.clock
@@ -86,7 +79,6 @@ class Growing:
             state.round_fans(corners_of(state.mesh), min(share, 1.0))
         # In a run by minutes, a slow step or report may put the fraction back.
         before, self._events = self._events, max(self._events, events_passed(config, clock.fraction))
-        state = self.ordered(state, clock.fraction)
         if self._events <= before or clock.done:
             return self, state
         stray = self._near.contain(state.result())
@@ -98,7 +90,7 @@ class Growing:
 
     def result(self, state: State) -> SplatMesh:
         """The fans of ``state``, but those in the near field of a camera, in the order of the result."""
-        mesh = replace(state.result(), attributes={}, order=self._order)
+        mesh = replace(self._steps.result(state), attributes={})
         assert mesh.face_splat is not None
         stray = self._near.contain(mesh)
         return mesh.take(~stray[mesh.face_splat]) if stray.any() and not stray.all() else mesh

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from meshsplats.finetuning.phases.phase import Moment, pruned
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, samples_of, uses_point_targets
 from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class Blended:
     """The only phase of opacity 'blended'."""
 
     config: FinetuneConfig
+    order: Order | None = None
+    """That of the result, where the first steps blend whole splats (``by_splat_share``). None: all steps
+    blend in the order of their mesh."""
     usual: float = 0.0
     listing: None = None
 
@@ -31,11 +35,19 @@ class Blended:
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         return views
 
+    def before_step(self, state: State, fraction: float) -> State:
+        order = "splat" if fraction < (self.config.by_splat_share or 0.0) else self.order
+        if self.order is None or order is None or state.mesh.order == order:
+            return state
+        mesh = replace(state.result(), order=order)
+        return state.rebuild(mesh, np.arange(len(mesh.vertices)))
+
     def after_step(self, state: State, moment: Moment) -> tuple[Blended, State]:
         return self, pruned(state, self.config, moment)
 
     def result(self, state: State) -> SplatMesh:
-        return state.result()
+        mesh = state.result()
+        return mesh if self.order is None else replace(mesh, order=self.order)
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {}

@@ -9,6 +9,7 @@ import numpy as np
 from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.checkpoint import reading_arrays
 from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.initial import order_of
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.cutting import Cutting, check_for_cutoff
 from meshsplats.finetuning.phases.hybrid import Hybrid
@@ -68,7 +69,7 @@ def first_phase(
         with reading_arrays():
             return Listed.resume(config, state, arrays or {})
     if not config.cuts:
-        return Blended(config)
+        return Blended(config, None if start.face_splat is None else order_of(start, config))
     if state.solid is None:
         return Cutting(config, start, resumed)
     with reading_arrays():

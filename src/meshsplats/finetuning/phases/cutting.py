@@ -92,6 +92,9 @@ class Cutting:
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         return views
 
+    def before_step(self, state: State, fraction: float) -> State:
+        return state
+
     def after_step(self, state: State, moment: Moment) -> tuple[Cutting | Hybrid, State]:
         config, clock = self.config, moment.clock
         late = self._is_late(clock.fraction)

@@ -63,6 +63,9 @@ class Hybrid:
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         return views
 
+    def before_step(self, state: State, fraction: float) -> State:
+        return state
+
     def after_step(self, state: State, moment: Moment) -> tuple[Hybrid, State]:
         before, state = state, pruned(state, self.config, moment)
         if self.limits is None or state is not before:

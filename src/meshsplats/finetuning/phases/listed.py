@@ -38,6 +38,9 @@ class Listed:
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         return views
 
+    def before_step(self, state: State, fraction: float) -> State:
+        return state
+
     def after_step(self, state: State, moment: Moment) -> tuple[Listed, State]:
         clock = moment.clock
         if not clock.due(self.config.prune_interval(len(moment.views))) or clock.done:

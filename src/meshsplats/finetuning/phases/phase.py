@@ -41,6 +41,9 @@ class Phase(Schedule, Protocol):
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         """The training ``views``, as the next step sees them."""
 
+    def before_step(self, state: State, fraction: float) -> State:
+        """``state`` as the next step draws it."""
+
     def after_step(self, state: State, moment: Moment) -> tuple[Phase, State]:
         """The phase and the state of the next step: triangles may have been added or removed."""
 
