@@ -13,18 +13,27 @@ import numpy as np
 import pytest
 
 from meshsplats.camera import Camera
+from meshsplats.cameras.placing import outside_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.conversion import convert
-from meshsplats.datasets.splat_targets import splat_views
+from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import initial, memory
 from meshsplats.finetuning.config import PRESETS, FinetuneConfig, is_long, learning_rates, make_config
-from meshsplats.finetuning.initial import boundary_vertices, starting_mesh, starting_sides, vertex_sizes
+from meshsplats.finetuning.initial import (
+    TRAINED_PX2,
+    boundary_vertices,
+    for_photographs,
+    starting_mesh,
+    starting_sides,
+    vertex_sizes,
+)
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render_splats
 
 ROOT = Path(__file__).parents[2]
 
@@ -388,3 +397,27 @@ def test_the_first_signal_is_kept_and_the_second_interrupts():
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_splats_begin_as_wide_as_in_the_photographs():
+    """Those of 3DGS were widened in them, unless the photographs were larger then."""
+    cloud = replace(make_scene(300), scales=make_scene(300).scales * np.float32(0.3))
+    assert cloud.kernel == "3dgs"
+
+    def photographs(size, dilation):
+        views = []
+        for camera in outside_cameras(cloud, 3, width=size, height=size):
+            drawn = render_splats(cloud, camera, background=(1, 1, 1), samples=2, dilation=dilation)
+            views.append(View(camera, ViewImage(drawn.color), background=(1.0, 1.0, 1.0)))
+        return views
+
+    options = ConversionOptions()
+    assert for_photographs(options, cloud, photographs(48, 0.3)).footprint_px2 == TRAINED_PX2
+    smaller = photographs(48, 0.3 / 16)
+    assert for_photographs(options, cloud, smaller) == options
+    for other in (ConversionOptions(footprint_px2=0.1), ConversionOptions(footprint="none")):
+        assert for_photographs(other, cloud, photographs(48, 0.3)) == other
+    drawn = splat_dataset(cloud, train=2, test=1, width=32, placement="object").train
+    assert for_photographs(options, cloud, drawn) == options
+    assert for_photographs(options, replace(cloud, kernel="antialiased"), photographs(48, 0.3)) == options
+    assert for_photographs(options, cloud, ()) == options

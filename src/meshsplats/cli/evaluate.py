@@ -122,8 +122,7 @@ class Evaluate(Command):
     ] = None
     """Score all scenes of a benchmark as in the paper's Table 1."""
     tune: Annotated[
-        Literal["default", "paper"] | None,
-        tyro.conf.arg(metavar="{default,paper}", help_behavior_hint=""),
+        Literal["default", "paper"] | None, tyro.conf.arg(metavar="{default,paper}", help_behavior_hint="")
     ] = None
     """With --protocol: first fine-tune each scene on its training views, with this preset."""
     strips: int = 8
@@ -243,10 +242,7 @@ class Evaluate(Command):
         return replace(made, train=())
 
     def _background(
-        self,
-        dataset: Dataset,
-        scenes: Mapping[str, GaussianCloud | SplatMesh | None],
-        source: Path | None,
+        self, dataset: Dataset, scenes: Mapping[str, GaussianCloud | SplatMesh | None], source: Path | None
     ) -> Background:
         known = {name: scene for name, scene in scenes.items() if scene is not None}
         photographs = None if self.data is None else dataset
@@ -290,10 +286,7 @@ class Evaluate(Command):
             threads=self.threads,
             on_view=keep,
         )
-        about: dict[str, Any] = {
-            **background.to_dict(),
-            "lpips_network": self.network if lpips else None,
-        }
+        about: dict[str, Any] = {**background.to_dict(), "lpips_network": self.network if lpips else None}
         if self.cameras is not None:
             about["held_out"] = None  # it is unknown what a mesh was trained on
         report = replace(report, about={**report.about, **about})

@@ -33,7 +33,7 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, RunOptions, make_config, on_splats, starting_mesh
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import worthwhile_views, worthwhile_zooms
-from meshsplats.finetuning.initial import starts_with_filter
+from meshsplats.finetuning.initial import for_photographs, starts_with_filter
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.step import samples_of
@@ -136,7 +136,7 @@ class Finetune(TrainingCommand):
             cloud,
             lambda chosen, zooms: dataset if zooms is None else self._targets(cloud, chosen, earlier, zooms),
             config,
-            self._start_options(dataset),
+            self._start_options(cloud, dataset),
             self.files().folder,
             as_begun(config, earlier),
             resumed=earlier is not None,
@@ -164,14 +164,16 @@ class Finetune(TrainingCommand):
         return starting_mesh(
             cloud,
             [view.camera for view in dataset.train],
-            self._start_options(dataset),
+            self._start_options(cloud, dataset),
             preset=self._start_preset,
             config=config,
             threads=self.threads,
         )
 
-    def _start_options(self, dataset: Dataset) -> ConversionOptions:
-        return replace(self.conversion, crop=None, look=dataset.look)  # cropped already
+    def _start_options(self, cloud: GaussianCloud, dataset: Dataset) -> ConversionOptions:
+        options = replace(self.conversion, crop=None, look=dataset.look)  # cropped already
+        paper = self._start_preset == "paper"
+        return options if paper else for_photographs(options, cloud, dataset.train, self.threads)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
         scene = load_scene(self.input, self.reading)
@@ -209,7 +211,8 @@ class Finetune(TrainingCommand):
 
         if isinstance(scene, SplatMesh):
             raise UsageError(f"{self.input} is a mesh: --cell-splats divides splats")
-        options = CellOptions(self.cell_splats or 0, self.conversion, self._start_preset)
+        begin = self._start_options(scene, dataset)
+        options = CellOptions(self.cell_splats or 0, begin, self._start_preset)
         check_for_cells(config)
         count = -(-len(scene) // options.splats)
         color = None if background is None else background.color

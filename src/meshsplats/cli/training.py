@@ -50,11 +50,7 @@ def tuning_options(
     """The configuration of an optimisation as command-line options. ``about``: their description;
     ``default_of``: the end of an option's help; ``without``: options that it does not have."""
     return as_cli_options(
-        FinetuneConfig,
-        about,
-        without=("preset", *LENGTHS, *without),
-        defaults=default_of,
-        checked=False,
+        FinetuneConfig, about, without=("preset", *LENGTHS, *without), defaults=default_of, checked=False
     )
 
 
