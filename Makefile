@@ -46,7 +46,7 @@ ARM64 := build/arm64
 # The sanitizers' run-time libraries are found by the names that GCC gives them.
 SANITIZED := build/sanitizers
 SANITIZER_CXX ?= g++
-SANITIZER_FLAGS := -std=gnu++17 -O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -fPIC -shared -pthread \
+SANITIZER_FLAGS := -std=gnu++17 -O1 -g1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fPIC -shared -pthread \
 	-ffp-contract=off -fno-math-errno -fno-trapping-math -fvisibility=hidden -Wno-psabi -Wno-uninitialized \
 	-Wno-maybe-uninitialized $(if $(filter x86_64,$(shell uname -m)),-march=x86-64-v3) -DMS_CHECKS -D_GLIBCXX_ASSERTIONS
 CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat_order rasterize cutoff ramp fan_filter \
