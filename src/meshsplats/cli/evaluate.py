@@ -324,12 +324,17 @@ class Evaluate(Command):
         return self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
 
     def _tuned_candidates(self, scene: GaussianCloud | SplatMesh, dataset: Dataset) -> Candidates:
+        from meshsplats.conversion import ConversionOptions
         from meshsplats.finetuning import starting_mesh
+        from meshsplats.finetuning.initial import for_photographs
 
         assert self.tune is not None
         if isinstance(scene, SplatMesh):
             return Candidates(_tuned(scene, dataset, self.tune, self.threads), None, scene)
-        mesh = starting_mesh(scene, [view.camera for view in dataset.train], preset=self.tune)
+        options = ConversionOptions()
+        if self.tune == "default":
+            options = for_photographs(options, scene, dataset.train, self.threads)
+        mesh = starting_mesh(scene, [view.camera for view in dataset.train], options, preset=self.tune)
         return Candidates(_tuned(mesh, dataset, self.tune, self.threads), scene, mesh)
 
 
