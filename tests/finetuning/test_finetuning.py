@@ -29,6 +29,7 @@ from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
     TRAINING_MIN_TRANSMITTANCE,
+    for_views,
     kept_faces,
     make_step,
     target_of,
@@ -283,10 +284,7 @@ def test_a_run_can_be_made_longer(scene, tmp_path):
     tuned = finetune(mesh, dataset, longer, run=replace(run, resume=True))
     assert score(tuned, Dataset((), dataset.train)) > score(short, Dataset((), dataset.train)) + 0.5
     assert [line["step"] for line in Journal(run.folder).metrics()] == [0, 6, 18]
-    assert json.loads((run.folder / "config.json").read_text()) == longer.to_dict() | {
-        "one_sample_share": 0,
-        "by_splat_share": 0,
-    }
+    assert json.loads((run.folder / "config.json").read_text()) == for_views(longer, dataset.train).to_dict()
     assert [int(p.stem[5:]) for p in sorted((run.folder / "previews").iterdir())] == [
         *(0, 2, 3, 5, 6),  # quarters of 6
         *(9, 14, 18),  # those of 18 that were to come

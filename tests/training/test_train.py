@@ -25,12 +25,18 @@ from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.checkpoint import OtherRunError
+from meshsplats.finetuning.config import HARMONICS_RATE
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.reports import Reports
 from meshsplats.finetuning.run import TrainingLoop, run_start
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import BY_SPLAT_SHARE, ONE_SAMPLE_SHARE, with_shares
+from meshsplats.finetuning.step import (
+    BY_SPLAT_SHARE,
+    ONE_SAMPLE_SHARE,
+    PHOTOGRAPHS_HARMONICS_RATE,
+    for_views,
+)
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
@@ -467,21 +473,24 @@ def test_photographs_have_one_sample_a_pixel_at_first(ball, start, monkeypatch):
     assert drawn == [1, 1, 2, 2, 3, 3]
 
 
-def test_shares_of_photographs_with_and_without_alpha_and_of_images_of_splats(ball, room):
+def test_what_follows_from_the_kind_of_views(ball, room):
+    """Photographs with and without alpha, and images of splats."""
     drawn = splat_dataset(make_scene(200), train=2, test=1, width=16, placement="object")
-    for data, one_sample, by_splat in (
-        (ball, 0.0, BY_SPLAT_SHARE),
-        (room, ONE_SAMPLE_SHARE, BY_SPLAT_SHARE),
-        (drawn, 0.0, 0.0),
+    for data, one_sample, by_splat, rate in (
+        (ball, 0.0, BY_SPLAT_SHARE, PHOTOGRAPHS_HARMONICS_RATE),
+        (room, ONE_SAMPLE_SHARE, BY_SPLAT_SHARE, PHOTOGRAPHS_HARMONICS_RATE),
+        (drawn, 0.0, 0.0, HARMONICS_RATE),
     ):
         for config in (train_config(), make_config()):
-            found = with_shares(config, data.train)
+            found = for_views(config, data.train)
             assert (found.one_sample_share, found.by_splat_share) == (one_sample, by_splat)
-        assert with_shares(make_config("paper"), data.train) == make_config("paper")
-        cut = with_shares(make_config(opacity="cutoff"), data.train)
+        assert found.harmonics_rate == rate
+        assert for_views(train_config(), data.train).harmonics_rate == HARMONICS_RATE
+        assert for_views(make_config("paper"), data.train) == make_config("paper")
+        cut = for_views(make_config(opacity="cutoff"), data.train)
         assert (cut.one_sample_share, cut.by_splat_share) == (0.0, None)
         given = train_config(one_sample_share=0.3, by_splat_share=0.2)
-        assert with_shares(given, data.train) == given
+        assert for_views(given, data.train) == given
 
 
 @pytest.mark.usefixtures("start_found_once")

@@ -19,6 +19,9 @@ BackgroundMode = Literal["mixed", "random", "white", "black"]
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 
+HARMONICS_RATE = 0.02
+"""``harmonics_rate`` for images of splats."""
+
 _POSITION_EPSILON = 1e-15
 """Adam's epsilon for positions in units of the splat."""
 
@@ -56,9 +59,10 @@ class FinetuneConfig:
     them."""
     position_rate: Annotated[float, Range(0, 10), Advanced] = 0.02
     """Adam's learning rate of the vertex positions, in ``position_unit``. 0: positions are fixed."""
-    harmonics_rate: Annotated[float, Range(0, 1), Advanced] = 0.02
+    harmonics_rate: Annotated[float | None, Range(0, 1), Advanced] = None
     """Adam's learning rate of the spherical harmonics of splats, where the mesh has them. It falls as that of
-    colours does. 0: they stay."""
+    colours does. 0: they stay. None: 0.02 for images of splats, 0.005 for photographs, which are few: what
+    they alone show, held-out ones do not."""
     position_unit: Annotated[Unit, Advanced] = "splat"
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
     as in the paper."""
@@ -212,6 +216,7 @@ _PAPER = FinetuneConfig(
     steps=None,
     color_rate=5e-3,
     position_rate=math.exp(-3) * 5e-3,
+    harmonics_rate=HARMONICS_RATE,
     position_unit="scene",
     soft_edges=False,
     final_share=1.0,
@@ -247,7 +252,7 @@ class FinetuneChanges(TypedDict, total=False):
     minutes: float | None
     color_rate: float
     position_rate: float
-    harmonics_rate: float
+    harmonics_rate: float | None
     position_unit: Unit
     soft_edges: bool
     final_share: float

@@ -37,7 +37,7 @@ from meshsplats.finetuning.phases.phase import Moment, Phase
 from meshsplats.finetuning.plain import most_images, with_plain_colors
 from meshsplats.finetuning.reports import Reports, scored_count
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import make_step, with_shares
+from meshsplats.finetuning.step import for_views, make_step
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Device
@@ -193,7 +193,7 @@ def ready_loop(
         frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
     check_phases(config, mesh, engine(run.device, run.threads), frozen)
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
-    config = with_shares(config, dataset.train)
+    config = for_views(config, dataset.train)
     journal = None if run.folder is None else Journal(run.folder)
     start = run_start(mesh, dataset, config, run, journal, frozen=frozen, loss=loss)
     clock = start.clock(run)

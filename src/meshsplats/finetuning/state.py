@@ -15,7 +15,7 @@ from meshsplats.colors import srgb_to_linear
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored_mesh
-from meshsplats.finetuning.config import FinetuneConfig, epsilons
+from meshsplats.finetuning.config import HARMONICS_RATE, FinetuneConfig, epsilons
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
 from meshsplats.finetuning.initial import boundary_vertices, order_of, vertex_sizes
 from meshsplats.finetuning.loss import LossRates
@@ -301,7 +301,8 @@ class State:
         return max(1 - self.config.opacity_decay * color_rate / self.config.color_rate, 0)
 
     def _harmonics_rate(self, color_rate: float) -> float:
-        return self.config.harmonics_rate * color_rate / self.config.color_rate
+        rate = self.config.harmonics_rate
+        return (HARMONICS_RATE if rate is None else rate) * color_rate / self.config.color_rate
 
     @cached_property
     def _frozen_splats(self) -> np.ndarray:

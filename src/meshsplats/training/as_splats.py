@@ -17,7 +17,7 @@ from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import with_shares
+from meshsplats.finetuning.step import for_views
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Need
@@ -110,7 +110,7 @@ def fit_splats(
     """
     check_fans(mesh)
     run = replace(run or RunOptions(), folder=None, resume=False)
-    config = with_shares(_fitting(config, mesh, dataset, run.threads), dataset.train)
+    config = for_views(_fitting(config, mesh, dataset, run.threads), dataset.train)
     halved = _halved(mesh, dataset.train, config)
     fans = fans_of(splats_of_fans(halved), FITTED_SIDES)
     fans = replace(fans, harmonics=halved.harmonics, order="splat", filter_px2=DILATION, origin=mesh.origin)

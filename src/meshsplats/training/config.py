@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 from meshsplats._options import Advanced, Fixed, Range, check_names
-from meshsplats.finetuning.config import LENGTHS, BackgroundMode, FinetuneConfig
+from meshsplats.finetuning.config import HARMONICS_RATE, LENGTHS, BackgroundMode, FinetuneConfig
 
 MASKED_SHARE = 0.4
 """Fans at the start from masked photographs, as a share of ``max_splats``. Lego, 300 steps at half the size:
@@ -25,6 +25,7 @@ class TrainConfig(FinetuneConfig):
     rate_steps: int = 1000
     color_rate: float = 0.03
     position_rate: float = 0.12
+    harmonics_rate: float | None = HARMONICS_RATE
     l2_weight: float = 10.0
     opacity: Annotated[Literal["blended", "cutoff"], Fixed(_GROWS)] = "blended"
     prune_epochs: Annotated[float, Fixed(_GROWS)] = 0.0

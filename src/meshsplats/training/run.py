@@ -21,7 +21,7 @@ from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import HARMONIC_BYTES, SHADED_BYTES, check_bytes, estimate_bytes
 from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
-from meshsplats.finetuning.step import with_shares
+from meshsplats.finetuning.step import for_views
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
@@ -86,7 +86,7 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
-    config = with_shares(config, dataset.train)
+    config = for_views(config, dataset.train)
     engine(run.device, run.threads).check()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
