@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from _rendering import camera
@@ -73,6 +75,18 @@ def test_solving_never_loses_against_the_formula(mesh):
         assert sorted(found.rank) == list(range(len(start)))
     again = solve(mesh, pieces, node, found.rank, default_views(mesh))
     assert again.before == pytest.approx(found.after)
+
+
+def test_a_stack_is_put_in_order_from_any_start():
+    """Every pair of a hundred layers wants one order, which single moves reach but for pairs of no weight."""
+    rng = np.random.default_rng(0)
+    mesh = squares(*np.linspace(-1, 1, 100))
+    colors = np.concatenate([rng.integers(0, 2, (100, 3)), np.full((100, 1), 0.04)], axis=1)
+    mesh = replace(mesh, colors=np.repeat(colors, 4, axis=0))
+    start = rng.permutation(200).astype(np.int32)
+    found = solve(mesh, pieces_of(mesh), np.zeros(100, np.int64), start, both_ends())
+    assert found.before > 0.3 * found.weight
+    assert found.after < 1e-4 * found.before
 
 
 @pytest.mark.slow

@@ -10,9 +10,11 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <memory>
 #include <utility>
 #include <vector>
 
+#include "insertion.h"
 #include "parallel.h"
 #include "pooled_vector.h"
 #include "triangle.h"
@@ -114,6 +116,8 @@ class PairTable {
 
 // The pairs of one view. Pieces are drawn front to back. Every fragment is paired with a few of those in
 // front of it, drawn at random by their shares of the pixel: these pairs stand for those with all of them.
+// What was drawn stays until another layer takes its place (reservoir sampling; Vitter, 1985): a list of all
+// layers of a pixel would not fit into the cache.
 class ViewPairs {
   public:
     ViewPairs(const MsOrdering &ordering, int ranges) : in_(ordering), ranges_(ranges), cache_(CACHE) {}
@@ -124,8 +128,7 @@ class ViewPairs {
         width_ = camera.width, height_ = camera.height;
         out_ = out;
         random_ = 0x9E3779B97F4A7C15ull * (view + 1);
-        pixels_.assign((size_t)width_ * height_, {1, 0});
-        layers_.resize((size_t)width_ * height_ * LAYERS);
+        pixels_.assign((size_t)width_ * height_, {1, {}});
         std::fill(cache_.begin(), cache_.end(), UnitPair{0, 0, 0});
         const Projection projection(camera, 1);
         vertices_.resize(in_.vertex_count);
@@ -148,8 +151,7 @@ class ViewPairs {
     }
 
   private:
-    static constexpr int LAYERS = 48;  // of a pixel that are remembered
-    static constexpr int DRAWS = 2;    // pairs of a fragment
+    static constexpr int DRAWS = 4;  // pairs of a fragment
     static constexpr size_t CACHE = 1 << 14;
     static constexpr float FAINT = 1.f / 64;   // fragments of less opacity do not count
     static constexpr float HIDDEN = 1.f / 50;  // nor are fragments behind this transmittance seen
@@ -160,14 +162,14 @@ class ViewPairs {
         float x, y;
         bool visible;
     };
-    struct Pixel {
-        float transmittance;
-        int32_t layers;
-    };
     struct Layer {
         uint32_t unit;
-        float until;  // 1 - transmittance behind it
+        int32_t splat, node;
         float color[3];
+    };
+    struct Pixel {
+        float transmittance;
+        Layer drawn[DRAWS];  // each is any layer so far, with the probability of its share
     };
 
     const MsOrdering &in_;
@@ -176,7 +178,6 @@ class ViewPairs {
     std::vector<UnitPair> *out_ = nullptr;
     uint64_t random_ = 0;
     PooledVector<Pixel> pixels_;
-    PooledVector<Layer> layers_;
     PooledVector<Point> vertices_;
     std::vector<std::pair<float, int32_t>> order_;
     std::vector<UnitPair> cache_;  // sums of pairs that were seen a moment ago
@@ -199,7 +200,8 @@ class ViewPairs {
                     *cc = in_.colors + 4 * (int64_t)f[2];
         if (std::max({ca[3], cb[3], cc[3]}) < FAINT) return;
         // Fronts turn counter-clockwise; y points down here.
-        Layer layer{2 * (uint32_t)piece + ((area > 0) != (in_.turned[face] != 0)), 0, {}};
+        const uint32_t unit = 2 * (uint32_t)piece + ((area > 0) != (in_.turned[face] != 0));
+        Layer layer{unit, in_.splat[piece], in_.node[piece], {}};
         for (int k = 0; k < 3; ++k) layer.color[k] = (ca[k] + cb[k] + cc[k]) * (1.f / 3);
         const int first = std::max(0, (int)std::ceil(std::max(top, -1.f) - 0.5f));
         const int last = std::min(height_ - 1, (int)std::floor(std::min(bottom, height_ + 1.f) - 0.5f));
@@ -223,32 +225,24 @@ class ViewPairs {
             const int end = (int)std::ceil(std::clamp(high, -1.f, width_ + 1.f) - 0.5f);
             for (int x = begin; x < std::min(end, width_); ++x) {
                 const float alpha = ca[3] + slope * (x + 0.5f - a.x) + down * (py - a.y);
-                if (alpha >= FAINT) blend((size_t)y * width_ + x, piece, layer, std::min(alpha, 1.f));
+                if (alpha >= FAINT) blend(pixels_[(size_t)y * width_ + x], layer, std::min(alpha, 1.f));
             }
         }
     }
 
-    void blend(size_t place, int32_t piece, Layer &layer, float alpha) {
-        Pixel &pixel = pixels_[place];
-        Layer *front = &layers_[place * LAYERS];
-        if (pixel.layers) {
-            const float all = front[pixel.layers - 1].until;
-            for (int draw = 0, i = 0; draw < DRAWS; ++draw) {
-                const float drawn = (draw + chance()) * (all / DRAWS);
-                while (i + 1 < pixel.layers && !(front[i].until > drawn)) ++i;
-                pair(front[i], layer, piece, all * alpha / DRAWS);
-            }
-        }
-        if (pixel.transmittance > HIDDEN && pixel.layers < LAYERS) {
-            pixel.transmittance *= 1 - alpha;
-            layer.until = 1 - pixel.transmittance;
-            front[pixel.layers++] = layer;
-        }
+    void blend(Pixel &pixel, const Layer &layer, float alpha) {
+        const float all = 1 - pixel.transmittance;
+        if (all > 0)
+            for (const Layer &near : pixel.drawn) pair(near, layer, all * alpha / DRAWS);
+        if (pixel.transmittance <= HIDDEN) return;
+        const float share = pixel.transmittance * alpha;
+        pixel.transmittance -= share;
+        for (Layer &near : pixel.drawn)
+            if (chance() * (all + share) < share) near = layer;
     }
 
-    void pair(const Layer &near, const Layer &far, int32_t piece, float share) {
-        const int32_t other = (int32_t)(near.unit / 2);
-        if (in_.splat[other] == in_.splat[piece] || in_.node[other] != in_.node[piece]) return;
+    void pair(const Layer &near, const Layer &far, float share) {
+        if (near.splat == far.splat || near.node != far.node) return;
         float difference = ALIKE;
         for (int k = 0; k < 3; ++k) {
             const float d = near.color[k] - far.color[k];
@@ -306,7 +300,8 @@ class Ordering {
     PairTable tables_[RANGES];
     PooledVector<int64_t> start_;
     PooledVector<Edge> edges_;
-    PooledVector<int32_t> key_, moved_, order_;
+    PooledVector<int32_t> key_, moved_;
+    PooledVector<int64_t> order_;
 
     void collect() {
         std::vector<std::vector<UnitPair>> waiting((size_t)VIEWS * RANGES);
@@ -360,10 +355,9 @@ class Ordering {
 
     // Spreads the keys evenly in their order.
     void number() {
-        for (int64_t i = 0; i < units_; ++i) order_[i] = (int32_t)i;
-        std::sort(order_.begin(), order_.end(),
-                  [&](int32_t a, int32_t b) { return key_[a] != key_[b] ? key_[a] < key_[b] : a < b; });
-        for (int64_t i = 0; i < units_; ++i) key_[order_[i]] = (int32_t)i * spacing_;
+        for (int64_t i = 0; i < units_; ++i) order_[i] = key_[i] * ((int64_t)1 << 32) + i;
+        std::sort(order_.begin(), order_.end());
+        for (int64_t i = 0; i < units_; ++i) key_[(uint32_t)order_[i]] = (int32_t)i * spacing_;
     }
 
     // The weight of the pairs in the wrong order.
@@ -386,9 +380,9 @@ class Ordering {
     // Moves the units of a round, all as if the others stayed.
     void move(int sweep, int round) {
         parallel_blocks(io_.threads, units_, BLOCK, [&](int64_t begin, int64_t end, int) {
-            std::vector<std::pair<int32_t, float>> near;
+            Insertion insertion;
             for (int64_t i = begin; i < end; ++i)
-                moved_[i] = turn(i, sweep) == round ? best(i, near) : key_[i];
+                moved_[i] = turn(i, sweep) == round ? best(i, insertion) : key_[i];
         });
         std::swap(key_, moved_);
     }
@@ -397,24 +391,11 @@ class Ordering {
     }
 
     // The key of a unit at its best place among its neighbours, or its own.
-    int32_t best(int64_t unit, std::vector<std::pair<int32_t, float>> &near) const {
-        near.clear();
+    int32_t best(int64_t unit, Insertion &insertion) const {
+        insertion.clear();
         for (int64_t e = start_[unit]; e < start_[unit + 1]; ++e)
-            near.push_back({key_[edges_[e].unit], edges_[e].weight});
-        std::sort(near.begin(), near.end());
-        // Behind the first k neighbours, the sum of their weights is right.
-        double sum = 0, most = 0, now = 0;
-        size_t place = 0;
-        for (size_t k = 0; k < near.size(); ++k) {
-            sum += near[k].second;
-            if (near[k].first < key_[unit]) now = sum;
-            if (sum > most) most = sum, place = k + 1;
-        }
-        if (near.empty() || most <= now + 1e-9) return key_[unit];
-        const int64_t low = place ? near[place - 1].first : near[0].first - 2 * (int64_t)spacing_;
-        const int64_t high =
-            place < near.size() ? near[place].first : near.back().first + 2 * (int64_t)spacing_;
-        return (int32_t)((low + high) / 2);
+            insertion.add({key_[edges_[e].unit], edges_[e].weight});
+        return insertion.best(key_[unit], spacing_);
     }
 };
 
