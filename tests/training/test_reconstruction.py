@@ -6,6 +6,7 @@ import builtins
 import os
 import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -179,6 +180,83 @@ def test_photographs_of_several_sizes_have_cameras_of_their_own(scene):
     with pytest.warns(DataWarning):
         find_cameras(folder)
     assert colmap.mode == "per image"
+
+
+class WithPairs(Colmap):
+    """A later version, which matches the pairs of a file, and writes the features to its database."""
+
+    ImportedPairingOptions = SimpleNamespace
+
+    def extract_features(self, database, folder, names, **options):
+        super().extract_features(database, folder, names, **options)
+        with closing(sqlite3.connect(database)) as connection:
+            connection.execute("create table images (image_id integer, name text)")
+            connection.execute("create table descriptors (image_id integer, rows, cols, data blob)")
+            for i, name in enumerate(names):
+                rows = np.full((2, 128), 10 * i + 1, np.uint8)
+                connection.execute("insert into images values (?, ?)", (7 * i, name))
+                if i:  # the first has no features
+                    values = (7 * i, *rows.shape, rows.tobytes())
+                    connection.execute("insert into descriptors values (?, ?, ?, ?)", values)
+            connection.commit()
+
+    def match_image_pairs(self, database, *, pairing_options, device):
+        lines = Path(pairing_options.match_list_path).read_text().splitlines()
+        self.pairs = [line.split(" ") for line in lines]
+
+
+@pytest.fixture
+def many(scene, monkeypatch):
+    """The same scene, where five photographs are many."""
+
+    def made(names=None):
+        folder, colmap, _ = scene()
+        for i, name in enumerate(names or ()):
+            (folder / f"p{i}.png").rename(folder / name)
+        cameras = dict(colmap.cameras)
+        later = WithPairs(cameras, True)
+        monkeypatch.setitem(sys.modules, "pycolmap", later)
+        monkeypatch.setattr(reconstruction, "ALL_UP_TO", 4)
+        seen = []
+
+        def pairs(descriptors):
+            seen.extend(descriptors)
+            return np.array([[0, 1], [2, 4]])
+
+        monkeypatch.setattr(reconstruction, "alike_pairs", pairs)
+        return folder, later, seen
+
+    return made
+
+
+def test_of_many_photographs_those_that_look_alike_are_matched(many):
+    folder, colmap, seen = many()
+    lines = []
+    with pytest.warns(DataWarning):
+        find_cameras(folder, lines.append)
+    assert colmap.pairs == [["p0.png", "p1.png"], ["p2.png", "p4.png"]]
+    assert [rows.shape for rows in seen] == [(0, 128), *[(2, 128)] * 4]
+    assert [int(rows[0, 0]) for rows in seen[1:]] == [11, 21, 31, 41]
+    assert "match" not in colmap.calls
+    assert any(line.endswith("2 pairs of photographs that look alike") for line in lines)
+
+
+def test_names_with_blanks_are_no_trouble_in_a_list_of_pairs(many):
+    names = [f"photo ({i}).png" for i in range(5)]
+    folder, colmap, _ = many(names)
+    colmap.cameras = {f"{i:06d}.png": camera for i, camera in enumerate(colmap.cameras.values())}
+    with pytest.warns(DataWarning, match=r"photo \(4\)\.png"):
+        find_cameras(folder)
+    assert colmap.pairs == [["000000.png", "000001.png"], ["000002.png", "000004.png"]]
+    assert [view.name for view in load_dataset(folder, test_every=0).train] == names[:4]
+
+
+def test_an_older_library_matches_all_pairs(scene, monkeypatch):
+    folder, colmap, _ = scene()
+    monkeypatch.setattr(reconstruction, "ALL_UP_TO", 4)
+    with pytest.warns(DataWarning):
+        find_cameras(folder)
+    assert "match" in colmap.calls
 
 
 def test_only_the_photographs_are_read(tmp_path):

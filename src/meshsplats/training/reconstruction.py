@@ -5,9 +5,12 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
+import sqlite3
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ from meshsplats.datasets.image_files import Shelf
 from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import load_image, read_exif, read_header
+from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
 
 CAMERAS, POINTS = "transforms.json", "sparse_points.ply"
 """Files beside the photographs."""
@@ -52,7 +56,7 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
     """Finds the cameras of the photographs in ``folder`` (``bare_photographs``) and writes
     ``transforms.json`` and ``sparse_points.ply`` there, as nerfstudio has them, whole or not at all.
 
-    ``say`` is called with a line about each stage. Takes minutes: all pairs of photographs are matched.
+    ``say`` is called with a line about each stage. Takes minutes.
 
     Raises:
         MissingDependencyError: pycolmap is not installed.
@@ -99,8 +103,7 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
             device=pycolmap.Device.cpu,
             **_feature_options(pycolmap),
         )
-        say(f"finding the cameras: {len(photographs) * (len(photographs) - 1) // 2:,} pairs")
-        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        _match(pycolmap, Path(database), [path.name for path in images], say)
         say("finding the cameras: poses")
         found = pycolmap.incremental_mapping(database, place, work)
     best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
@@ -131,6 +134,33 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
     say(f"cameras of {count} photographs and {len(best.points3D):,} points: {folder / CAMERAS}")
 
 
+def _match(pycolmap: Any, database: Path, names: list[str], say: Callable[[str], None]) -> None:
+    """Matches the features of all pairs of the images ``names``, or where these are many, of those that look
+    alike."""
+    count = len(names)
+    # Older versions of the library have no function for given pairs.
+    if count <= ALL_UP_TO or not hasattr(pycolmap, "match_image_pairs"):
+        say(f"finding the cameras: {count * (count - 1) // 2:,} pairs")
+        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        return
+    pairs = alike_pairs(_descriptors(database, names))
+    say(f"finding the cameras: {len(pairs):,} pairs of photographs that look alike")
+    chosen = database.parent / "pairs.txt"
+    chosen.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
+    options = pycolmap.ImportedPairingOptions()
+    options.match_list_path = chosen
+    pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+
+
+def _descriptors(database: Path, names: list[str]) -> list[np.ndarray]:
+    """(features, 128) uint8 for each of the images ``names`` in COLMAP's database."""
+    query = "select name, rows, cols, data from descriptors join images using (image_id)"
+    with closing(sqlite3.connect(database)) as connection:
+        table = connection.execute(query).fetchall()
+    found = {name: np.frombuffer(data, np.uint8).reshape(rows, width) for name, rows, width, data in table}
+    return [found.get(name, np.zeros((0, 128), np.uint8)) for name in names]
+
+
 def _feature_options(pycolmap: Any) -> dict[str, Any]:
     """Options of ``extract_features`` in the library's version."""
     if hasattr(pycolmap, "FeatureExtractionOptions"):
@@ -142,18 +172,26 @@ def _feature_options(pycolmap: Any) -> dict[str, Any]:
 
 
 def _for_pycolmap(photographs: list[Path], work: Path) -> list[Path]:
-    """Files that pycolmap reads, in one folder, one for each of ``photographs``: themselves, or copies in the
-    folder ``work`` where some are HEIF images."""
-    if not any(path.suffix.lower() in (".heic", ".heif") for path in photographs):
+    """Files that pycolmap reads, in one folder, one for each of ``photographs``: themselves, or in the folder
+    ``work`` copies where some are HEIF images, and links where names have blanks, which its lists of pairs
+    do not allow."""
+    heif = any(path.suffix.lower() in (".heic", ".heif") for path in photographs)
+    if not heif and not any(" " in path.name or path.name.startswith("#") for path in photographs):
         return photographs
     from PIL import Image
 
     folder = work / "images"
     folder.mkdir()
-    copies = [folder / f"{path.name}.png" for path in photographs]
+    copies = [folder / f"{i:06d}{'.png' if heif else path.suffix}" for i, path in enumerate(photographs)]
     for path, copy in zip(photographs, copies, strict=True):
-        pixels = load_image(path)
-        Image.fromarray(pixels[..., :3]).save(copy, exif=read_exif(path), compress_level=1)
+        if heif:
+            pixels = load_image(path)
+            Image.fromarray(pixels[..., :3]).save(copy, exif=read_exif(path), compress_level=1)
+        else:
+            try:
+                copy.symlink_to(path.absolute())
+            except OSError:  # Windows lets only some users make links
+                shutil.copyfile(path, copy)
     return copies
 
 
