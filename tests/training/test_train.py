@@ -39,6 +39,7 @@ from meshsplats.finetuning.step import (
 )
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
+from meshsplats.images.reading import load_image
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
@@ -57,7 +58,7 @@ from meshsplats.training.growth import (
     split_in_halves,
 )
 from meshsplats.training.initial import fans_of
-from meshsplats.training.run import SO_FAR, check_training_memory
+from meshsplats.training.run import COVERAGE, SO_FAR, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
 
 LAYERS = ("color", "alpha")
@@ -781,6 +782,7 @@ def test_a_new_run_removes_the_mesh_of_an_earlier_one(ball, start, tmp_path, mon
     with pytest.raises(OSError):
         train(ball, train_config(steps=2, **SMALL), run=RunOptions(tmp_path), on_progress=fail)
     assert not (tmp_path / SO_FAR).exists()
+    assert load_image(tmp_path / COVERAGE).shape[2] == 3
 
 
 # ---- As splats

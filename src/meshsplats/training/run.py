@@ -23,10 +23,12 @@ from meshsplats.finetuning.memory import HARMONIC_BYTES, SHADED_BYTES, check_byt
 from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
 from meshsplats.finetuning.step import for_views
 from meshsplats.formats.meshes import load_mesh, save_mesh
+from meshsplats.images.writing import save_image
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.spherical_harmonics import TERMS
 from meshsplats.training.config import TrainConfig, with_train_changes
+from meshsplats.training.coverage import coverage_picture
 from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growing import REDUCED_PART, Growing
 from meshsplats.training.growth import SHELL
@@ -37,8 +39,9 @@ from meshsplats.training.stereo import matching_bytes
 
 SHOWN_NAMES = 10
 """Maximum number of such photographs that are named."""
-START, SO_FAR = "start.npz", "mesh.npz"
-"""Files in the folder of a run: the fans that it started from, and those at an interruption."""
+START, SO_FAR, COVERAGE = "start.npz", "mesh.npz", "coverage.png"
+"""Files in the folder of a run: the fans that it started from, those at an interruption, and how many
+photographs show each place."""
 
 
 def train(
@@ -103,11 +106,15 @@ def train(
                 DataWarning,
                 stacklevel=2,
             )
+    picture = None
+    if journal is not None and not run.resume:
+        picture = coverage_picture(mesh, dataset.train, run.threads)
     run = replace(run, spent=run.spent + time.perf_counter() - began)
     start = run_start(mesh, dataset, config, run, journal)
-    if journal is not None and not run.resume:
+    if journal is not None and picture is not None:
         (journal.folder / SO_FAR).unlink(missing_ok=True)
         save_mesh(mesh, journal.folder / START)
+        save_image(journal.folder / COVERAGE, picture)
     clock, views = start.clock(run), start.dataset.train
     phase = Growing(config, mesh, views, clock.fraction, run.cache_bytes)
     loop = TrainingLoop(start, clock, phase, run, on_progress)
