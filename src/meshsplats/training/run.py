@@ -36,6 +36,7 @@ from meshsplats.training.hull import carving_bytes
 from meshsplats.training.initial import colored, fans_of, starting_patches
 from meshsplats.training.patches import Patches, flat_splats
 from meshsplats.training.stereo import matching_bytes
+from meshsplats.training.suspects import find_suspects
 
 SHOWN_NAMES = 10
 """Maximum number of such photographs that are named."""
@@ -79,7 +80,8 @@ def train(
         OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError, Interrupted: as by
             ``finetune``. Interrupted leaves the mesh so far in the folder, too.
 
-    Warns with a DataWarning of photographs that do not fit the others.
+    Warns with a DataWarning of photographs that do not fit the others: before the first step of those that
+    are blurred, double or misplaced, at the end of those that the mesh cannot show.
     """
     need(Dataset, dataset=dataset)
     need(TrainConfig, config=config, optional=True)
@@ -97,6 +99,8 @@ def train(
         mesh = _stored_start(journal)
     else:
         mesh = starting_fans(dataset, config, points, run.threads)
+        for message in find_suspects(mesh, dataset.train, run.threads).messages():
+            warnings.warn(message, DataWarning, stacklevel=2)
     if config.exposure is None:
         config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
         if config.exposure:
