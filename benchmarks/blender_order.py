@@ -5,8 +5,8 @@
 PSNR against ``render(order="splat")``, unlit, one sample a pixel. *As converted*: the triangles in the order
 of the mesh. *In the file*: each twice, with both windings, in the order that ``drawing_order`` solves for
 views from all around, back faces culled. *Far to near*: the modifier of the extension and of saved files, in
-one animation with a camera for each frame; and the processor time of all threads in which it sorts for
-another view.
+one animation with a camera for each frame; and the processor time of all threads in which a viewport's
+splats are sorted for another view.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def sorting_ms(mesh: ms.SplatMesh) -> float:
     from meshsplats.blender.inside.host import bpy
 
     arrays, facts = prepare(mesh, [], SceneOptions(engine="eevee"), 1)
-    built = scene.build(scene.Subject(**arrays, **facts), [], SceneOptions(engine="eevee"), 1024, edges=False)
+    built = scene.build(scene.Subject(**arrays, **facts), [], SceneOptions(engine="eevee"), 1024, edges=True)
     modifier, found = far_to_near.modifier_of(built.obj), []
     for angle in np.linspace(0, 2 * np.pi, 9):
         watch = Stopwatch()

@@ -107,11 +107,17 @@ def after_frame(scene, depsgraph):
 
 
 @persistent
-def after_load(path):
+def drop_copies(*_):
+    """Before a file is saved, and when another one or another state of it was loaded: no sorted copies."""
     _views.clear()
+    if any(map(has_splats, bpy.data.scenes)):
+        from meshsplats.blender.inside import far_to_near
+
+        far_to_near.drop_copies()
 
 
 _handle = None
+_DROP = ("save_pre", "load_post", "undo_post", "redo_post")
 
 
 def register():
@@ -119,12 +125,14 @@ def register():
     _handle = bpy.types.SpaceView3D.draw_handler_add(before_drawing, (), "WINDOW", "PRE_VIEW")
     bpy.app.handlers.depsgraph_update_post.append(after_update)
     bpy.app.handlers.frame_change_post.append(after_frame)
-    bpy.app.handlers.load_post.append(after_load)
+    for name in _DROP:
+        getattr(bpy.app.handlers, name).append(drop_copies)
 
 
 def unregister():
     global _handle
-    bpy.app.handlers.load_post.remove(after_load)
+    for name in _DROP:
+        getattr(bpy.app.handlers, name).remove(drop_copies)
     bpy.app.handlers.frame_change_post.remove(after_frame)
     bpy.app.handlers.depsgraph_update_post.remove(after_update)
     bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")

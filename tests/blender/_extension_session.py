@@ -442,7 +442,14 @@ def drawn_from(direction, kind="MATERIAL"):
         pass
     bpy.context.view_layer.update()
     data = turned.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    centers = [value.vector for value in data.attributes["splat_center"].data]
+    owner = {}
+    for face, splat in zip(turned.data.polygons, turned.data.attributes["splat"].data, strict=True):
+        owner.update((vertex, splat.value) for vertex in face.vertices)
+    middles = {}
+    for face in turned.data.polygons:
+        middles.setdefault(owner[face.vertices[0]], []).append(face.center)
+    middles = {splat: sum(found, middles[splat][0] * 0) / len(found) for splat, found in middles.items()}
+    centers = [middles[owner[face.vertices[0]]] for face in data.polygons]
     heights = [sum(a * b for a, b in zip(center, direction, strict=True)) for center in centers]
     return [asked, all(a <= b + 1e-5 for a, b in pairwise(heights))]
 

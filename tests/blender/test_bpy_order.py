@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats, random_mesh
 
 from meshsplats import convert, orbit, psnr, render
 from meshsplats.blender import SceneOptions, draw
-from meshsplats.blender.inside import far_to_near, frame, meshes, objects, rendering, stage
+from meshsplats.blender.inside import far_to_near, frame, meshes, objects, rendering, sorted_copies, stage
 
 
 @pytest.fixture
@@ -24,14 +24,23 @@ def scene():
     return bpy.context.scene
 
 
+def evaluated_faces(obj) -> np.ndarray:
+    """(f, 3) vertices of the triangles in the order in which they are drawn."""
+    bpy.context.view_layer.update()
+    return meshes.triangles(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)[0]
+
+
 def evaluated_centers(obj) -> np.ndarray:
     """(f, 3) centres of splats in the order in which they are drawn, Blender's world."""
-    bpy.context.view_layer.update()
-    data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    flat = np.empty(3 * len(data.polygons), np.float32)
-    data.attributes[far_to_near.CENTER].data.foreach_get("vector", flat)
+    drawn = evaluated_faces(obj)
+    middles, own = meshes.face_middles(obj.data), meshes.triangles(obj.data)[0]
+    _, owner = np.unique(meshes.owners(obj.data), return_inverse=True)
+    means = np.stack([np.bincount(owner, middles[:, k]) for k in range(3)], axis=1)
+    means /= np.bincount(owner)[:, None]
+    of_vertex = np.zeros(len(obj.data.vertices), int)
+    of_vertex[own] = owner[:, None]
     world = np.array(obj.matrix_world)
-    return flat.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+    return means[of_vertex[drawn[:, 0]]] @ world[:3, :3].T + world[:3, 3]
 
 
 def assert_far_to_near(obj, direction) -> None:
@@ -45,6 +54,7 @@ def test_a_viewport_is_sorted_for_its_viewer_and_the_mesh_keeps_its_order(scene)
     obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
     obj.scale = (1, 3, 0.5)
     obj.rotation_euler = (0.3, 0.2, 1)
+    bpy.context.view_layer.update()
     modifier = far_to_near.modifier_of(obj)
     for direction in ((1, 0, 0), (0.3, -0.8, 0.5), (0, 0, -1)):
         far_to_near.look(modifier, direction)
@@ -64,16 +74,19 @@ def test_a_viewport_is_sorted_for_its_viewer_and_the_mesh_keeps_its_order(scene)
     assert len(np.unique(centers.round(5), axis=0)) == len(first)
 
 
-def test_triangles_of_a_splat_keep_their_order(scene):
+@pytest.mark.parametrize("copied", [True, False])
+def test_triangles_of_a_splat_keep_their_order(scene, copied):
     mesh = convert(ball_splats(60)[0])
     obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
-    number = obj.data.attributes.new("number", "INT", "FACE")
-    number.data.foreach_set("value", np.arange(len(mesh.faces), dtype=np.int32))
-    far_to_near.look(far_to_near.modifier_of(obj), (0.2, -1, 0.1))
-    bpy.context.view_layer.update()
-    data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    order = np.empty(len(mesh.faces), np.int32)
-    data.attributes["number"].data.foreach_get("value", order)
+    if not copied:  # with another modifier before it, nodes sort
+        earlier = obj.modifiers.new("earlier", "WEIGHTED_NORMAL")
+        obj.modifiers.move(len(obj.modifiers) - 1, 0)
+        assert obj.modifiers[0] == earlier
+    modifier = far_to_near.modifier_of(obj)
+    far_to_near.look(modifier, (0.2, -1, 0.1))
+    assert (sorted_copies.of(modifier) is not None) == copied
+    faces = evaluated_faces(obj)
+    order = np.array([np.flatnonzero((mesh.faces == face).all(axis=1))[0] for face in faces])
     assert (order != np.arange(len(order))).any()
     owner = mesh.face_splat[order]
     inside = np.diff(owner) == 0
@@ -81,19 +94,85 @@ def test_triangles_of_a_splat_keep_their_order(scene):
     assert (np.diff(order)[inside] == 1).all()
 
 
-def test_centres_follow_edits(scene):
+def test_a_copy_shows_what_nodes_would_and_leaves_nothing(scene):
+    cloud, _ = ball_splats(200)
+    stray = replace(cloud, means=np.vstack([cloud.means[:-1], [3e5, 0, 0]]))
+    for points in (cloud, stray):
+        mesh = convert(points)
+        obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
+        modifier = far_to_near.modifier_of(obj)
+        far_to_near.look(modifier, (0.2, -1, 0.1))
+        shown = evaluated_faces(obj)
+        assert sorted_copies.of(modifier) is not None
+        far_to_near.drop_copies()
+        assert not [other for other in bpy.data.objects if sorted_copies.OWNER in other]
+        assert not [data for data in bpy.data.meshes if sorted_copies.OWNER in data]
+        np.testing.assert_array_equal(evaluated_faces(obj), shown)
+        bpy.data.objects.remove(obj)
+
+
+def test_an_object_that_turns_is_sorted_again(scene):
     obj = objects.add(objects.prepare(convert(ball_splats(100)[0]), False), "ball", scene.collection)
-    before = evaluated_centers(obj)
+    modifier = far_to_near.modifier_of(obj)
+    bpy.context.view_layer.update()
     handlers = bpy.app.handlers.depsgraph_update_post
     handlers.append(lambda _, depsgraph: far_to_near.after_update(depsgraph))
     try:
+        for direction in ((0, 0, 1), (0, 1, 0)):
+            far_to_near.look(modifier, direction)
+            assert_far_to_near(obj, direction)
+            assert sorted_copies.of(modifier) is not None, "only turning the object drops it"
+        obj.location.x += 1
+        assert_far_to_near(obj, (0, 1, 0))
+        assert sorted_copies.of(modifier) is not None
+        obj.rotation_euler.x += 1
+        bpy.context.view_layer.update()
+        assert_far_to_near(obj, (0, 1, 0))
+    finally:
+        handlers.clear()
+
+
+def test_a_duplicate_has_a_copy_of_its_own(scene):
+    obj = objects.add(objects.prepare(convert(ball_splats(100)[0]), False), "ball", scene.collection)
+    far_to_near.look(far_to_near.modifier_of(obj), (0, 0, 1))
+    other = obj.copy()
+    other.rotation_euler = (2, 0, 0)
+    scene.collection.objects.link(other)
+    bpy.context.view_layer.update()
+    for turned in (other, obj):
+        far_to_near.look(far_to_near.modifier_of(turned), (0, 0, 1))
+    for turned in (other, obj):
+        assert_far_to_near(turned, (0, 0, 1))
+    bpy.data.objects.remove(other)
+    far_to_near.drop_copies()
+    assert not [data for data in bpy.data.meshes if sorted_copies.OWNER in data]
+
+
+def test_whole_numbers_are_sorted_as_numpy_sorts_them():
+    values = np.random.default_rng(0).normal(0, 1e5, 3000).astype(np.float32) // 7
+    values[:3] = (2.0**30, -(2.0**30), 2.0**30)
+    expected = np.argsort(np.rint(values), kind="stable")
+    np.testing.assert_array_equal(sorted_copies.far_to_near(values), expected)
+
+
+def test_centres_follow_edits(scene):
+    obj = objects.add(objects.prepare(convert(ball_splats(100)[0]), False), "ball", scene.collection)
+    modifier = far_to_near.modifier_of(obj)
+    handlers = bpy.app.handlers.depsgraph_update_post
+    handlers.append(lambda _, depsgraph: far_to_near.after_update(depsgraph))
+    try:
+        far_to_near.look(modifier, (0, 1, 0))
+        before = evaluated_centers(obj)
         for vertex in obj.data.vertices:
             vertex.co.x += 5
         obj.data.update()
         bpy.context.view_layer.update()
     finally:
         handlers.clear()
-    far_to_near.look(far_to_near.modifier_of(obj), (0, 0, 1))
+    assert sorted_copies.of(modifier) is None, "it would show the mesh as it was"
+    for _ in ("nodes", "a copy"):
+        assert_far_to_near(obj, (0, 1, 0))
+        far_to_near.look(modifier, (0, 1, 0))
     after = evaluated_centers(obj)
     assert after[:, 0].mean() == pytest.approx(before[:, 0].mean() + 5, abs=1e-3)
 
@@ -101,7 +180,6 @@ def test_centres_follow_edits(scene):
 def test_meshes_without_splats_are_sorted_by_the_triangle(scene):
     mesh = replace(random_mesh(50), face_splat=None)
     obj = objects.add(objects.prepare(mesh, False), "mesh", scene.collection)
-    assert far_to_near.CENTER not in obj.data.attributes
     far_to_near.look(far_to_near.modifier_of(obj), (0, 0, 1))
     bpy.context.view_layer.update()
     data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 
+from meshsplats._geometry import direction
 from meshsplats.blender import LightOptions, SceneOptions
 from meshsplats.blender.options import LIGHTS, check_environment
+from meshsplats.cameras.framing import front_axes
+from meshsplats.colors import linear_to_srgb
 
 
 @pytest.mark.parametrize(
@@ -53,6 +57,24 @@ def test_environment_images_are_known_by_content(tmp_path):
         check_environment(bad)
     with pytest.raises(FileNotFoundError):
         SceneOptions(light=replace(LightOptions(), hdri=tmp_path / "none.hdr")).check()
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_a_white_plate_stays_white(name):
+    """Lying, and upright before a viewer who looks down on it by 15 degrees, in the middle of a ground that
+    reflects 0.6 of the light, 250 of 255 and more: irradiance by Lambert's law."""
+    light, up = LIGHTS[name], np.array([0.0, 0, 1])
+    axes = front_axes(up)
+
+    def radiance(normal, ground):
+        suns = ((light.sun, light.sun_strength), (light.fill_direction, light.fill))
+        direct = sum(strength * max(direction(axes, *at) @ normal, 0) for at, strength in suns) / np.pi
+        return direct + light.sky * (1 + normal[2]) / 2 + 0.6 * ground * (1 - normal[2]) / 2
+
+    lying = radiance(up, 0)
+    facing = radiance(direction(axes, 0, 15), lying)
+    shown = linear_to_srgb(np.clip(2**light.exposure * np.array([lying, facing]), 0, 1))
+    assert (255 * shown >= 250).all()
 
 
 def test_named_lights_and_what_is_said_instead():

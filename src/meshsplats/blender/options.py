@@ -47,8 +47,8 @@ class LightOptions:
     """Ground under the subject: a grey plane that fades into the background; a catcher, visible only where
     shadows fall (Cycles); or none."""
     exposure: Annotated[float, Range(-20, 20)] = 0.35
-    """Brightness added for display, in stops: with 0.35, a white plate that faces the viewer looks
-    white. Values of an .exr and the background do not change."""
+    """Brightness added for display, in stops: with 0.35, a white plate that lies or faces the
+    viewer looks white. Values of an .exr and the background do not change."""
     mirror: bool = False
     """A mirror behind the subject."""
     glass: bool = False
@@ -90,7 +90,7 @@ LIGHTS = {
         sky_color=(0.8, 0.9, 1.0),
     ),
     "overcast": LightOptions(sun_strength=0.0, sky=0.9),
-    "studio": LightOptions(sun=(-45.0, 40.0), sun_strength=1.7, sun_size=35.0, fill=0.6, sky=0.3),
+    "studio": LightOptions(sun=(-45.0, 48.0), sun_strength=1.7, sun_size=35.0, fill=0.6, sky=0.32),
 }
 """Lights by name: an afternoon's sun; the sun high in a clear sky; clouds, no shadows with edges; a large
 lamp on the left, a weaker one on the right."""

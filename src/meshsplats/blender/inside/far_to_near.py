@@ -2,7 +2,8 @@
 
 A Geometry Nodes modifier sorts them, by the splat as ``render(order="splat")`` does. The mesh keeps its own
 order, and files need no add-on: images follow the active camera, also an animated one. A viewport follows the
-active camera, too, or else the direction that it was given last (``look``).
+active camera, too, or else the direction that it was given last (``look``), by a sorted copy of the mesh
+where that will do (``sorted_copies``).
 """
 
 from __future__ import annotations
@@ -12,13 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import meshes, versions
+from meshsplats._arrays import subsample
+from meshsplats.blender.inside import meshes, sorted_copies, versions
 from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.inside.sorted_copies import CENTER, SORTED
 
-CENTER = "splat_center"
-"""Face attribute: centre of the splat that each face was made from, the mean of its triangles' corners."""
 MODIFIER = "Far to near"
 """Name of the modifier, and of its node group."""
+_STEPS = 2.0**20
+"""Steps of depth in the distance within which half of the splats lie from the middle."""
+_SOME = 10_000
+"""Splats whose median that distance is."""
+_FARTHEST = 2.0**29
+"""Steps beyond which strays are not told apart: sums of three must fit into 32 bits."""
 VIEW = "View"
 """Input of the node group: the direction to the viewer of a viewport, in Blender's world. Zero: the active
 camera's."""
@@ -44,24 +51,36 @@ def modifier_of(obj: Any) -> Any:
 
 def set_centers(data: Any) -> None:
     """Stores with the mesh ``data`` the centres of its splats, if they have changed: those of faces that lie
-    side by side and belong to one splat."""
-    if not len(data.polygons) or meshes.SPLAT not in data.attributes:
+    side by side and belong to one splat; where faces have no splats, each is one."""
+    if not len(data.polygons):
         return
-    owner = meshes.owners(data)
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(owner) != 0]))
-    counts = np.diff(starts, append=len(owner))
-    centers = np.repeat(
-        np.add.reduceat(meshes.face_middles(data), starts) / counts[:, None], counts, axis=0
-    ).astype(np.float32)
+    middles = meshes.face_middles(data)
+    if meshes.SPLAT in data.attributes:
+        owner = meshes.owners(data)
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(owner) != 0]))
+        counts = np.diff(starts, append=len(owner))
+        middles = np.add.reduceat(middles, starts) / counts[:, None]
+    else:
+        counts = np.ones(len(middles), np.int64)
+    centers = np.repeat(_in_steps(middles), counts, axis=0).ravel()
     attribute = data.attributes.get(CENTER)
     if attribute is None:
         attribute = data.attributes.new(CENTER, "FLOAT_VECTOR", "FACE")
     else:
-        before = np.empty(3 * len(owner), np.float32)
+        before = np.empty(len(centers), np.float32)
         attribute.data.foreach_get("vector", before)
-        if (before == centers.ravel()).all():
+        if (before == centers).all():
             return
-    attribute.data.foreach_set("vector", centers.ravel())
+    attribute.data.foreach_set("vector", centers)
+
+
+def _in_steps(places: np.ndarray) -> np.ndarray:
+    """(n, 3) float32 ``places`` (n, 3) relative to their middle, in steps."""
+    some = subsample(places, _SOME)
+    middle = np.median(some, axis=0)
+    spread = float(np.median(np.linalg.norm(some - middle, axis=1)))
+    away = (places - middle) * (_STEPS / (spread or 1.0))
+    return np.clip(away, -_FARTHEST, _FARTHEST).astype(np.float32)
 
 
 def look(modifier: Any, direction: Sequence[float] | None) -> None:
@@ -70,9 +89,17 @@ def look(modifier: Any, direction: Sequence[float] | None) -> None:
     shown = direction is not None
     if modifier.show_viewport != shown:
         modifier.show_viewport = shown
-    if direction is not None:
-        versions.set_input(modifier, VIEW, tuple(float(x) for x in direction))
-        modifier.id_data.update_tag()
+    given = tuple(float(x) for x in direction or (0, 0, 0))
+    versions.set_input(modifier, VIEW, given)
+    if not (_knows_copies(modifier) and any(given) and sorted_copies.show(modifier, given)):
+        sorted_copies.drop(modifier)
+        if shown:
+            modifier.id_data.update_tag()
+
+
+def _knows_copies(modifier: Any) -> bool:
+    """Whether the node group can show sorted copies; those of older files cannot."""
+    return any(item.name == SORTED for item in modifier.node_group.interface.items_tree)
 
 
 def sorted_objects(scene: Any) -> list[Any]:
@@ -88,12 +115,31 @@ def follow_camera(scene: Any) -> None:
 
 
 def after_update(depsgraph: Any) -> None:
-    """Finds the centres of splats again after edits of their meshes, a handler of ``depsgraph_update_post``.
-    While a mesh is in edit mode, it is drawn in its own order."""
+    """Finds the centres of splats again after edits of their meshes, and has nodes sort those that were
+    edited or turned, a handler of ``depsgraph_update_post``. While a mesh is in edit mode, it is drawn in its
+    own order."""
     for update in depsgraph.updates:
-        data = update.id.original
-        if isinstance(data, bpy.types.Mesh) and not data.is_editmode and CENTER in data.attributes:
-            set_centers(data)
+        changed = update.id.original
+        if isinstance(changed, bpy.types.Object):
+            modifier = modifier_of(changed)
+            if modifier is not None and sorted_copies.has_turned(modifier):
+                sorted_copies.drop(modifier)
+        elif isinstance(changed, bpy.types.Mesh) and CENTER in changed.attributes:
+            for obj in sorted_objects(depsgraph.scene):
+                if obj.data == changed and sorted_copies.is_stale(modifier_of(obj)):
+                    sorted_copies.drop(modifier_of(obj))
+            if not changed.is_editmode:
+                set_centers(changed)
+
+
+def drop_copies() -> None:
+    """Removes all sorted copies: before a file is saved, and when another one, or another state of it, was
+    loaded."""
+    found = [modifier_of(obj) for obj in bpy.data.objects if obj.type == "MESH"]
+    for modifier in found:
+        if modifier is not None:
+            sorted_copies.drop(modifier)
+    sorted_copies.drop_strays()
 
 
 def _group() -> Any:
@@ -102,6 +148,7 @@ def _group() -> Any:
     group.is_modifier = True
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket(VIEW, in_out="INPUT", socket_type="NodeSocketVector")
+    group.interface.new_socket(SORTED, in_out="INPUT", socket_type="NodeSocketObject")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     link = group.links.new
 
@@ -112,7 +159,7 @@ def _group() -> Any:
             setattr(made, name, value)
         return made
 
-    given, result = node("NodeGroupInput", 0, 0), node("NodeGroupOutput", 7, 0)
+    given, result = node("NodeGroupInput", 0, 0), node("NodeGroupOutput", 11, 0)
     # A camera looks along its own -z.
     camera = node("GeometryNodeObjectInfo", 1, 3, transform_space="ORIGINAL")
     link(node("GeometryNodeInputActiveCamera", 0, 3).outputs[0], camera.inputs["Object"])
@@ -123,7 +170,8 @@ def _group() -> Any:
     link(given.outputs[VIEW], length.inputs[0])
     told = node("ShaderNodeMath", 2, 2, operation="MULTIPLY")
     link(length.outputs["Value"], told.inputs[0])
-    link(node("GeometryNodeIsViewport", 1, 1).outputs[0], told.inputs[1])
+    viewport = node("GeometryNodeIsViewport", 1, 1)
+    link(viewport.outputs[0], told.inputs[1])
     viewer = node("GeometryNodeSwitch", 3, 2, input_type="VECTOR")
     link(told.outputs[0], viewer.inputs["Switch"])
     link(behind.outputs[0], viewer.inputs["False"])
@@ -136,17 +184,37 @@ def _group() -> Any:
     local = node("FunctionNodeTransformDirection", 4, 2)
     link(viewer.outputs[0], local.inputs["Direction"])
     link(transposed.outputs[0], local.inputs["Transform"])
-    stored = node("GeometryNodeInputNamedAttribute", 3, 1, data_type="FLOAT_VECTOR")
+    unit = node("ShaderNodeVectorMath", 4, 1, operation="NORMALIZE")
+    link(local.outputs["Direction"], unit.inputs[0])
+    stored = node("GeometryNodeInputNamedAttribute", 4, 0, data_type="FLOAT_VECTOR")
     stored.inputs["Name"].default_value = CENTER
-    place = node("GeometryNodeSwitch", 4, 1, input_type="VECTOR")
-    link(stored.outputs["Exists"], place.inputs["Switch"])
-    link(node("GeometryNodeInputPosition", 3, 0).outputs[0], place.inputs["False"])
-    link(stored.outputs["Attribute"], place.inputs["True"])
     near = node("ShaderNodeVectorMath", 5, 1, operation="DOT_PRODUCT")
-    link(place.outputs[0], near.inputs[0])
-    link(local.outputs[0], near.inputs[1])
-    sort = node("GeometryNodeSortElements", 6, 0, domain="FACE")
-    link(given.outputs["Geometry"], sort.inputs["Geometry"])
-    link(near.outputs["Value"], sort.inputs["Sort Weight"])
-    link(sort.outputs[0], result.inputs[0])
+    link(stored.outputs["Attribute"], near.inputs[0])
+    link(unit.outputs[0], near.inputs[1])
+    step = node("FunctionNodeFloatToInt", 6, 1, rounding_mode="ROUND")
+    link(near.outputs["Value"], step.inputs[0])
+    # Groups are counted and laid side by side, which takes half as long as sorting faces by a weight.
+    depth = node("GeometryNodeCaptureAttribute", 7, 0, domain="FACE")
+    depth.capture_items.new("INT", "Depth")
+    link(given.outputs["Geometry"], depth.inputs[0])
+    link(step.outputs[0], depth.inputs[1])
+    # What is not carried along needs no time.
+    less = node("GeometryNodeRemoveAttribute", 8, 0)
+    less.inputs["Name"].default_value = CENTER
+    link(depth.outputs[0], less.inputs["Geometry"])
+    sort = node("GeometryNodeSortElements", 9, 0, domain="FACE")
+    link(less.outputs[0], sort.inputs["Geometry"])
+    link(depth.outputs[1], sort.inputs["Group ID"])
+    copy = node("GeometryNodeObjectInfo", 7, 2, transform_space="ORIGINAL")
+    link(given.outputs[SORTED], copy.inputs["Object"])
+    count = node("GeometryNodeAttributeDomainSize", 8, 2, component="MESH")
+    link(copy.outputs["Geometry"], count.inputs["Geometry"])
+    there = node("ShaderNodeMath", 9, 2, operation="MULTIPLY")
+    link(count.outputs["Face Count"], there.inputs[0])
+    link(viewport.outputs[0], there.inputs[1])
+    shown = node("GeometryNodeSwitch", 10, 0, input_type="GEOMETRY")
+    link(there.outputs[0], shown.inputs["Switch"])
+    link(sort.outputs[0], shown.inputs["False"])
+    link(copy.outputs["Geometry"], shown.inputs["True"])
+    link(shown.outputs[0], result.inputs[0])
     return group

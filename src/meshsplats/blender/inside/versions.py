@@ -97,9 +97,24 @@ def enable_cycles() -> None:
 
 def set_input(modifier: Any, name: str, value: Any) -> None:
     """Gives the input ``name`` of a Geometry Nodes ``modifier`` a value."""
-    sockets = modifier.node_group.interface.items_tree
-    (key,) = (s.identifier for s in sockets if s.name == name and s.in_out == "INPUT")
+    key = _key(modifier, name)
     if hasattr(modifier, "properties"):  # since 5.2
         getattr(modifier.properties.inputs, key).value = value
     else:
         modifier[key] = value
+
+
+def input_of(modifier: Any, name: str) -> Any:
+    """The value of the input ``name`` of a Geometry Nodes ``modifier``; None where its group, from an older
+    file, has no such input."""
+    key = _key(modifier, name)
+    if not key:
+        return None
+    if hasattr(modifier, "properties"):
+        return getattr(modifier.properties.inputs, key).value
+    return modifier.get(key)
+
+
+def _key(modifier: Any, name: str) -> str:
+    sockets = modifier.node_group.interface.items_tree if modifier.node_group is not None else ()
+    return next((s.identifier for s in sockets if s.name == name and s.in_out == "INPUT"), "")
