@@ -204,6 +204,16 @@ def test_some_of_many_splats_show_what_all_do(limit, count, monkeypatch):
     assert np.abs(few_spread - spread).mean() < 0.05
 
 
+def test_what_is_kept_of_many_splats_is_no_more_than_views_need(monkeypatch):
+    cloud = room(6000, 500)
+    cloud = replace(cloud, sh=np.pad(cloud.sh, ((0, 0), (0, 15), (0, 0))))
+    monkeypatch.setattr("meshsplats.viewpoints.sample.MOST", 2000)
+    some = AllSplats(cloud, 2)
+    assert 1000 < len(some.cloud) <= 2000
+    assert some.cloud.sh.shape[1] == 1
+    assert some.wider == pytest.approx((len(cloud) / len(some.cloud)) ** 0.5, rel=0.01)
+
+
 @pytest.mark.slow
 def test_targets_of_a_room_are_its_inside():
     auto = splat_dataset(room(), train=4, test=2, width=32, threads=2)
