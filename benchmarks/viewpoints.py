@@ -30,10 +30,21 @@ def split(cloud: ms.GaussianCloud, count: int) -> ms.GaussianCloud:
     parts = max(1, round(count / len(cloud)))
     if parts == 1:
         return cloud
-    many = cloud.take(np.tile(np.arange(len(cloud)), parts))
-    jitter = np.random.default_rng(0).normal(size=many.means.shape).astype(np.float32)
-    along = np.einsum("nij,nj->ni", many.rotations, jitter * many.scales)
-    return replace(many, means=many.means + along, scales=many.scales * np.float32(parts**-0.5))
+    rng, rotations = np.random.default_rng(0), cloud.rotations
+    means = np.empty((parts, len(cloud), 3), np.float32)
+    for part in means:  # one after the other: the peak of memory is to be that of the search
+        jitter = rng.normal(size=part.shape).astype(np.float32)
+        part[:] = cloud.means + np.einsum("nij,nj->ni", rotations, jitter * cloud.scales)
+    repeated = {
+        name: np.tile(values, (parts,) + (1,) * (values.ndim - 1))
+        for name, values in (
+            ("quaternions", cloud.quaternions),
+            ("scales", cloud.scales * np.float32(parts**-0.5)),
+            ("opacities", cloud.opacities),
+            ("sh", cloud.sh),
+        )
+    }
+    return replace(cloud, means=means.reshape(-1, 3), **repeated)
 
 
 def against(found: Sequence[ms.Camera], true: Sequence[ms.Camera]) -> tuple[float, float]:

@@ -17,9 +17,9 @@ from meshsplats.cli import main
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.viewpoints.finding import FoundCameras, find_cameras, first_impression
+from meshsplats.viewpoints.finding import FoundCameras, find_cameras, first_impression, varied
 from meshsplats.viewpoints.sample import AllSplats, Sample
-from meshsplats.viewpoints.views import Checked
+from meshsplats.viewpoints.views import Checked, Chooser
 
 HALF = np.array([2.0, 1.3, 3.0])
 """Half the width, height and length of the room; y points down."""
@@ -138,8 +138,6 @@ def test_a_given_up_is_kept(found):
 
 
 def test_more_views_than_can_be_found_are_variations(found):
-    from meshsplats.viewpoints.finding import varied
-
     many = varied(found.cameras, 40)
     assert len(many) == 40
     assert many[:COUNT] == list(found.cameras)
@@ -156,6 +154,28 @@ def test_the_widest_lens_of_a_good_picture(found):
     assert view.widest(1) == 2
     assert view.widest(0.01) is None
     assert view.with_lens(2, 800, 600).fx == pytest.approx(found.cameras[0].fx * 2 * 600 / 400)
+
+
+def test_views_that_fail_lead_the_search_back_to_good_ones():
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0, 3.6, 0.15), np.arange(0, 2, 0.15)))
+    count = len(x)
+    poor = np.where(x < 1.2, 0.0, 1.0)[:, None]
+    chooser = Chooser.__new__(Chooser)
+    chooser.place, chooser.spots = np.arange(count), np.stack([x, y], axis=1)
+    chooser.shown, chooser.weight = np.eye(count, dtype=np.float32), np.ones(count)
+    chooser.worth, chooser.rich = np.ones(count), np.ones(count, bool)
+    chooser._checked = {k: Checked(None, np.ones(1), poor[k], np.zeros(1)) for k in range(count)}
+    chosen = chooser.in_order(0, 6, 1.0)  # 80 of all candidates are good; more fail than it has patience for
+    assert len(chosen) == 6
+    assert (x[chosen] < 1.2).all()
+
+
+def test_variations_of_narrow_views_stay_narrow():
+    for fov in (40.0, 60.0, 80.0):
+        parent = look_at((0, 0, -2), (0, 0, 2), fov=fov, width=400, height=400, near=0.1)
+        wide = varied([parent], 3)[2]
+        widest = np.tan(np.radians(85 / 2)) / np.tan(np.radians(fov / 2))
+        assert parent.fx / wide.fx == pytest.approx(min(1.5, widest), rel=1e-6)
 
 
 @pytest.mark.slow
@@ -202,6 +222,16 @@ def test_some_of_many_splats_show_what_all_do(limit, count, monkeypatch):
     assert np.abs(few_alpha - alpha).mean() < 0.04
     assert np.abs(few_angle - angle).mean() < 0.1
     assert np.abs(few_spread - spread).mean() < 0.05
+
+
+def test_what_is_kept_of_many_splats_is_no_more_than_views_need(monkeypatch):
+    cloud = room(6000, 500)
+    cloud = replace(cloud, sh=np.pad(cloud.sh, ((0, 0), (0, 15), (0, 0))))
+    monkeypatch.setattr("meshsplats.viewpoints.sample.MOST", 2000)
+    some = AllSplats(cloud, 2)
+    assert 1000 < len(some.cloud) <= 2000
+    assert some.cloud.sh.shape[1] == 1
+    assert some.wider == pytest.approx((len(cloud) / len(some.cloud)) ** 0.5, rel=0.01)
 
 
 @pytest.mark.slow

@@ -33,6 +33,8 @@ DISTANCES = (0.9, 1.1)
 """Multiples of the distance at which the subject just fits."""
 SURROUNDINGS_SHARE = 0.01
 """A subject has surroundings if more than this share of the opacity lies beyond it."""
+MOST = 2_000_000
+"""Splats, at most, that tell whether a subject has surroundings."""
 STANDS = 12
 """Largest number of places for cameras inside a scene."""
 CANDIDATES = 512
@@ -44,9 +46,10 @@ ROOMY = 0.4
 def has_surroundings(cloud: GaussianCloud) -> bool:
     """Whether more than ``SURROUNDINGS_SHARE`` of the opacity lies far outside the subject, as
     ``framing.scene_bounds`` has it."""
+    step = -(-len(cloud) // MOST)
     center = scene_bounds(cloud).center
-    distance = np.linalg.norm(cloud.means - center, axis=1)
-    weights = cloud.opacities.astype(np.float64)
+    distance = np.linalg.norm(cloud.means[::step] - center, axis=1)
+    weights = cloud.opacities[::step].astype(np.float64)
     if weights.sum() == 0:
         return False
     far = distance > SURROUNDINGS * weighted_quantile(distance, weights, 0.5)

@@ -33,7 +33,10 @@ SHIFT = 0.1
 TURN = 8.0
 """Greatest turn of a variation, degrees."""
 WIDE = 85.0
-"""Degrees of every third variation, for what is around the subject."""
+"""Degrees of every third variation, for what is around the subject, at most..."""
+WIDER = 1.5
+"""...and how much more it shows, at most, than the view that it is a variation of: a narrow view is one
+because there is noise around it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +195,8 @@ def varied(cameras: Sequence[Camera], count: int) -> list[Camera]:
         matrix[:3, 3] = SHIFT * depth * np.array([y, 0.5 * z, x])
         focal = camera.fx
         if i % 3 == 2:
-            focal = min(focal, min(camera.width, camera.height) / 2 / np.tan(np.radians(WIDE) / 2))
+            widest = min(camera.width, camera.height) / 2 / np.tan(np.radians(WIDE) / 2)
+            focal = min(focal, max(widest, focal / WIDER))
         views.append(replace(camera, world_to_camera=matrix @ camera.world_to_camera, fx=focal, fy=focal))
     return views
 

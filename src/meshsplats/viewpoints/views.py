@@ -34,7 +34,11 @@ UNCOMMON = 0.4
 NEARBY = 0.7
 """Distance, in spreads of the places and units of direction, within which views show much the same..."""
 ALIKE = 0.12
-"""...and that within which they are as bad as each other, likely."""
+"""...that within which they are as bad as each other..."""
+LIKELY = 0.5
+"""...and that within which they are likely both good pictures, or neither."""
+TRUST = 4.0
+"""So many views that are no good pictures halve what one like them is worth."""
 SIDE = 56
 """Pixels of a side of the images in which views are checked."""
 WIDEST, WIDE, NARROWEST = 84.0, 60.0, 40.0
@@ -172,6 +176,7 @@ class Chooser:
         count_shown = np.zeros(self.shown.shape[1])
         open_ones = self.rich.copy()
         nearest = np.full(len(self.place), np.inf)
+        good, bad = np.full(len(self.place), TRUST), np.zeros(len(self.place))
         failed = 0  # in a row: what is chosen does not depend on how many are wanted
         while len(chosen) < count and open_ones.any() and failed < PATIENCE:
             if first is not None and not chosen:
@@ -179,18 +184,22 @@ class Chooser:
             else:
                 gain = (self.shown @ need).astype(np.float64) * self.worth
                 gain *= 1 - np.exp(-nearest / NEARBY**2)
+                gain *= good / (good + bad)
                 k = int(np.argmax(np.where(open_ones, gain, -1)))
             open_ones[k] = False
+            apart = ((self.spots - self.spots[k]) ** 2).sum(axis=1)
+            alike = np.exp(-apart / LIKELY**2)
             if np.isfinite(limit) and self.checked(k).widest(limit) is None:
-                apart = ((self.spots - self.spots[k]) ** 2).sum(axis=1)
                 open_ones &= apart > ALIKE**2
+                bad += alike
                 failed += 1
                 continue
             chosen.append(k)
             failed = 0
+            good += alike
             count_shown += self.shown[k] / STEPS
             need = np.round(LEVELS * self.weight / (1 + count_shown)).astype(np.float32)
-            nearest = np.minimum(nearest, ((self.spots - self.spots[k]) ** 2).sum(axis=1))
+            nearest = np.minimum(nearest, apart)
         return chosen
 
     def fog_limit(self) -> float:
