@@ -25,6 +25,11 @@ _OUTLIERS = 0.002
 """Share of the opacity that may lie beyond each side of the box, so that floaters do not enlarge it."""
 _MARGIN = 0.05
 """Margin around the box, relative to its longest side."""
+_NEARLY, _ALL = 0.02, 0.001
+"""Shares of what cameras see of a place beyond each side of two boxes: nearly all, and all but strays."""
+_REACH = 0.25
+"""How far the box of a place reaches beyond nearly all, relative to the longest side of that: what is farther
+away is a background for whose sake all voxels would be coarse."""
 _CLOSE = 0.9
 """Distance before a surface, in units of the truncation, from which there must be something behind."""
 _GAP = 3
@@ -188,3 +193,19 @@ def grid_around(scene: GaussianCloud | SplatMesh, resolution: int) -> Grid:
     low, high = low - _MARGIN * longest, high + _MARGIN * longest
     voxel = float((high - low).max()) / resolution
     return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1))
+
+
+def grid_of(points: np.ndarray, resolution: int) -> Grid:
+    """The grid around what cameras see of a place, ``points`` (n, 3), about ``resolution`` voxels along its
+    longest side: around all of it but strays, unless these lie far beyond nearly all.
+
+    Raises ValueError for points without extent.
+    """
+    lowest, low, high, highest = np.quantile(points, [_ALL, _NEARLY, 1 - _NEARLY, 1 - _ALL], axis=0)
+    reach = _REACH * float((high - low).max())
+    low, high = np.maximum(lowest, low - reach), np.minimum(highest, high + reach)
+    voxel = float((high - low).max()) / (resolution - 4)
+    if not voxel > 0:
+        raise ValueError("the scene has no extent")
+    low = low - 2 * voxel
+    return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 3))

@@ -25,7 +25,14 @@ from meshsplats.surfaces.atlas import cells, cells_side, unwrap
 from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors
 from meshsplats.surfaces.floor import missing_ground
-from meshsplats.surfaces.fusion import coarser, collapsed, grid_around, isosurface, signed_distances
+from meshsplats.surfaces.fusion import (
+    coarser,
+    collapsed,
+    grid_around,
+    grid_of,
+    isosurface,
+    signed_distances,
+)
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
 from meshsplats.surfaces.manifold import split_pinches
@@ -53,8 +60,6 @@ _FLOOR = 4
 """New ground has at most as many triangles as the surface divided by this."""
 _BOX_SIDE = 128
 """Sides of the depth images by which the box of a place is found."""
-_BOX_SHARE = 0.02
-"""Share of what these show beyond each side of the box."""
 
 
 def make_surface(
@@ -242,7 +247,7 @@ def _floored(
 
 
 def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, threads: int | None) -> Grid:
-    """The grid around what the cameras see, without what is farther than nearly all of it."""
+    """The grid around what the cameras see."""
     points = []
     for camera in cameras:
         small = camera.scaled(_BOX_SIDE / max(camera.width, camera.height)).with_near_plane(mesh.vertices)
@@ -258,12 +263,7 @@ def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, thre
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
-    low, high = np.quantile(every, [_BOX_SHARE, 1 - _BOX_SHARE], axis=0)
-    voxel = float((high - low).max()) / (resolution - 4)
-    if not voxel > 0:
-        raise ValueError("the scene has no extent")
-    low = low - 2 * voxel
-    return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 3))
+    return grid_of(every, resolution)
 
 
 def _fitted(
