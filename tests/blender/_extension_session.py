@@ -302,7 +302,7 @@ choices = {name: getattr(obj.meshsplats, name) for name in sys.modules[addon + "
 window, operator = Window(), Operator()
 answers = [operator.begin(window, work.Work([str(folder / "ball.ply")], choices))]
 answers.append(operator.modal(window, event("MOUSEMOVE")))
-while answers[-1] != {"FINISHED"} and len(answers) < 2000:
+while answers[-1] != {"FINISHED"} and len(answers) < 20_000:
     time.sleep(0.02)
     answers.append(operator.modal(window, event("TIMER")))
 report["waited"] = {

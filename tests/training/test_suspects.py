@@ -1,4 +1,4 @@
-"""Photographs that are blurred, double or misplaced: named when they are, and no others."""
+"""Photographs that are blurred or double: named when they are, and no others."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from PIL import Image
 
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning
-from meshsplats.training import starting_fans, train, train_config
-from meshsplats.training.suspects import REACH, Suspects, alike, find_suspects, fitting_share, steepness
+from meshsplats.training import train, train_config
+from meshsplats.training.suspects import REACH, Suspects, alike, find_suspects, steepness
 
 SIZE = {"start_splats": 1500, "max_splats": 1500, "growth_events": 0, "sh_degree": 0}
 
@@ -31,11 +31,6 @@ def photographs():
     return [sharp_view(camera) for camera in cameras_around(20, side=96)]
 
 
-@pytest.fixture(scope="module")
-def start(photographs):
-    return starting_fans(Dataset(tuple(photographs)).over((0, 0, 0)), train_config(steps=1, **SIZE))
-
-
 def with_color(view: View, color: np.ndarray, **changes) -> View:
     return replace(view, source=replace(view.load(), color=color), **changes)
 
@@ -48,56 +43,43 @@ def smeared(color: np.ndarray, count: int, *axes: int) -> np.ndarray:
     return values.astype(color.dtype)
 
 
-def turned(view: View, degrees: float) -> View:
-    """``view`` with its camera turned about its own upright axis."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turn = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
-    return replace(view, camera=replace(view.camera, world_to_camera=turn @ view.camera.world_to_camera))
-
-
 # ---- All of them
 
 
-def test_photographs_without_a_fault_are_not_named(start, photographs):
-    assert find_suspects(start, photographs) == Suspects()
+def test_photographs_without_a_fault_are_not_named(photographs):
+    assert find_suspects(photographs) == Suspects()
 
 
 @pytest.mark.parametrize("axes", [(0, 1), (0,), (1,)], ids=["out of focus", "shaken upwards", "sideways"])
-def test_blurred_ones_are_named(start, photographs, axes):
+def test_blurred_ones_are_named(photographs, axes):
     views = list(photographs)
     for i in (3, 11):
         views[i] = with_color(views[i], smeared(views[i].load().color, 7, *axes))
-    assert find_suspects(start, views) == Suspects(blurred=("003", "011"))
+    assert find_suspects(views) == Suspects(blurred=("003", "011"))
 
 
 @pytest.mark.parametrize("kind", ["a copy", "JPEG", "smaller"])
-def test_the_same_photograph_twice_is_named(start, photographs, kind):
+def test_the_same_photograph_twice_is_named(photographs, kind):
     view = photographs[4]
     picture, camera = Image.fromarray(view.load().color), replace(view.camera, name="copy")
     if kind == "JPEG":
         file = io.BytesIO()
-        picture.save(file, "JPEG", quality=95, subsampling=0)
+        picture.save(file, "JPEG", quality=98, subsampling=0)
         picture = Image.open(file)
     if kind == "smaller":
         picture = picture.resize((32, 32), Image.Resampling.BOX)
         camera = replace(camera.within(32), name="copy")
     again = View(camera, ViewImage(np.asarray(picture)))
-    found = find_suspects(start, [*photographs, again])
+    found = find_suspects([*photographs, again])
     assert found == Suspects(doubles=(("004", "copy"),))
+    moved = View(camera, ViewImage(np.roll(np.asarray(picture), 1, axis=1)))
+    assert find_suspects([*photographs, moved]) == Suspects(), "a neighbour is another photograph"
 
 
-@pytest.mark.parametrize("degrees", [20, -20])
-def test_a_turned_camera_is_named(degrees):
-    """By the fans that it took part in, too."""
-    views = [sharp_view(camera) for camera in cameras_around(30, side=96)]
-    views[7] = turned(views[7], degrees)
-    mesh = starting_fans(Dataset(tuple(views)).over((0, 0, 0)), train_config(steps=1, **SIZE))
-    assert find_suspects(mesh, views) == Suspects(misplaced=("007",))
-
-
-def test_few_photographs_do_not_tell_what_is_usual(start, photographs):
-    views = [turned(photographs[0], 20), *photographs[:3]]
-    assert find_suspects(start, views) == Suspects()
+def test_few_photographs_do_not_tell_what_is_usual(photographs):
+    blurred = with_color(photographs[0], smeared(photographs[0].load().color, 7, 0, 1))
+    views = [blurred, *photographs[1:4]]
+    assert find_suspects(views) == Suspects()
 
 
 # ---- One at a time
@@ -126,21 +108,10 @@ def test_a_sharp_edge_has_a_steepness_of_one_in_any_light():
     assert steepness(ViewImage(color // 5))[0] == 1
 
 
-def test_a_wall_tells_nothing(start, photographs):
-    """Neither whether it is sharp nor where it is."""
+def test_a_wall_tells_nothing(photographs):
     grey = with_color(photographs[2], np.full_like(photographs[2].load().color, 120))
     assert np.isnan(steepness(grey.load())).all()
-    assert np.isnan(fitting_share(start, grey, grey.load()))
-    assert find_suspects(start, [*photographs[:2], grey, *photographs[3:]]) == Suspects()
-
-
-def test_pixels_that_do_not_count_do_not_misplace_a_camera(start, photographs):
-    view = turned(photographs[7], 20)
-    left = np.zeros((96, 96), bool)
-    left[:, :10] = True
-    masked = replace(view, source=replace(view.load(), mask=left))
-    assert np.isnan(fitting_share(start, masked, masked.load()))  # too few are left
-    assert fitting_share(start, view, view.load()) < 0.3 * fitting_share(start, photographs[7], view.load())
+    assert find_suspects([*photographs[:2], grey, *photographs[3:]]) == Suspects()
 
 
 def test_pairs_are_those_of_equal_rows():
@@ -152,11 +123,11 @@ def test_pairs_are_those_of_equal_rows():
 
 def test_messages_count_and_name():
     names = tuple(f"{i}.jpg" for i in range(7))
-    lines = Suspects(names, (("a.jpg", "b.jpg"),), names[:1]).messages()
+    lines = Suspects(names, (("a.jpg", "b.jpg"),)).messages()
     named = "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, ..."
     assert lines[0].startswith(f"7 photographs are blurred beside the others: {named}")
     assert lines[1].startswith("the same photograph twice: a.jpg and b.jpg.")
-    assert lines[2].startswith("1 photograph is not where its camera says: 0.jpg.")
+    assert len(lines) == 2
     assert Suspects().messages() == []
 
 

@@ -81,7 +81,7 @@ def train(
             ``finetune``. Interrupted leaves the mesh so far in the folder, too.
 
     Warns with a DataWarning of photographs that do not fit the others: before the first step of those that
-    are blurred, double or misplaced, at the end of those that the mesh cannot show.
+    are blurred or double, at the end of those that the mesh cannot show.
     """
     need(Dataset, dataset=dataset)
     need(TrainConfig, config=config, optional=True)
@@ -99,7 +99,7 @@ def train(
         mesh = _stored_start(journal)
     else:
         mesh = starting_fans(dataset, config, points, run.threads)
-        for message in find_suspects(mesh, dataset.train, run.threads).messages():
+        for message in find_suspects(dataset.train).messages():
             warnings.warn(message, DataWarning, stacklevel=2)
     if config.exposure is None:
         config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
