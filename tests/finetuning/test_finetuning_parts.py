@@ -16,6 +16,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.conversion.footprint import DRAWN_PX2
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
@@ -23,7 +24,6 @@ from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import initial, memory
 from meshsplats.finetuning.config import PRESETS, FinetuneConfig, is_long, learning_rates, make_config
 from meshsplats.finetuning.initial import (
-    TRAINED_PX2,
     boundary_vertices,
     for_photographs,
     starting_mesh,
@@ -412,7 +412,7 @@ def test_splats_begin_as_wide_as_in_the_photographs():
         return views
 
     options = ConversionOptions()
-    assert for_photographs(options, cloud, photographs(48, 0.3)).footprint_px2 == TRAINED_PX2
+    assert for_photographs(options, cloud, photographs(48, 0.3)).footprint_px2 == DRAWN_PX2
     smaller = photographs(48, 0.3 / 16)
     assert for_photographs(options, cloud, smaller) == options
     for other in (ConversionOptions(footprint_px2=0.1), ConversionOptions(footprint="none")):

@@ -255,6 +255,11 @@ def splat_views(
     )
 
 
+def are_rendered(views: Sequence[View]) -> bool:
+    """Whether some of ``views`` are images of splats, not photographs."""
+    return any(isinstance(view.source, RenderedSplats) for view in views)
+
+
 @dataclass(frozen=True, eq=False)
 class RenderedSplats:
     """An image of splats, rendered on demand."""

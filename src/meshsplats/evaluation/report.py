@@ -12,7 +12,7 @@ import numpy as np
 from meshsplats._kinds import need
 from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
-from meshsplats.datasets.splat_targets import RenderedSplats
+from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
@@ -331,7 +331,7 @@ def _empty(view: View) -> np.ndarray | None:
 
 
 def _targets_are_splats(dataset: Dataset) -> bool:
-    return any(isinstance(view.source, RenderedSplats) for view in dataset.views[:1])
+    return are_rendered(dataset.views[:1])
 
 
 def _mesh_renderer(mesh: SplatMesh, samples: int, threads: int | None) -> ImageAt:

@@ -13,8 +13,9 @@ from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.detail import OnImage
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2
 from meshsplats.conversion.options import FLAT_SIDES, make_options
-from meshsplats.datasets.splat_targets import RenderedSplats
+from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.config import FinetuneConfig, is_long
 from meshsplats.gaussians import GaussianCloud
@@ -41,12 +42,10 @@ LONG_SIDES = 32
 LONG_TRIANGLES = 1_500_000
 """``MANY_TRIANGLES`` of long runs."""
 
-TRAINED_PX2, AREA_PX2 = 0.3, 0.05
-"""Square pixels: the variance by which 3DGS widens splats in the images that it trains on, and that of fans
-for means over areas. Lego on its photographs, before a step and after 1.5 minutes: 30.1 and 34.55 dB, with
-the latter 26.0 and 34.34; snowmiku 27.0 and 26.3 before, the same after."""
 FITTED_VIEWS = 4
-"""Photographs by which one of them is chosen."""
+"""Photographs by which ``for_photographs`` chooses a footprint. Lego on its photographs, before a step and
+after 1.5 minutes, as wide as 3DGS drew it: 30.1 and 34.55 dB; as for means over areas 26.0 and 34.34;
+snowmiku 27.0 and 26.3 before, the same after."""
 
 FOOTPRINT_PX2 = 0.008
 """Variance of the footprint, square pixels of the training images, for runs on means over areas: that of
@@ -104,16 +103,17 @@ def for_photographs(
 ) -> ConversionOptions:
     """``options`` with the footprint by which ``cloud`` looks most like ``views``, if these are photographs.
 
-    3DGS widens splats by ``TRAINED_PX2`` in the photographs that it trains on: their own size is too small
+    3DGS widens splats by ``DRAWN_PX2`` in the photographs that it trains on: their own size is too small
     there, and right where these photographs are much smaller than those. Options that say something of the
     footprint, and splats of other kernels, stay.
     """
     views = subsample(views, FITTED_VIEWS)
     if cloud.kernel != "3dgs" or options.footprint is not None or options.footprint_px2 is not None:
         return options
-    if not views or any(isinstance(view.source, RenderedSplats) for view in views):
+    if not views or are_rendered(views):
         return options
-    errors = dict.fromkeys((AREA_PX2, TRAINED_PX2), 0.0)
+    of_areas = FILTER_PX2["area"][cloud.kernel]
+    errors = dict.fromkeys((of_areas, DRAWN_PX2), 0.0)
     for view in views:
         image = view.load()
         weight = 1.0 if image.mask is None else image.mask[..., None]
@@ -123,8 +123,8 @@ def for_photographs(
                 cloud, view.camera, background=view.background, samples=2, dilation=px2, threads=threads
             )
             errors[px2] += float((weight * (drawn.color.clip(0, 1) - target) ** 2).mean())
-    wider = errors[TRAINED_PX2] < errors[AREA_PX2]
-    return replace(options, footprint_px2=TRAINED_PX2) if wider else options
+    wider = errors[DRAWN_PX2] < errors[of_areas]
+    return replace(options, footprint_px2=DRAWN_PX2) if wider else options
 
 
 def _is_for_images_of_splats(options: ConversionOptions, config: FinetuneConfig | None) -> bool:

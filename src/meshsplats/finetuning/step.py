@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.silhouettes import has_silhouettes
-from meshsplats.datasets.splat_targets import RenderedSplats
+from meshsplats.datasets.splat_targets import RenderedSplats, are_rendered
 from meshsplats.datasets.views import View
 from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DivergenceError
@@ -154,7 +154,7 @@ def samples_of(view: View, config: FinetuneConfig, fraction: float = 1.0) -> int
 def for_views(config: Config, views: Sequence[View]) -> Config:
     """``config`` with the numbers that it leaves to the kind of ``views``: ``one_sample_share``,
     ``by_splat_share`` and ``harmonics_rate``."""
-    rendered = any(isinstance(view.source, RenderedSplats) for view in views)
+    rendered = are_rendered(views)
     one_sample, by_splat, harmonics = config.one_sample_share, config.by_splat_share, config.harmonics_rate
     if one_sample is None:
         one_sample = 0.0 if config.cuts or rendered or has_silhouettes(views) else ONE_SAMPLE_SHARE

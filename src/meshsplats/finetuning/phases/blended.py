@@ -36,8 +36,10 @@ class Blended:
         return views
 
     def before_step(self, state: State, fraction: float) -> State:
-        order = "splat" if fraction < (self.config.by_splat_share or 0.0) else self.order
-        if self.order is None or order is None or state.mesh.order == order:
+        if self.order is None:
+            return state
+        order: Order = "splat" if fraction < (self.config.by_splat_share or 0.0) else self.order
+        if state.mesh.order == order:
             return state
         mesh = replace(state.result(), order=order)
         return state.rebuild(mesh, np.arange(len(mesh.vertices)))
