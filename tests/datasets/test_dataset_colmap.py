@@ -293,13 +293,16 @@ def test_an_endless_line_of_points_is_skipped_without_memory(tmp_path):
     tracemalloc.stop()
 
 
-def test_missing_images_are_counted_and_left_out_on_demand(tmp_path):
+def test_held_out_views_are_those_that_are_there(tmp_path):
     folder = simple_colmap(tmp_path, 5)
     (folder / "images/p01.png").unlink()
     (folder / "images/p03.png").unlink()
-    refused(folder, r"2 of 5 images are missing \(images/p01\.png, images/p03\.png\).*--missing skip")
+    with pytest.raises(
+        FileFormatError, match=r"2 of 5 .* \(images/p01\.png, images/p03\.png\).*--missing skip"
+    ):
+        load_dataset(folder, missing="error")
     with pytest.warns(DataWarning, match=r"2 images are missing.*images/p01\.png, images/p03\.png"):
-        dataset = load_dataset(folder, test_every=2, missing="skip")
+        dataset = load_dataset(folder, test_every=2)
     # Held out is every second of those that are there.
     assert [view.name for view in dataset.test] == ["p00.png", "p04.png"]
 

@@ -292,25 +292,25 @@ def test_names_stay_inside_the_folder(tmp_path):
 # ---- Half a data set
 
 
-def test_missing_images_are_an_error_for_every_command(tmp_path, capsys):
+def test_many_missing_images_are_an_error_for_every_command(tmp_path, capsys):
     folder = simple_colmap(tmp_path / "half", 6)
-    for i in (1, 2):
+    for i in (1, 2, 4):
         (folder / f"images/p0{i}.png").unlink()
     scene = tmp_path / "mesh.npz"
     corners = np.array([[1.0, 0, 5], [0, 1, 5], [0, 0, 6]])
     ms.save_mesh(ms.SplatMesh(corners, np.array([[0, 1, 2]], np.int32), np.ones((3, 4))), scene)
     command = ["render", str(scene), "-o", str(tmp_path / "out"), "--data", str(folder)]
     assert main(command) == 1
-    assert "2 of 6 images are missing" in capsys.readouterr().err
+    assert "3 of 6 images are missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main([*command, "--missing", "skip"]) == 0
-    assert "2 images are missing; their views are left out" in capsys.readouterr().err
+    assert "3 images are missing; their views are left out" in capsys.readouterr().err
     assert main(["render", str(scene), "-o", str(tmp_path / "out2"), "--missing", "skip"]) == 2
     assert main(["info", str(folder), "--json"]) == 0
     shown = capsys.readouterr()
-    assert json.loads(shown.out)["images"] == 4
-    assert shown.err.count("2 images are missing") == 1
-    with pytest.raises(ValueError, match="missing must be 'error' or 'skip', got 'no'"):
+    assert json.loads(shown.out)["images"] == 3
+    assert shown.err.count("3 images are missing") == 1
+    with pytest.raises(ValueError, match="missing must be 'few', 'error' or 'skip', got 'no'"):
         load_dataset(folder, missing="no")  # type: ignore[arg-type]
 
 

@@ -229,12 +229,17 @@ def test_masks_by_name_and_by_folder(tmp_path):
     refused(folder, "8 x 12 pixels do not fit its camera")
 
 
-def test_missing_images_are_counted(tmp_path):
+def test_few_missing_images_are_left_out(tmp_path):
     folder = studio(tmp_path, 4)
     (tmp_path / "images/f2.png").unlink()
-    refused(folder, r"1 of 4 images are missing \(images/f2\.png\)")
     with pytest.warns(DataWarning, match=r"1 images are missing.*\(images/f2\.png\)"):
-        assert len(load_dataset(folder, missing="skip").views) == 3
+        assert len(load_dataset(folder).views) == 3
+    with pytest.raises(FileFormatError, match=r"1 of 4 images are missing \(images/f2\.png\)"):
+        load_dataset(folder, missing="error")
+    (tmp_path / "images/f1.png").unlink()  # half of them
+    refused(folder, r"2 of 4 images are missing \(images/f1\.png, images/f2\.png\)")
+    with pytest.warns(DataWarning, match="2 images are missing"):
+        assert len(load_dataset(folder, missing="skip").views) == 2
     # The same where their size would have been asked of them.
     folder = studio(tmp_path, 3, [*map(frame, ("images/f0.png", "no.png"))], w=None)
     with pytest.warns(DataWarning, match="1 images are missing"):

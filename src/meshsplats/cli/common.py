@@ -233,7 +233,7 @@ def check_data(
     """UsageError for --missing and --masks without --data, and for --cameras with it."""
     if cameras is not None and data is not None:
         raise UsageError("give --cameras or --data, not both")
-    if missing != "error" and data is None:
+    if missing != "few" and data is None:
         raise UsageError("--missing has no effect without --data")
     if masks != "count" and data is None:
         raise UsageError("--masks has no effect without --data")

@@ -232,7 +232,7 @@ class Convert(ConvertCommand):
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         words += ["--look", self.look_of_result] if self.look_of_result != "area" else []
-        words += again(self, "data", missing="error")
+        words += again(self, "data", missing="few")
         if cameras and self.data is None:
             words += ["--cameras", source if self.cameras is None else self.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
@@ -241,7 +241,7 @@ class Convert(ConvertCommand):
         """The command that makes a mesh for viewers that do not sort, and what is gained by it."""
         words: list[str | Path] = ["meshsplats", "finetune", shown_path(self.input[0])]
         words += [
-            *again(self, "data", missing="error"),
+            *again(self, "data", missing="few"),
             *self.reading.again(),
             "-o",
             self.output.with_suffix(".solid.glb"),

@@ -77,7 +77,7 @@ class ConvertCommand(Command):
     folder that has one. Default: those of the input if it is a model folder, else none."""
     data: option.Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
     file, else -y."""

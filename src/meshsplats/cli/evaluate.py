@@ -114,7 +114,7 @@ class Evaluate(Command):
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     masks: option.MeaningOfMasks = "count"
     protocol: Annotated[
         Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
@@ -180,7 +180,7 @@ class Evaluate(Command):
             for name in ("before", "splats", "images", "cameras", "sh_degree", "order"):
                 if getattr(self, name) is not None:
                     raise UsageError(f"{flag(name)} has no effect with --protocol")
-            if self.missing != "error":
+            if self.missing != "few":
                 raise UsageError("--missing has no effect with --protocol, which needs every image")
             return
         if self.cluster.cluster is not None:

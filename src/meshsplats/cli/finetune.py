@@ -245,7 +245,7 @@ class Finetune(TrainingCommand):
             return [f"next: {command_line(words)}"]
         words = ["meshsplats", "evaluate", self.output]
         if target.data is not None:
-            words += again(target, "data", downscale=1, test_every=8, missing="error", masks="count")
+            words += again(target, "data", downscale=1, test_every=8, missing="few", masks="count")
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
             words += ["--look", dataset.look] if dataset.look != "area" else []

@@ -49,7 +49,7 @@ class ViewOptions:
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
     """With --data: factor by which images are smaller than the photographs."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     elevation: option.Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0

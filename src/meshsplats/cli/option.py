@@ -43,8 +43,8 @@ Origin = Annotated[
 ]
 
 Missing = Annotated[
-    Literal["error", "skip"],
-    tyro.conf.arg(help="With --data: images that are missing are an error, or their views are left out."),
+    Literal["few", "error", "skip"],
+    tyro.conf.arg(help="With --data: missing images are left out; few: if fewer than half are missing."),
 ]
 
 MeaningOfMasks = Annotated[

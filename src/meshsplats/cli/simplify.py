@@ -56,7 +56,7 @@ class Simplify(Command):
     model folder, else images of 1000 pixels that hold the subject."""
     data: option.Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     no_preview: bool = False
     """Write no preview."""
     origin: option.Origin = "keep"

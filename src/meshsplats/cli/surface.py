@@ -60,7 +60,7 @@ class Surface(Command):
     """Levels of detail, each with a quarter of the triangles of the one before: MESH.glb, MESH_lod1.glb..."""
     data: option.Folder = None
     """Data set of photographs to fit shape and texture to, in place of images of the scene."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     masks: option.MeaningOfMasks = "count"
     cameras: option.File = None
     """Camera file: from where images are made, in place of --views."""

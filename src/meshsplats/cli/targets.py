@@ -36,7 +36,7 @@ class TargetOptions:
     """With --data: factor by which images are smaller than the photographs."""
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     masks: tyro.conf.Fixed[Masks] = "count"
     """With --data: only pixels inside of masks count, or (subject) what is outside is clear."""
     views: option.Count = None

@@ -49,8 +49,8 @@ class PhotographOptions:
     """Factor by which images are smaller than the photographs."""
     test_every: int = 8
     """Every n-th view is held out for scores, if the data set has no split; 0: none."""
-    missing: Literal["error", "skip"] = "error"
-    """Photographs that are missing are an error, or their cameras are left out."""
+    missing: Literal["few", "error", "skip"] = "few"
+    """Missing photographs are left out (skip), if they are fewer than half (few), or an error."""
     masks: Literal["count", "subject"] = "count"
     """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
     estimate_cameras: bool = False
@@ -174,7 +174,7 @@ class Train(TrainingCommand):
             words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
             return [f"next: {command_line(words)}"]
         words = ["meshsplats", "evaluate", self.output, "--data", self.input]
-        words += again(target, downscale=1, test_every=8, missing="error", masks="count")
+        words += again(target, downscale=1, test_every=8, missing="few", masks="count")
         if plan.background is not None:
             words += ["--background", plan.background.name]
         words += ["--samples", samples_of(plan.dataset.train[0], config), "-o", f"{folder}-evaluation"]

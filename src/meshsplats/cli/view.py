@@ -78,7 +78,7 @@ class View(Command):
     folder that has one. Default: those of the input, if it is a model folder."""
     data: option.Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): viewpoints to choose from."""
-    missing: option.Missing = "error"
+    missing: option.Missing = "few"
     up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else of the
     mesh."""

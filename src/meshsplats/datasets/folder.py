@@ -146,7 +146,7 @@ def load_dataset(
     test_every: int = 8,
     background: Sequence[float] = WHITE,
     cache_bytes: int = CACHE_BYTES,
-    missing: Missing = "error",
+    missing: Missing = "few",
     masks: Masks = "count",
     origin: Sequence[float] | np.ndarray | None = None,
 ) -> Dataset:
@@ -177,8 +177,9 @@ def load_dataset(
             another.
         cache_bytes: images are kept up to this many bytes after their first use; the others are read anew
             each time.
-        missing: what images that are missing mean: an ``'error'``, or that their views are left out
-            (``'skip'``), with a DataWarning.
+        missing: views of missing images are left out with a DataWarning if they are fewer than half
+            (``'few'``, as where blurred ones were thrown away) or any (``'skip'``); else they are an
+            ``'error'``.
         masks: what masks say: which pixels ``'count'``, or what the ``'subject'`` is: pixels outside are then
             clear, as in photographs that were cut out.
         origin: (3,) point of the world that cameras shall be relative to, such as that of splats or a mesh of
@@ -203,7 +204,7 @@ def load_dataset(
     if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
         raise ValueError(f"background must be three numbers in [0, 1], got {background!r}")
     if missing not in get_args(Missing):
-        raise ValueError(f"missing must be 'error' or 'skip', got {missing!r}")
+        raise ValueError(f"missing must be 'few', 'error' or 'skip', got {missing!r}")
     if masks not in get_args(Masks):
         raise ValueError(f"masks must be 'count' or 'subject', got {masks!r}")
     if test_every == 1:

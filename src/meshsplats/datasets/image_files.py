@@ -246,7 +246,9 @@ Taken = list[tuple[Camera, PhotoFile]]
 """The views made from one photograph: one, or the six of a panorama."""
 
 
-Missing = Literal["error", "skip"]
+Missing = Literal["few", "error", "skip"]
+"""What missing images mean: an error, or that their views are left out; few: left out where fewer than half
+are missing, as after blurred ones were thrown away, else an error."""
 Masks = Literal["count", "subject"]
 
 
@@ -258,7 +260,7 @@ class Album:
     """The data set's folder, which no path may leave."""
     downscale: int
     store: ImageCache
-    on_missing: Missing = "error"
+    on_missing: Missing = "few"
     images: str = ""
     """Folder of the images in it, where names of their own lead nowhere; empty: ``folder`` itself."""
     masks: Masks = "count"
@@ -367,17 +369,20 @@ class Album:
     def report(self, where: str, found: int, *, needed: bool = True) -> None:
         """Warns of what differs from the file. FileFormatError if images are missing, unless they may be, or
         if nothing is left, unless nothing is ``needed``."""
-        if not found and (needed or self.on_missing == "error" or not self.missing):
+        many = self.on_missing == "few" and 2 * len(self.missing) >= found + len(self.missing)
+        refused = many or self.on_missing == "error"
+        if not found and (needed or refused or not self.missing):
             what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
             raise FileFormatError(f"{where}: {what}")
-        if self.missing and self.on_missing == "error":
+        if self.missing and refused:
             raise FileFormatError(
                 f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
                 f" ({_first(self.missing)}){self._near()}; complete the folder, or leave their views out:"
                 " --missing skip, missing='skip' in Python"
             )
+        near = self._near() if self.missing else ""
         for names, text in (
-            (self.missing, "images are missing; their views are left out"),
+            (self.missing, f"images are missing{near}; their views are left out"),
             (self.renamed, "images have another name than the file gives them, and are taken"),
             (self.no_mask, "images have no mask and count wholly"),
         ):
