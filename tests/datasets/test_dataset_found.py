@@ -22,7 +22,7 @@ from meshsplats.datasets.layouts import find_layout, unread_cameras
 from meshsplats.datasets.points import load_points
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import load_image
-from meshsplats.training.reconstruction import bare_photographs, refuse_unread_cameras
+from meshsplats.training.reconstruction import bare_photographs, ensure_cameras
 
 SIZE = (12, 8)
 CAMERA = (1, "PINHOLE", *SIZE, (10.0, 11.0, 6.5, 3.5))
@@ -255,7 +255,7 @@ def test_transforms_take_the_only_file_too(tmp_path):
         (["a.exr"], r"images/a\.exr is there, but \.exr images are not read here"),
         (["b.png"], r"images/b\.png is there, which another image of the file may mean, too"),
         (["../photos/a.jpeg"], r"photos/ has an image of that name: name that folder 'images'"),
-        (["._a.jpg", ".DS_Store"], r"missing \(images/a\.jpg\); complete the folder"),
+        (["._a.jpg", ".DS_Store"], r"missing \(images/a\.jpg\); --missing skip"),
     ],
 )
 def test_what_may_be_meant_is_named(tmp_path, files, message):
@@ -471,7 +471,7 @@ def test_cameras_that_are_not_read_are_named_and_not_replaced(tmp_path, name):
     with pytest.raises(FileFormatError, match=message):
         load_dataset(folder)
     with pytest.raises(FileFormatError, match=f"{message}.*--estimate-cameras"):
-        refuse_unread_cameras(folder)
+        ensure_cameras(folder)
 
 
 def test_train_does_not_estimate_cameras_where_some_lie(tmp_path, capsys, monkeypatch):

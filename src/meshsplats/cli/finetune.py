@@ -20,8 +20,6 @@ from meshsplats.cli.training import (
     Plan,
     Trained,
     TrainingCommand,
-    as_begun,
-    default_background,
     over_background,
 )
 from meshsplats.cluster import Shared
@@ -31,7 +29,7 @@ from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, RunOptions, make_config, on_splats, starting_mesh
-from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
 from meshsplats.finetuning.config import worthwhile_views, worthwhile_zooms
 from meshsplats.finetuning.initial import for_photographs, starts_with_filter
 from meshsplats.finetuning.run_files import RunFiles
@@ -193,7 +191,7 @@ class Finetune(TrainingCommand):
         return replace(self.target, below=below).make(
             scene,
             self.input,
-            default_background(config),
+            config.behind_splats,
             self.threads,
             worthwhile_views(as_begun(config, earlier)),
             self.preset,

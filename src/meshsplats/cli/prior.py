@@ -18,14 +18,12 @@ from meshsplats.cli.training import (
     Plan,
     Trained,
     TrainingCommand,
-    as_begun,
-    default_background,
     over_background,
     tuning_options,
 )
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FinetuneConfig, RunOptions, worthwhile_views
-from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
@@ -147,7 +145,7 @@ class Prior(TrainingCommand):
         ]
 
     def _dataset(self, base: BaseMesh, config: FinetuneConfig, earlier: Checkpoint | None) -> Dataset:
-        background = default_background(config)
+        background = config.behind_splats
         if self.splats is None:
             return self.target.make(_grey_mesh(base), self.input, background, self.threads)
         cloud = self.reading.load(self.splats, base.origin)

@@ -32,8 +32,9 @@ class TargetOptions:
 
     data: option.Folder = None
     """Data set of photographs (COLMAP, NeRF, nerfstudio, LLFF)."""
-    downscale: int = 1
-    """With --data: factor by which images are smaller than the photographs."""
+    downscale: option.Count = None
+    """With --data: factor by which images are smaller than the photographs. Default: what the minutes suffice
+    for."""
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
     missing: option.Missing = "few"
@@ -110,7 +111,7 @@ class TargetOptions:
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
-                downscale=self.downscale,
+                downscale=self.downscale or 1,
                 test_every=self.test_every,
                 background=background,
                 cache_bytes=self.cache_bytes,

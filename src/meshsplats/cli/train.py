@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -30,6 +30,8 @@ from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.run import SO_FAR, check_training_memory, train
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     GrowingOptions = TrainConfig
 else:
     GrowingOptions = as_cli_options(
@@ -45,8 +47,8 @@ else:
 class PhotographOptions:
     """The photographs."""
 
-    downscale: int = 1
-    """Factor by which images are smaller than the photographs."""
+    downscale: option.Count = None
+    """Factor by which images are smaller than the photographs. Default: what the minutes suffice for."""
     test_every: int = 8
     """Every n-th view is held out for scores, if the data set has no split; 0: none."""
     missing: Literal["few", "error", "skip"] = "few"
@@ -106,25 +108,18 @@ class Train(TrainingCommand):
             check_outputs([self.as_splats], self.force, inputs=self.inputs)
         super().check()
 
+    def prepared(self, config: FinetuneConfig) -> Self:
+        from meshsplats.training.reconstruction import ensure_cameras
+
+        there = ensure_cameras(self.input, replacing=self.target.estimate_cameras, say=say)
+        if there is not None and self.target.estimate_cameras:
+            raise UsageError(f"--estimate-cameras has no effect: {there} has cameras")
+        return self._sized(self.input, config)
+
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
-        from meshsplats.datasets.layouts import find_layout
         from meshsplats.datasets.points import load_points
-        from meshsplats.training.reconstruction import (
-            CAMERAS,
-            bare_photographs,
-            find_cameras,
-            refuse_unread_cameras,
-        )
 
         assert isinstance(config, TrainConfig)
-        if bare_photographs(self.input):
-            if not self.target.estimate_cameras:
-                refuse_unread_cameras(self.input)
-            find_cameras(self.input, say)
-        elif self.target.estimate_cameras:
-            found = find_layout(self.input)
-            if found is not None and found.source != self.input / CAMERAS:  # those of an earlier run
-                raise UsageError(f"--estimate-cameras has no effect: {found.source} has cameras")
         dataset, background = self._dataset(config)
         mask = dataset.train[0].mask
         if mask is not None and mask.mean() < 0.5:
@@ -183,9 +178,14 @@ class Train(TrainingCommand):
     def _dataset(self, config: TrainConfig) -> tuple[Dataset, Background]:
         from meshsplats.datasets.folder import load_dataset
 
-        options: dict[str, Any] = {"downscale": self.target.downscale, "test_every": self.target.test_every}
-        options |= {"missing": self.target.missing, "masks": self.target.masks}
-        dataset = load_dataset(self.input, cache_bytes=self.target.cache_bytes, **options)
+        dataset = load_dataset(
+            self.input,
+            downscale=self.target.downscale or 1,
+            test_every=self.target.test_every,
+            cache_bytes=self.target.cache_bytes,
+            missing=self.target.missing,
+            masks=self.target.masks,
+        )
         if len(dataset.train) < 2:
             raise ValueError(
                 f"{self.input}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"

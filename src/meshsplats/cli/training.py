@@ -6,12 +6,13 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cli import option
@@ -26,10 +27,13 @@ from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
 from meshsplats.finetuning.baseline import SizeScores
-from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
-from meshsplats.finetuning.config import LENGTHS, PRESETS, with_changes
+from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, as_begun
+from meshsplats.finetuning.config import LENGTHS, PRESETS
+from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.reports import SCORED_VIEWS
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
+from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.outputs import recorded_options
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -55,6 +59,8 @@ def tuning_options(
 
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     TuningOptions = FinetuneConfig
 else:
     TuningOptions = tuning_options("In parentheses: the values of the presets.", of_presets(PRESETS))
@@ -155,6 +161,26 @@ class TrainingCommand(Command):
                 raise UsageError("--device gpu has no gradients for --opacity cutoff")
             open_device()
 
+    def prepared(self, config: FinetuneConfig) -> Self:
+        """The command with the size of the photographs, if it reads some: as given, as in the run that is
+        resumed, or what suits the length of ``config``, as the run began."""
+        return self if self.target.data is None else self._sized(self.target.data, config)
+
+    def _sized(self, folder: Path, config: FinetuneConfig) -> Self:
+        from meshsplats.training.image_sizes import worthwhile_downscale
+
+        target: Any = self.target
+        if target.downscale is not None:
+            return self
+        recorded = recorded_options(self.files().command, self._name) if self.resume else None
+        factor = (recorded or {}).get("downscale")
+        if not isinstance(factor, int):
+            threads = None if self.device == "gpu" else thread_count(self.threads)
+            factor = worthwhile_downscale(folder, config.minutes, threads, target.missing, target.masks)
+            if factor > 1:
+                say(f"images: 1/{factor} of the photographs' sides, as time allows (--downscale 1: whole)")
+        return replace(self, target=replace(target, downscale=factor))
+
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         """Reads the input and prepares the optimisation. ``earlier``: checkpoint of a resumed run."""
         raise NotImplementedError
@@ -167,18 +193,24 @@ class TrainingCommand(Command):
         return self.configured().to_dict()
 
     def execute(self) -> int:
-        from meshsplats.formats.meshes import save_mesh
-
         config = self.configured()
         start = time.perf_counter() - STARTUP_SECONDS
         self.check()
         files = self.files()
         files.check(self.inputs, resume=self.resume, force=self.force)
         earlier = self._earlier(files)
+        with progress_display() as show:
+            show.phase(f"reading {self.input}")
+            command = self.prepared(as_begun(config, earlier))
+        return command._run(config, files, earlier, start)
+
+    def _run(self, config: FinetuneConfig, files: RunFiles, earlier: Checkpoint | None, start: float) -> int:
+        """``execute`` of a prepared command, which began at ``start`` by the performance counter."""
+        from meshsplats.formats.meshes import save_mesh
+
         try:
             with progress_display() as show:
                 setup = Setup(show, start, config.minutes)
-                setup.phase(f"reading {self.input}")
                 plan = self.plan(config, earlier, setup)
                 print_plan(plan, self.target.cache_bytes)
                 with files.claimed(self.inputs, resume=self.resume, force=self.force):
@@ -281,8 +313,6 @@ class TrainingCommand(Command):
 
     def _scored(self, config: FinetuneConfig, dataset: Dataset) -> dict[str, Any]:
         """What the scores of a run compare: the look of the targets, and the samples of the mesh."""
-        from meshsplats.finetuning.step import samples_of
-
         return {"look": dataset.look, "samples": samples_of((dataset.test or dataset.train)[0], config)}
 
     def _print_result(
@@ -295,9 +325,6 @@ class TrainingCommand(Command):
     ) -> None:
         """Prints the result of a run of ``seconds``, after those of the ``earlier`` part. ``scored``: see
         ``_scored``."""
-        from meshsplats.finetuning.journal import Journal
-        from meshsplats.finetuning.reports import SCORED_VIEWS
-
         lines = Journal(files.folder).metrics()
         scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
         steps = lines[-1]["step"] if lines else 0
@@ -315,7 +342,7 @@ class TrainingCommand(Command):
                 **trained.counts,
                 "held_out_psnr": held_out,
                 **scored,
-                **_sizes_record(trained.sizes),
+                **({} if trained.sizes is None else trained.sizes.to_dict()),
                 "run": str(files.folder),
             }
             print(json.dumps(result, indent=1))
@@ -335,17 +362,6 @@ class TrainingCommand(Command):
         print(f"preview: {files.preview}" + (f"; metrics: {files.folder}/metrics.jsonl" if lines else ""))
 
 
-def _sizes_record(sizes: SizeScores | None) -> dict[str, Any]:
-    """For JSON."""
-    if sizes is None:
-        return {}
-    rounded = {
-        name: {str(width): round(value, 3) for width, value in scores.items()}
-        for name, scores in (("converted", sizes.converted), ("tuned", sizes.tuned))
-    }
-    return {"psnr_by_width": rounded, "written": "converted" if sizes.loses else "tuned"}
-
-
 def _result_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[str]:
     """At each image width, the conversion against the tuned mesh; which one was written, if not that; and
     whether no step was taken. ``steps``: None if unknown."""
@@ -360,17 +376,6 @@ def _result_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[st
         yield "  a longer run helps, a new one rather than --resume, which keeps the start of a short one"
     elif steps == 0:
         yield "there was no time for steps: this is the mesh at the start; more --minutes help"
-
-
-def default_background(config: FinetuneConfig) -> tuple[float, float, float]:
-    """The background of images of splats."""
-    return (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
-
-
-def as_begun(config: FinetuneConfig, earlier: Checkpoint | None) -> FinetuneConfig:
-    """``config`` with the length that the run began with: one that is made longer keeps its views and its
-    starting mesh."""
-    return config if earlier is None else with_changes(config, **planned_length(earlier))
 
 
 def over_background(
@@ -395,8 +400,7 @@ def print_plan(plan: Plan, cache_bytes: int) -> None:
     """Prints sizes and the memory that is needed. MemoryError if it is not there."""
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
-    dataset = plan.dataset
-    needed = plan.needed
+    dataset, needed = plan.dataset, plan.needed
     if needed is None and plan.mesh is not None:
         needed = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes)
     camera = dataset.train[0].camera

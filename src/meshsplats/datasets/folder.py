@@ -24,6 +24,7 @@ from meshsplats.errors import DataWarning, FileFormatError
 
 Views = tuple[list[View], list[View]]
 MAX_LIST_BYTES = 16 << 20
+MOST_DOWNSCALE = 64
 
 
 def read_folder(
@@ -197,7 +198,10 @@ def load_dataset(
     taken if no other can be meant.
     """
     need_path(path=path)
-    for option, value, least, most in (("downscale", downscale, 1, 64), ("test_every", test_every, 0, 10**9)):
+    for option, value, least, most in (
+        ("downscale", downscale, 1, MOST_DOWNSCALE),
+        ("test_every", test_every, 0, 10**9),
+    ):
         if int(value) != value or not least <= value <= most:
             raise ValueError(f"{option} must be a whole number from {least} to {most}, got {value}")
     color = np.asarray(background, np.float64)

@@ -247,8 +247,7 @@ Taken = list[tuple[Camera, PhotoFile]]
 
 
 Missing = Literal["few", "error", "skip"]
-"""What missing images mean: an error, or that their views are left out; few: left out where fewer than half
-are missing, as after blurred ones were thrown away, else an error."""
+"""What missing images mean: an error, or that their views are left out; few: left out if under a half."""
 Masks = Literal["count", "subject"]
 
 
@@ -369,16 +368,14 @@ class Album:
     def report(self, where: str, found: int, *, needed: bool = True) -> None:
         """Warns of what differs from the file. FileFormatError if images are missing, unless they may be, or
         if nothing is left, unless nothing is ``needed``."""
-        many = self.on_missing == "few" and 2 * len(self.missing) >= found + len(self.missing)
-        refused = many or self.on_missing == "error"
+        refused = self.on_missing == "error" or (self.on_missing == "few" and len(self.missing) >= found)
         if not found and (needed or refused or not self.missing):
             what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
             raise FileFormatError(f"{where}: {what}")
         if self.missing and refused:
             raise FileFormatError(
                 f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
-                f" ({_first(self.missing)}){self._near()}; complete the folder, or leave their views out:"
-                " --missing skip, missing='skip' in Python"
+                f" ({_first(self.missing)}){self._near()}; --missing skip (missing='skip') leaves them out"
             )
         near = self._near() if self.missing else ""
         for names, text in (

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,12 @@ class SizeScores:
     def loses(self) -> bool:
         """Whether it is, anywhere."""
         return bool(self.worse_at)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, with the name of the one that is kept."""
+        scores = {"converted": self.converted, "tuned": self.tuned}
+        rounded = {name: {str(w): round(db, 3) for w, db in by.items()} for name, by in scores.items()}
+        return {"psnr_by_width": rounded, "written": "converted" if self.loses else "tuned"}
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
+from meshsplats.finetuning.config import LENGTHS, FinetuneConfig, with_changes
 from meshsplats.finetuning.loss import DEFAULT
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors
 from meshsplats.gaussians import GaussianCloud
@@ -108,6 +108,12 @@ def planned_length(checkpoint: Checkpoint) -> dict[str, Any]:
     if checkpoint.planned is not None:
         return checkpoint.planned
     return {name: checkpoint.config.get(name) for name in LENGTHS}
+
+
+def as_begun(config: FinetuneConfig, earlier: Checkpoint | None) -> FinetuneConfig:
+    """``config`` with the length that the run began with: one that is made longer keeps its views and its
+    starting mesh."""
+    return config if earlier is None else with_changes(config, **planned_length(earlier))
 
 
 class OtherRunError(ValueError):

@@ -195,6 +195,11 @@ class FinetuneConfig:
             return self.settle_share
         return 0.15 if self.opaque_share == 1 else 0.5
 
+    @property
+    def behind_splats(self) -> tuple[float, float, float]:
+        """The background of images of splats."""
+        return BACKGROUNDS["black" if self.background == "black" else "white"]
+
     def total_steps(self, views: int) -> int | None:
         """Number of steps with this number of training views; None if the length is given in minutes."""
         if self.minutes is not None:

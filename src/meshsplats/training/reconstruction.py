@@ -45,11 +45,22 @@ def bare_photographs(folder: Path) -> list[Path]:
     return []
 
 
-def refuse_unread_cameras(folder: Path) -> None:
-    """FileFormatError if cameras that are not read belong to the photographs in ``folder``: estimated ones
-    would have another frame, without a word."""
-    if there := unread_cameras(folder):
+def ensure_cameras(
+    folder: Path, *, replacing: bool = False, say: Callable[[str], None] = lambda text: None
+) -> Path | None:
+    """Finds the cameras of the photographs in ``folder`` if it has none. Returns the file of its cameras if
+    they are not of ``find_cameras``.
+
+    Raises FileFormatError if cameras that are not read belong to the photographs, unless ``replacing`` them:
+    estimated ones would have another frame, without a word. Otherwise errors are those of ``find_cameras``.
+    """
+    if not bare_photographs(folder):
+        layout = find_layout(folder)
+        return None if layout is None or layout.source == folder / CAMERAS else layout.source
+    if not replacing and (there := unread_cameras(folder)):
         raise FileFormatError(f"{folder}: {there}; --estimate-cameras finds cameras in their place")
+    find_cameras(folder, say)
+    return None
 
 
 def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -> None:

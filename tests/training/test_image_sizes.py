@@ -1,0 +1,73 @@
+"""How large photographs are used: by the time there is, in a run that is resumed as before, or as given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from _balls import cameras_around
+from _photographs import write_photographs
+
+from meshsplats import _toml as toml
+from meshsplats.cli import main
+from meshsplats.demo_scene import make_scene
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.rendering import render_splats
+from meshsplats.training import image_sizes
+from meshsplats.training.image_sizes import worthwhile_downscale
+
+SIDE = 48
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(200)
+
+
+@pytest.fixture
+def photographs(scene, tmp_path) -> Path:
+    """Of 48 x 48 pixels."""
+    cameras = cameras_around(5, seed=1, side=SIDE)
+    images = [render_splats(scene, camera, background=(1, 1, 1)).color.clip(0, 1) for camera in cameras]
+    return write_photographs(tmp_path / "photos", cameras, images)
+
+
+@pytest.mark.parametrize(
+    ("minutes", "threads", "factor"),
+    [(4, 1, 1), (1, 4, 1), (1, 1, 2), (0.25, 1, 4), (1e-9, 1, 48), (None, 1, 1), (1, None, 1)],
+)
+def test_more_minutes_and_threads_make_larger_images(photographs, monkeypatch, minutes, threads, factor):
+    monkeypatch.setattr(image_sizes, "PIXELS_PER_MINUTE", SIDE**2 / 4)
+    assert worthwhile_downscale(photographs, minutes, threads) == factor
+
+
+def test_no_time_is_enough_for_the_largest_photographs(photographs, monkeypatch):
+    monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2 / 9)
+    assert worthwhile_downscale(photographs, None, None) == 3
+
+
+@pytest.mark.parametrize("command", ["train", "finetune"])
+def test_a_run_says_its_size_and_keeps_it(command, scene, photographs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2 / 4)
+    save_gaussians(scene, tmp_path / "scene.ply")
+    words = [str(photographs), "--start-splats", "100", "--max-splats", "100", "--sh-degree", "0"]
+    if command == "finetune":
+        words = [str(tmp_path / "scene.ply"), "--data", str(photographs)]
+    words = [command, *words, "-o", str(tmp_path / "mesh.npz")]
+    assert main([*words, "--steps", "2"]) == 0
+    shown = capsys.readouterr()
+    assert "1/2 of the photographs' sides, as time allows (--downscale 1: whole)" in shown.err
+    assert f"of {SIDE // 2} x {SIDE // 2} pixels" in shown.err
+    assert "--downscale 2" in shown.out.partition("next: ")[2]
+    assert toml.load(tmp_path / "mesh.npz.run/command.toml")["options"]["downscale"] == 2
+
+    monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2)  # as with more time
+    assert main([*words, "--steps", "3", "--resume", "--force"]) == 0  # its images stay
+    assert f"of {SIDE // 2} x {SIDE // 2} pixels" in capsys.readouterr().err
+    assert main([*words, "--steps", "3", "--force"]) == 0
+    shown = capsys.readouterr()
+    assert f"of {SIDE} x {SIDE} pixels" in shown.err
+    assert "as time allows" not in shown.err
+    assert "--downscale" not in shown.out
+    assert main([*words, "--steps", "2", "--downscale", "3", "--force"]) == 0
+    assert f"of {SIDE // 3} x {SIDE // 3} pixels" in capsys.readouterr().err
