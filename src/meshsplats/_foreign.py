@@ -57,11 +57,11 @@ _KINDS: Sequence[_Kind] = (
         rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|II\*\0|MM\0\*|v/1\x01|....ftyp(heic|heix|mif1|avif)",
         "an image; 'meshsplats train' makes a mesh of a folder of photographs",
     ),
+    _Kind(".insv .360", b"", "a video of a panoramic camera: export it with its program as .mp4"),
     _Kind(
-        ".mp4 .mov .m4v .avi .mkv .webm .insv .360",
+        ".mp4 .mov .m4v .avi .mkv .webm",
         rb"....ftyp(isom|iso2|mp4|qt|M4V|avc1|3gp)|....(moov|mdat|wide)|\x1aE\xdf\xa3|RIFF....AVI ",
-        "a video: 'ffmpeg -i VIDEO -vf fps=2 photos/%04d.jpg' takes images from it, and 'meshsplats train"
-        " photos' makes a mesh of these",
+        "a video: 'meshsplats train VIDEO -o mesh.npz' makes a mesh of its sharpest frames",
     ),
     _Kind(
         ".rar .7z .tar .tgz .xz .bz2 .zst",

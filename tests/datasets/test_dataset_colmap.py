@@ -366,7 +366,7 @@ def test_of_several_models_the_one_with_the_most_images_is_taken(tmp_path):
         (lambda f: (f / "cameras.bin").touch(), r"cameras\.bin is there, half of COLMAP's model"),
         (lambda f: simple_colmap(f / "inner"), "inner/ in it looks like one"),
         (lambda f: (f / "notes.md").touch(), r"it holds notes\.md"),
-        (lambda f: (f / "clip.MP4").touch(), r"clip\.MP4 in it is a video: 'ffmpeg"),
+        (lambda f: (f / "clip.MP4").touch(), r"clip\.MP4 in it is a video: 'meshsplats train"),
         (lambda f: (f / "scan.las").touch(), r"scan\.las in it is a point cloud"),
     ],
 )

@@ -33,8 +33,7 @@ class TargetOptions:
     data: option.Folder = None
     """Data set of photographs (COLMAP, NeRF, nerfstudio, LLFF)."""
     downscale: option.Count = None
-    """With --data: factor by which images are smaller than the photographs. Default: what the minutes suffice
-    for."""
+    """With --data: factor by which images are smaller than photographs. Default: by the minutes."""
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
     missing: option.Missing = "few"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -57,6 +57,8 @@ class PhotographOptions:
     """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
     estimate_cameras: bool = False
     """Find the cameras of the photographs though the folder holds some of a kind that is not read."""
+    frames: option.Count = None
+    """Frames to take of a video. Default: two per second, 40 to 120."""
     cache: float = 2.0
     """Gigabytes of images kept in memory; others are read again when they are needed."""
 
@@ -74,7 +76,8 @@ class PhotographOptions:
 class Train(TrainingCommand):
     """Makes a mesh from photographs with cameras: COLMAP, NeRF-synthetic, nerfstudio or LLFF folders.
 
-    Without cameras, they are found first (extra photos) and saved beside the photographs. Beside the result
+    Without cameras, they are found first (extra photos) and saved beside the photographs. Of a video (extra
+    video), frames are taken, to a folder beside it. Beside the result
     NAME: its configuration, a preview, and a folder NAME.run with metrics, previews and a checkpoint, from
     which --resume continues after Ctrl-C.
     """
@@ -86,7 +89,7 @@ class Train(TrainingCommand):
     EXCLUSIVE = (LENGTHS,)
 
     input: tyro.conf.Positional[Path]
-    """The folder of the photographs, or its transforms.json."""
+    """The folder of the photographs, its transforms.json, or a video."""
     as_splats: option.File = None
     """Also write splats to this file, .ply, .spz or .sog, for their viewers: a fifth of the time."""
     target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
@@ -110,11 +113,13 @@ class Train(TrainingCommand):
 
     def prepared(self, config: FinetuneConfig) -> Self:
         from meshsplats.training.reconstruction import ensure_cameras
+        from meshsplats.training.video import photographs_of
 
-        there = ensure_cameras(self.input, replacing=self.target.estimate_cameras, say=say)
+        folder = photographs_of(self.input, self.target.frames, say)
+        there = ensure_cameras(folder, replacing=self.target.estimate_cameras, say=say)
         if there is not None and self.target.estimate_cameras:
             raise UsageError(f"--estimate-cameras has no effect: {there} has cameras")
-        return self._sized(self.input, config)
+        return replace(self, input=folder)._sized(folder, config)
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         from meshsplats.datasets.points import load_points
@@ -130,9 +135,8 @@ class Train(TrainingCommand):
         def optimise(run: RunOptions, show: Display) -> Trained:
             mesh = train(dataset, config, points=points, run=run, on_progress=show)
             counts: dict[str, int] = {"fans": mesh.splat_count or 0, "triangles": len(mesh.faces)}
-            return Trained(
-                mesh, mesh, counts, f"{counts['triangles']:,} triangles of {counts['fans']:,} fans"
-            )
+            made = f"{counts['triangles']:,} triangles of {counts['fans']:,} fans"
+            return Trained(mesh, mesh, counts, made)
 
         needed = check_training_memory(dataset, config, cache_bytes=self.target.cache_bytes)
         summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
@@ -166,9 +170,8 @@ class Train(TrainingCommand):
         """The command that scores the result on held-out views, or one that renders it if there are none."""
         target, folder = self.target, self.output.with_suffix("")
         if not plan.dataset.test:
-            words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
-            return [f"next: {command_line(words)}"]
-        words = ["meshsplats", "evaluate", self.output, "--data", self.input]
+            return [f"next: {command_line(['meshsplats', 'render', self.output, '-o', f'{folder}-images'])}"]
+        words: list[str | Path | int] = ["meshsplats", "evaluate", self.output, "--data", self.input]
         words += again(target, downscale=1, test_every=8, missing="few", masks="count")
         if plan.background is not None:
             words += ["--background", plan.background.name]

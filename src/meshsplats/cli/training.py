@@ -172,8 +172,8 @@ class TrainingCommand(Command):
         target: Any = self.target
         if target.downscale is not None:
             return self
-        recorded = recorded_options(self.files().command, self._name) if self.resume else None
-        factor = (recorded or {}).get("downscale")
+        recorded = (self.resume and recorded_options(self.files().command, self._name)) or {}
+        factor = recorded.get("downscale")
         if not isinstance(factor, int):
             threads = None if self.device == "gpu" else thread_count(self.threads)
             factor = worthwhile_downscale(folder, config.minutes, threads, target.missing, target.masks)

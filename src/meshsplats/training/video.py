@@ -1,0 +1,199 @@
+"""Photographs from a video: sharp frames, evenly spread over what the camera saw."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.images.reading import MAX_PIXELS
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+FRAMES_PER_SECOND = 2.0
+FEWEST_FRAMES, MOST_FRAMES = 40, 120
+"""Frames by default: so many per second, but not fewer or more than these. The time for their cameras grows
+faster than their number."""
+IMAGES = "images"
+"""Folder of the frames in that of a video."""
+LOOK_SIDE, MOTION_SIDE = 480, 64
+"""Longest side of a frame as it is searched for edges, and sides of the picture that motion is told by."""
+STILL = 0.05
+"""Motion that every frame counts at least, as a share of the mean: in a video that stands still, time
+decides."""
+QUALITY = 95
+"""Of the JPEG files."""
+NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
+
+
+class Frames(NamedTuple):
+    """What is known of the n frames of a video, in order."""
+
+    sharpness: np.ndarray
+    """(n,) mean square of the Laplacian of the grey values."""
+    motion: np.ndarray
+    """(n,) how much each frame differs from the one before, 0 for the first: about proportional to the way of
+    the camera where frames follow closely."""
+    seconds: float
+    """Length of the video."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether ``path`` is a file with the suffix of a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def photographs_of(
+    path: Path, frames: int | None = None, say: Callable[[str], None] = lambda text: None
+) -> Path:
+    """The folder of photographs at ``path``: of a video, one beside it, NAME-frames, which is made by
+    ``save_frames`` with so many ``frames`` unless it is there; else ``path`` itself.
+
+    Raises ValueError for ``frames`` without a video, and for another number of them than are there; otherwise
+    errors are those of ``save_frames``.
+    """
+    if not is_video(path):
+        if frames is not None:
+            raise ValueError(f"a number of frames is for a video, and {path} is none")
+        return path
+    folder = path.with_name(f"{path.stem}-frames")
+    if not (folder / IMAGES).is_dir():
+        save_frames(path, folder, frames, say)
+        return folder
+    there = len(list((folder / IMAGES).glob("*.jpg")))
+    if frames not in (None, there):
+        raise ValueError(f"{folder} has {there} frames, not {frames}: remove it, or keep them (no --frames)")
+    say(f"the {there} frames of {path.name} that are in {folder}")
+    return folder
+
+
+def save_frames(
+    video: Path, folder: Path, count: int | None = None, say: Callable[[str], None] = lambda text: None
+) -> int:
+    """Writes the ``count`` best frames of ``video`` as JPEG files to ``folder``/images, whole or not at all.
+
+    The way of the camera is divided into as many equal parts, and the sharpest frame of each is taken.
+    Frames are turned as players show them.
+
+    Args:
+        count: number of frames; None: two per second, 40 to 120.
+        say: is called with a line about each stage.
+
+    Returns:
+        The number of frames, fewer than ``count`` if the video has fewer.
+
+    Raises:
+        MissingDependencyError: PyAV is not installed.
+        FileFormatError: not a video that can be read, or one of larger frames than images may have.
+        FileExistsError: ``folder`` is there.
+        ValueError: ``count`` below 2.
+
+    Warns with a DataWarning where a video cannot be read to its end.
+    """
+    if count is not None and count < 2:
+        raise ValueError(f"at least 2 frames are needed, got {count}")
+    if folder.exists():
+        raise FileExistsError(f"{folder}: is there already")
+    say(f"looking at the frames of {video.name}")
+    frames = look_at_frames(video)
+    chosen = choose_frames(frames, count or usual_count(frames.seconds))
+    say(f"{len(chosen)} of {len(frames.sharpness):,} frames: {folder / IMAGES}")
+    wanted = {int(frame): place for place, frame in enumerate(chosen)}
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as beside:
+        made = Path(beside) / folder.name
+        (made / IMAGES).mkdir(parents=True)
+        for index, frame in enumerate(_decoded(video)):
+            if index in wanted:
+                turned = np.ascontiguousarray(_turned(frame.to_ndarray(format="rgb24"), frame.rotation))
+                _save(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", turned)
+            if index == chosen[-1]:
+                break
+        shutil.move(made, folder)
+    return len(chosen)
+
+
+def usual_count(seconds: float) -> int:
+    """Number of frames to take of a video of that length."""
+    return int(min(max(round(FRAMES_PER_SECOND * seconds), FEWEST_FRAMES), MOST_FRAMES))
+
+
+def look_at_frames(video: Path) -> Frames:
+    """Sharpness and motion of every frame of ``video``. Errors are those of ``save_frames``."""
+    sharpness, motion, before = [], [], None
+    seconds = 0.0
+    for frame in _decoded(video, warn=True):
+        scale = min(1.0, LOOK_SIDE / max(frame.width, frame.height))
+        size = {"width": max(1, round(scale * frame.width)), "height": max(1, round(scale * frame.height))}
+        grey = frame.reformat(**size, format="gray").to_ndarray().astype(np.float32)
+        small = frame.reformat(width=MOTION_SIDE, height=MOTION_SIDE, format="gray").to_ndarray()
+        # Exposure and contrast may change while the camera stands still.
+        now = small.astype(np.float32) - small.mean(dtype=np.float32)
+        now /= max(float(np.sqrt(np.square(now).mean())), 1.0)
+        sharpness.append(_sharpness(grey))
+        motion.append(0.0 if before is None else float(np.sqrt(np.square(now - before).mean())))
+        before = now
+        seconds = max(seconds, float(frame.time or 0))
+    if len(sharpness) < 2:
+        raise FileFormatError(f"{video}: {len(sharpness)} frames can be read, at least 2 are needed")
+    return Frames(np.array(sharpness), np.array(motion), seconds)
+
+
+def choose_frames(frames: Frames, count: int) -> np.ndarray:
+    """(at most count,) int64, increasing: the sharpest frame of each of ``count`` equal parts of the way."""
+    steps = np.maximum(frames.motion, STILL * frames.motion.mean())
+    if not steps.any():
+        steps = np.ones_like(steps)
+    way = np.cumsum(steps) - steps / 2
+    part = np.minimum((way / steps.sum() * count).astype(np.int64), count - 1)
+    order = np.lexsort((-frames.sharpness, part))
+    return np.sort(order[np.unique(part[order], return_index=True)[1]])
+
+
+def _sharpness(grey: np.ndarray) -> float:
+    if min(grey.shape) < 3:
+        return 0.0
+    middle = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * middle
+    return float(np.square(laplacian).mean())
+
+
+def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
+    """The frames of ``video``; with ``warn``, a DataWarning says where it cannot be read on."""
+    try:
+        import av
+    except ImportError:
+        raise MissingDependencyError(NEEDS) from None
+    count = 0
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise FileFormatError(f"{video}: has no pictures, only sound")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            if stream.codec_context.width * stream.codec_context.height > MAX_PIXELS:
+                raise FileFormatError(f"{video}: frames have more than {MAX_PIXELS:,} pixels")
+            for frame in container.decode(stream):
+                yield frame
+                count += 1
+    except av.FFmpegError as error:
+        if not count:
+            raise FileFormatError(f"{video}: not a video that can be read ({error.strerror})") from None
+        if warn:
+            text = f"{video}: cannot be read beyond frame {count:,} ({error.strerror})"
+            warnings.warn(text, DataWarning, stacklevel=3)
+
+
+def _turned(pixels: np.ndarray, degrees: float) -> np.ndarray:
+    """``pixels`` (h, w, 3) turned counter-clockwise by the nearest quarter turn."""
+    return np.rot90(pixels, round(degrees / 90) % 4)
+
+
+def _save(path: Path, pixels: np.ndarray) -> None:
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, quality=QUALITY, subsampling=0)

@@ -1,0 +1,253 @@
+"""Frames of videos as photographs: sharp ones, evenly spread over the camera's way, turned as players do."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image, ImageFilter
+
+from meshsplats.cli import main
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.training import video as module
+from meshsplats.training.video import (
+    Frames,
+    choose_frames,
+    is_video,
+    look_at_frames,
+    photographs_of,
+    save_frames,
+    usual_count,
+)
+
+av = pytest.importorskip(
+    "av", reason="the library of videos is not installed: pip install 'meshsplats[video]'"
+)
+
+RATE = 10
+"""Frames per second."""
+
+
+def write_video(path: Path, frames: list[np.ndarray], rotation: int = 0) -> Path:
+    """``frames`` (h, w, 3) uint8, to be shown turned counter-clockwise by ``rotation`` degrees."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=RATE)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+def passing(places: list[int], blurred: set[int] = frozenset()) -> list[np.ndarray]:
+    """Pictures of a wall of random squares through a window of 96 x 64 pixels, at ``places`` along it."""
+    rng = np.random.default_rng(0)
+    wall = np.kron(rng.integers(0, 256, (16, 200, 3), np.uint8), np.ones((4, 4, 1), np.uint8))
+    frames = []
+    for i, place in enumerate(places):
+        image = Image.fromarray(wall[:, place : place + 96])
+        frames.append(np.array(image.filter(ImageFilter.GaussianBlur(2)) if i in blurred else image))
+    return frames
+
+
+def place_of(path: Path) -> int:
+    """Where along the wall a saved frame was taken."""
+    seen = np.asarray(Image.open(path).convert("L"), float)
+    walls = {
+        p: np.asarray(Image.fromarray(f).convert("L"), float) for p, f in enumerate(passing(list(range(600))))
+    }
+    return min(walls, key=lambda place: float(np.square(walls[place] - seen).mean()))
+
+
+def test_the_sharpest_frame_of_each_part_of_the_way():
+    # Ways of 1 each: parts end after the third and the sixth frame.
+    frames = Frames(np.array([1.0, 9, 2, 3, 3, 8, 5, 7, 6]), np.ones(9), 1.0)
+    np.testing.assert_array_equal(choose_frames(frames, 3), [1, 5, 7])
+    # The camera stands still during the first five frames: they are one part together, or less.
+    still = Frames(np.arange(9.0), np.array([0.0, 0, 0, 0, 0, 1, 1, 1, 1]), 1.0)
+    np.testing.assert_array_equal(choose_frames(still, 4), [5, 6, 7, 8])
+    nothing_moves = Frames(np.arange(6.0), np.zeros(6), 1.0)
+    np.testing.assert_array_equal(choose_frames(nothing_moves, 2), [2, 5])
+
+
+@given(
+    arrays(np.float64, st.integers(2, 40), elements=st.floats(0, 1e6)),
+    st.integers(2, 50),
+    st.integers(0, 2**32 - 1),
+)
+def test_frames_are_chosen_once_and_in_order(motion, count, seed):
+    frames = Frames(np.random.default_rng(seed).random(len(motion)), motion, 1.0)
+    chosen = choose_frames(frames, count)
+    assert 1 <= len(chosen) <= min(count, len(motion))
+    assert (np.diff(chosen) > 0).all()
+    assert 0 <= chosen[0] <= chosen[-1] < len(motion)
+
+
+def test_length_decides_how_many_frames_are_usual():
+    assert [usual_count(seconds) for seconds in (0, 5, 30, 60, 3600)] == [40, 40, 60, 120, 120]
+
+
+def test_blurred_frames_are_passed_over(tmp_path):
+    blurred = set(range(60)) - set(range(3, 60, 5))
+    clip = write_video(tmp_path / "walk.mp4", passing([3 * i for i in range(60)], blurred))
+    frames = look_at_frames(clip)
+    assert len(frames.sharpness) == 60
+    assert frames.seconds == pytest.approx(5.9)
+    assert set(choose_frames(frames, 12)) <= set(range(60)) - blurred
+
+
+def test_frames_are_spread_over_the_way_not_the_time(tmp_path):
+    places = [0] * 40 + [8 * i for i in range(1, 41)]  # at first, the camera stands still
+    clip = write_video(tmp_path / "walk.mp4", passing(places))
+    assert save_frames(clip, tmp_path / "frames", 10) == 10
+    found = sorted((tmp_path / "frames/images").iterdir())
+    assert [path.name for path in found] == [f"{i:04d}.jpg" for i in range(1, 11)]
+    seen = [place_of(path) for path in found]
+    assert seen == sorted(seen)
+    assert max(np.diff(seen)) <= 64  # of 320, in ten parts
+    assert seen.count(0) <= 2
+
+
+@pytest.mark.parametrize("degrees", [90, -90, 180])
+def test_frames_are_turned_as_players_show_them(tmp_path, degrees):
+    if not hasattr(av.video.stream.VideoStream, "set_display_rotation"):
+        pytest.skip("this version of PyAV does not write rotations")
+    picture = np.zeros((64, 96, 3), np.uint8)
+    picture[:32, :48] = 255  # light to the left above
+    clip = write_video(tmp_path / "phone.mov", [picture] * 4, degrees)
+    save_frames(clip, tmp_path / "frames", 2)
+    seen = np.asarray(Image.open(tmp_path / "frames/images/0001.jpg").convert("L"))
+    # By hand: counter-clockwise, the corner to the left above comes to the left below.
+    corner = {90: (slice(48, None), slice(None, 32)), -90: (slice(None, 48), slice(32, None))}
+    expected = np.zeros((64, 96) if degrees == 180 else (96, 64))
+    expected[corner.get(degrees, (slice(32, None), slice(48, None)))] = 255
+    assert seen.shape == expected.shape
+    assert np.abs(seen - expected).mean() < 8
+
+
+def test_what_is_no_video_is_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "noise.mp4").write_bytes(np.random.default_rng(0).bytes(4000))
+    (tmp_path / "empty.mov").write_bytes(b"")
+    for name in ("noise.mp4", "empty.mov"):
+        with pytest.raises(FileFormatError, match=f"{name}: not a video that can be read"):
+            photographs_of(tmp_path / name)
+    with av.open(str(tmp_path / "song.mkv"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        sound.sample_rate = 8000
+        container.mux(stream.encode(sound))
+    with pytest.raises(FileFormatError, match=r"song\.mkv: has no pictures, only sound"):
+        photographs_of(tmp_path / "song.mkv")
+    short = write_video(tmp_path / "short.mp4", passing([0]))
+    with pytest.raises(FileFormatError, match="1 frames can be read, at least 2 are needed"):
+        photographs_of(short)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "empty.mov",
+        "noise.mp4",
+        "short.mp4",
+        "song.mkv",
+    ]
+
+
+def test_a_video_that_is_cut_off_gives_the_frames_before(tmp_path):
+    whole = write_video(tmp_path / "walk.mkv", passing([5 * i for i in range(50)])).read_bytes()
+    cut = tmp_path / "cut.mkv"
+    cut.write_bytes(whole[: len(whole) // 2])
+    frames = look_at_frames(cut)
+    assert 10 < len(frames.sharpness) < 40
+
+
+def test_a_video_that_breaks_off_says_where(tmp_path, monkeypatch):
+    clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(10)]))
+
+    class Damaged:
+        def __init__(self, name):
+            self.container = av_open(name)
+            self.streams = self.container.streams
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            self.container.close()
+
+        def decode(self, stream):
+            for i, frame in enumerate(self.container.decode(stream)):
+                if i == 6:
+                    raise av.FFmpegError(1, "damaged")
+                yield frame
+
+    av_open = av.open
+    monkeypatch.setattr(av, "open", Damaged)
+    with pytest.warns(DataWarning, match=r"walk\.mp4: cannot be read beyond frame 6 \(damaged\)"):
+        assert len(look_at_frames(clip).sharpness) == 6
+
+
+def test_larger_frames_than_images_may_have_are_refused(tmp_path, monkeypatch):
+    clip = write_video(tmp_path / "walk.mp4", passing([0, 5]))
+    monkeypatch.setattr(module, "MAX_PIXELS", 96 * 64 - 1)
+    with pytest.raises(FileFormatError, match="more than 6,143 pixels"):
+        photographs_of(clip)
+
+
+def test_the_frames_of_a_video_are_made_once(tmp_path):
+    clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(20)]))
+    said: list[str] = []
+    folder = photographs_of(clip, 5, said.append)
+    assert folder == tmp_path / "walk-frames"
+    first = sorted((folder / "images").iterdir())
+    times = [path.stat().st_mtime_ns for path in first]
+    assert photographs_of(clip, None, said.append) == folder
+    assert photographs_of(clip, 5) == folder
+    assert [path.stat().st_mtime_ns for path in first] == times
+    assert said[-1].startswith("the 5 frames of walk.mp4 that are in ")
+    with pytest.raises(ValueError, match="has 5 frames, not 6: remove it"):
+        photographs_of(clip, 6)
+    with pytest.raises(FileExistsError):
+        save_frames(clip, folder)
+    with pytest.raises(ValueError, match="at least 2 frames are needed, got 1"):
+        save_frames(clip, tmp_path / "other", 1)
+    with pytest.raises(ValueError, match="a number of frames is for a video"):
+        photographs_of(folder, 5)
+    assert photographs_of(folder) == folder
+    assert not is_video(folder)
+
+
+def test_train_takes_a_video(tmp_path, monkeypatch, capsys):
+    clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(20)]))
+    asked = []
+
+    def no_cameras(folder, say):
+        asked.append(folder)
+        raise ValueError("none found")
+
+    monkeypatch.setattr("meshsplats.training.reconstruction.find_cameras", no_cameras)
+    words = ["train", str(clip), "-o", str(tmp_path / "mesh.npz")]
+    assert main([*words, "--frames", "6"]) == 1
+    assert asked == [tmp_path / "walk-frames"]
+    assert "6 of 20 frames" in capsys.readouterr().err
+    assert main([*words, "--frames", "7"]) == 1
+    assert "has 6 frames, not 7" in capsys.readouterr().err
+
+
+def test_without_its_library_the_extra_is_named(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name == "av":
+            raise ImportError(name)
+        return real(name, *rest)
+
+    clip = write_video(tmp_path / "walk.mp4", passing([0, 5]))
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingDependencyError, match=r"meshsplats\[video\]"):
+        photographs_of(clip)
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.mp4"]
