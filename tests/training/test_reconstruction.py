@@ -57,6 +57,14 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
         find_cameras(photographs(tmp_path, 3))
 
 
+def test_large_photographs_are_not_doubled(scene, monkeypatch):
+    monkeypatch.setattr(reconstruction, "DOUBLED_BELOW", 60)  # as long as their longest side
+    folder, colmap, _ = scene()
+    colmap.octave = 0
+    find_cameras(folder)
+    assert (folder / "transforms.json").is_file()
+
+
 def test_photographs_that_do_not_match_are_refused(tmp_path):
     pytest.importorskip("pycolmap")
     folder = photographs(tmp_path / "noise", 3)
@@ -77,20 +85,27 @@ class Colmap:
 
     def __init__(self, cameras: dict[str, Camera], methods: bool) -> None:
         self.logging = SimpleNamespace()
+        self.octave = -1  # for small images
+        self.ratio = "ba_global_images_ratio" if methods else "ba_global_frames_ratio"
         self.cameras, self.methods, self.calls = cameras, methods, []
+
+    def IncrementalPipelineOptions(self):
+        return SimpleNamespace(**{self.ratio: 1.1})
 
     def set_random_seed(self, seed):
         self.calls.append("seed")
 
     def extract_features(self, database, folder, names, *, camera_mode, device, sift_options):
-        assert sift_options == {"max_image_size": 1600, "max_num_features": 3000}
+        assert sift_options == {"max_image_size": 1600, "max_num_features": 3000, "first_octave": self.octave}
         self.names, self.mode, self.folder = names, camera_mode, Path(folder)
 
     def match_exhaustive(self, database, *, device):
         self.calls.append("match")
 
-    def incremental_mapping(self, database, folder, work):
+    def incremental_mapping(self, database, folder, work, options):
         assert Path(folder) == self.folder
+        ratios = [options.ba_global_points_ratio, getattr(options, self.ratio)]
+        assert (ratios, options.ba_global_max_refinements) == ([1.4, 1.4], 2)
         images, lenses = {}, {}
         for i, name in enumerate(reversed(self.names)):
             camera = self.cameras.get(name)

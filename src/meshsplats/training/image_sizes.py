@@ -9,7 +9,7 @@ from meshsplats.datasets.folder import MOST_DOWNSCALE, load_dataset
 from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.errors import DataWarning
 
-PIXELS_PER_MINUTE = 50_000
+PIXELS_PER_MINUTE = 40_000
 """Pixels of a photograph that are worth while for each minute of a run and each of its threads. At the whole
 size, a phone's 43 photographs of 1080 x 1920 pixels become better in two minutes of two processors at a
 quarter of the sides than at a half (29.9 and 29.4 dB), in five at a half than whole (31.2, 30.4)."""
