@@ -87,6 +87,7 @@ class Colmap:
     def __init__(self, cameras: dict[str, Camera], methods: bool) -> None:
         self.logging = SimpleNamespace()
         self.octave = -1  # for small images
+        self.matches: dict[tuple[int, int], int] = {}  # by places in the reversed list of names
         self.ratio = "ba_global_images_ratio" if methods else "ba_global_frames_ratio"
         self.cameras, self.methods, self.calls = cameras, methods, []
 
@@ -99,6 +100,12 @@ class Colmap:
     def extract_features(self, database, folder, names, *, camera_mode, device, sift_options):
         assert sift_options == {"max_image_size": 1600, "max_num_features": 3000, "first_octave": self.octave}
         self.names, self.mode, self.folder = names, camera_mode, Path(folder)
+        with closing(sqlite3.connect(database)) as connection:
+            connection.execute("create table two_view_geometries (pair_id integer, rows integer)")
+            for (one, other), matches in self.matches.items():
+                values = (one * (2**31 - 1) + other, matches)
+                connection.execute("insert into two_view_geometries values (?, ?)", values)
+            connection.commit()
 
     def match_exhaustive(self, database, *, device):
         self.calls.append("match")
@@ -121,7 +128,13 @@ class Colmap:
                 cam_from_world=(lambda pose=pose: pose) if self.methods else pose,
             )
         points = {
-            7 * i: SimpleNamespace(xyz=[i, 2.5, -1], color=np.array([10 * i, 20, 30], np.uint8))
+            7 * i: SimpleNamespace(
+                xyz=[i, 2.5, -1],
+                color=np.array([10 * i, 20, 30], np.uint8),
+                track=SimpleNamespace(
+                    elements=[SimpleNamespace(image_id=i), SimpleNamespace(image_id=i + 1)]
+                ),
+            )
             for i in range(4)
         }
         count = len(self.cameras)
@@ -167,6 +180,25 @@ def test_cameras_are_found_and_written_beside_the_photographs(scene, under, meth
     points = load_points(folder)
     assert points.positions.tolist() == [[i, 2.5, -1] for i in range(4)]
     assert points.colors.tolist() == [[10 * i, 20, 30] for i in range(4)]
+
+
+def test_cameras_that_matches_contradict_are_doubted(scene):
+    folder, colmap, _ = scene()
+    colmap.matches = {(1, 2): 100, (2, 3): 2000}  # p3 and p2, p2 and p1, which have one common point each
+    with pytest.warns(DataWarning) as warned:
+        find_cameras(folder)
+    messages = [str(warning.message) for warning in warned]
+    assert len(messages) == 2
+    assert (
+        "some cameras may be wrong: 2 pairs of photographs that match contradict them, most of p2.png"
+        in messages[1]
+    )
+    colmap.matches = {(1, 2): 99}  # too few to tell
+    for name in ("transforms.json", "sparse_points.ply"):
+        (folder / name).unlink()
+    with pytest.warns(DataWarning) as warned:
+        find_cameras(folder)
+    assert len(warned) == 1
 
 
 def test_points_that_are_there_are_not_overwritten(scene):

@@ -22,6 +22,7 @@ from meshsplats.datasets.layouts import find_layout, image_folders, unread_camer
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import load_image, read_exif, read_header
 from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
+from meshsplats.training.poses import find_poses
 
 CAMERAS, POINTS = "transforms.json", "sparse_points.ply"
 """Files beside the photographs."""
@@ -31,11 +32,6 @@ DOUBLED_BELOW = 1400
 """Images are doubled before the search for features if their longest side is shorter: larger ones have
 enough. A phone's 50 photographs, 1600 pixels high: 39 processor s for features in place of 101, 72 for pairs
 in place of 100, and places as exact."""
-GROWTH = 1.4
-"""All cameras are adjusted together again when there are so many times as many, or as many points."""
-REFINEMENTS = 2
-"""Times that they are, at most. With COLMAP's defaults, 1.1 and 5, poses take a third longer, or several
-times as long, and are not more exact."""
 MAX_FEATURES = 3000
 """Features of an image: matching takes the square of that for each pair."""
 FEWEST = 3
@@ -84,7 +80,7 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
         FileExistsError: ``sparse_points.ply`` is there already.
         OSError: the folder cannot be written.
 
-    Warns with a DataWarning about photographs that found no place.
+    Warns with a DataWarning about photographs that found no place, and about places that contradict matches.
     """
     photographs = bare_photographs(folder)
     if len(photographs) < FEWEST:
@@ -124,9 +120,8 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
             **_feature_options(pycolmap, max(max(size) for size in sizes)),
         )
         _match(pycolmap, Path(database), [path.name for path in images], say)
-        say("finding the cameras: poses")
-        found = pycolmap.incremental_mapping(database, place, work, options=_mapping_options(pycolmap))
-    best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+        poses = find_poses(pycolmap, Path(database), place, Path(work), say)
+    best = None if poses is None else poses.model
     count = 0 if best is None else best.num_reg_images()
     if best is None or count < FEWEST:
         raise ValueError(
@@ -141,6 +136,16 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
         warnings.warn(
             f"{folder}: {len(lost)} of {len(photographs)} photographs match no others and are left out:"
             f" {', '.join(lost[:5])}" + (", ..." if len(lost) > 5 else ""),
+            DataWarning,
+            stacklevel=2,
+        )
+    if poses is not None and poses.doubtful:
+        names = [named[name] for name in poses.suspects()]
+        warnings.warn(
+            f"{folder}: some cameras may be wrong: {len(poses.contradicting):,} pairs of photographs that"
+            f" match contradict them, most of {', '.join(names[:5])}"
+            + (", ..." if len(names) > 5 else "")
+            + ". Photographs between those of such a pair help, or the cameras of another program",
             DataWarning,
             stacklevel=2,
         )
@@ -191,16 +196,6 @@ def _feature_options(pycolmap: Any, side: int) -> dict[str, Any]:
             setattr(options.sift, name, value)
         return {"extraction_options": options}
     return {"sift_options": {"max_image_size": MAX_SIDE, **sift}}
-
-
-def _mapping_options(pycolmap: Any) -> Any:
-    """Options of ``incremental_mapping``, with the names of the library's version."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.ba_global_max_refinements = REFINEMENTS
-    options.ba_global_points_ratio = GROWTH
-    frames = "ba_global_frames_ratio"
-    setattr(options, frames if hasattr(options, frames) else "ba_global_images_ratio", GROWTH)
-    return options
 
 
 def _for_pycolmap(photographs: list[Path], work: Path) -> list[Path]:

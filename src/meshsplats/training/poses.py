@@ -1,0 +1,121 @@
+"""Poses of matched photographs by pycolmap, and whether they agree with the matches."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+GROWTH = 1.4
+"""All cameras are adjusted together again when there are so many times as many, or as many points."""
+REFINEMENTS = 2
+"""Times that they are, at most. With COLMAP's defaults, 1.1 and 5, poses take a third longer, or several
+times as long, and are not more exact."""
+STRONG = 100
+"""Matches that make a pair of photographs a strong one."""
+SHARED = 0.1
+"""A strong pair whose photographs see fewer common points than this share of its matches contradicts the
+poses. Where these are right, no pair has less than 0.5."""
+TOLERATED = 0.01
+"""Share of the strong pairs that may contradict them. Of a phone's 50 photographs, none do; of 116 of a room,
+where a repeated pattern has put five in a wrong place, 0.026, and half of them, 0.09."""
+_MAX_IMAGES = 2**31 - 1
+"""By which COLMAP's database makes one number of the two of a pair."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """A model of pycolmap, and what strong pairs say of it."""
+
+    model: Any
+    agreeing: int
+    """Strong pairs that agree with it..."""
+    contradicting: tuple[tuple[int, int], ...]
+    """... and the image numbers of those that do not. Pairs with a photograph that has no pose do neither."""
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether more contradict it than may."""
+        return len(self.contradicting) > TOLERATED * (self.agreeing + len(self.contradicting))
+
+    def suspects(self) -> list[str]:
+        """Names of the photographs in contradicting pairs, those in most of them first."""
+        counts = Counter(image for pair in self.contradicting for image in pair)
+        return [self.model.images[image].name for image, _ in counts.most_common()]
+
+
+def find_poses(
+    pycolmap: Any, database: Path, images: Path, work: Path, say: Callable[[str], None] = lambda text: None
+) -> Poses | None:
+    """The poses of the photographs in the folder ``images`` by the matches in COLMAP's ``database``; None if
+    too few match.
+
+    They are found one after the other (incremental structure from motion). If strong pairs contradict them,
+    they are found once more, all together (GLOMAP: Pan et al. 2024), and those are kept with which more of
+    the pairs agree: a photograph that is put in a wrong place, by a pattern that repeats itself, takes all
+    that follow with it.
+    """
+    pairs = strong_pairs(database)
+    say("finding the cameras: poses")
+    options = _incremental_options(pycolmap)
+    found = pycolmap.incremental_mapping(database, images, work, options=options)
+    best = _judged(found.values(), pairs)
+    if best is None or not best.doubtful or not hasattr(pycolmap, "global_mapping"):
+        return best
+    say(
+        f"finding the cameras: {len(best.contradicting):,} of {len(pairs):,} pairs contradict the poses:"
+        " once more, all together"
+    )
+    (work / "together").mkdir()
+    other = _judged(pycolmap.global_mapping(database, images, work / "together").values(), pairs)
+    return other if other is not None and other.agreeing > best.agreeing else best
+
+
+def strong_pairs(database: Path) -> dict[tuple[int, int], int]:
+    """The matches of each strong pair of images in COLMAP's ``database``, by their numbers."""
+    query = "select pair_id, rows from two_view_geometries where rows >= ?"
+    with closing(sqlite3.connect(database)) as connection:
+        rows = connection.execute(query, (STRONG,)).fetchall()
+    return {((number // _MAX_IMAGES), number % _MAX_IMAGES): int(count) for number, count in rows}
+
+
+def judge(model: Any, pairs: Mapping[tuple[int, int], int]) -> Poses:
+    """What ``pairs``, from ``strong_pairs``, say of the poses of ``model``."""
+    seen: dict[int, list[int]] = defaultdict(list)
+    for number, point in model.points3D.items():
+        for element in point.track.elements:
+            seen[element.image_id].append(number)
+    points = {image: np.unique(numbers) for image, numbers in seen.items()}
+    placed = {number for number, image in model.images.items() if image.has_pose}
+    none = np.zeros(0, np.int64)
+    agreeing, contradicting = 0, []
+    for (one, other), matches in pairs.items():
+        if one in placed and other in placed:
+            common = np.intersect1d(points.get(one, none), points.get(other, none), assume_unique=True)
+            if len(common) < SHARED * matches:
+                contradicting.append((one, other))
+            else:
+                agreeing += 1
+    return Poses(model, agreeing, tuple(contradicting))
+
+
+def _judged(models: Sequence[Any] | Any, pairs: Mapping[tuple[int, int], int]) -> Poses | None:
+    """The largest of ``models``; None if there is none."""
+    best = max(models, key=lambda model: model.num_reg_images(), default=None)
+    return None if best is None else judge(best, pairs)
+
+
+def _incremental_options(pycolmap: Any) -> Any:
+    """Options of ``incremental_mapping``, with the names of the library's version."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.ba_global_max_refinements = REFINEMENTS
+    options.ba_global_points_ratio = GROWTH
+    frames = "ba_global_frames_ratio"
+    setattr(options, frames if hasattr(options, frames) else "ba_global_images_ratio", GROWTH)
+    return options
