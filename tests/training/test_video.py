@@ -171,7 +171,7 @@ def test_a_video_that_breaks_off_says_where(tmp_path, monkeypatch):
     class Damaged:
         def __init__(self, name):
             self.container = av_open(name)
-            self.streams = self.container.streams
+            self.streams, self.duration = self.container.streams, self.container.duration
 
         def __enter__(self):
             return self
@@ -189,6 +189,19 @@ def test_a_video_that_breaks_off_says_where(tmp_path, monkeypatch):
     monkeypatch.setattr(av, "open", Damaged)
     with pytest.warns(DataWarning, match=r"walk\.mp4: cannot be read beyond frame 6 \(damaged\)"):
         assert len(look_at_frames(clip).sharpness) == 6
+
+
+def test_of_a_long_video_only_key_frames_are_taken(tmp_path, monkeypatch):
+    clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(60)]))
+    with av.open(str(clip)) as container:
+        stream = container.streams.video[0]
+        keys = sum(packet.is_keyframe for packet in container.demux(stream) if packet.dts is not None)
+    assert 2 < keys < 20
+    monkeypatch.setattr(module, "LONG", 5.9)
+    assert len(look_at_frames(clip).sharpness) == keys
+    assert save_frames(clip, tmp_path / "frames", 40) <= keys
+    monkeypatch.setattr(module, "LONG", 6.1)
+    assert len(look_at_frames(clip).sharpness) == 60
 
 
 def test_larger_frames_than_images_may_have_are_refused(tmp_path, monkeypatch):

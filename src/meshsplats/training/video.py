@@ -26,6 +26,9 @@ LOOK_SIDE, MOTION_SIDE = 480, 64
 STILL = 0.05
 """Motion that every frame counts at least, as a share of the mean: in a video that stands still, time
 decides."""
+LONG = 600.0
+"""Seconds. Of longer videos, only key frames are looked at, one in a second or in ten: to decode all takes
+too long."""
 QUALITY = 95
 """Of the JPEG files."""
 NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
@@ -177,6 +180,8 @@ def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
             stream.thread_type = "AUTO"
             if stream.codec_context.width * stream.codec_context.height > MAX_PIXELS:
                 raise FileFormatError(f"{video}: frames have more than {MAX_PIXELS:,} pixels")
+            if (container.duration or 0) > LONG * av.time_base:
+                stream.codec_context.skip_frame = "NONKEY"
             for frame in container.decode(stream):
                 yield frame
                 count += 1
