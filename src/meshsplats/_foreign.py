@@ -13,6 +13,7 @@ _HEAD = 4096
 """First bytes of a file that suffice here."""
 _MAX_PICKLE = 1 << 20
 """Bytes of a pickle that are searched for names; it is never unpickled."""
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".dng")
 
 
@@ -59,7 +60,7 @@ _KINDS: Sequence[_Kind] = (
     ),
     _Kind(".insv .360", b"", "a video of a panoramic camera: export it with its program as .mp4"),
     _Kind(
-        ".mp4 .mov .m4v .avi .mkv .webm",
+        " ".join(VIDEO_SUFFIXES),
         rb"....ftyp(isom|iso2|mp4|qt|M4V|avc1|3gp)|....(moov|mdat|wide)|\x1aE\xdf\xa3|RIFF....AVI ",
         "a video: 'meshsplats train VIDEO -o mesh.npz' makes a mesh of its sharpest frames",
     ),

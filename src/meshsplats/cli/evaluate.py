@@ -217,7 +217,7 @@ class Evaluate(Command):
         if self.data is not None:
             return load_dataset(
                 self.data,
-                downscale=self.downscale or 1,
+                downscale=1 if self.downscale is None else self.downscale,
                 test_every=self.test_every,
                 missing=self.missing,
                 masks=self.masks,

@@ -110,7 +110,7 @@ class TargetOptions:
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
-                downscale=self.downscale or 1,
+                downscale=1 if self.downscale is None else self.downscale,
                 test_every=self.test_every,
                 background=background,
                 cache_bytes=self.cache_bytes,

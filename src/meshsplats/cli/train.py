@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -15,6 +15,7 @@ from meshsplats.cli.common import again, check_mesh_suffix, check_splat_endings,
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.training import Plan, Trained, TrainingCommand
+from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import BLACK, Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
@@ -51,9 +52,9 @@ class PhotographOptions:
     """Factor by which images are smaller than the photographs. Default: what the minutes suffice for."""
     test_every: int = 8
     """Every n-th view is held out for scores, if the data set has no split; 0: none."""
-    missing: Literal["few", "error", "skip"] = "few"
+    missing: Missing = "few"
     """Missing photographs are left out (skip), if they are fewer than half (few), or an error."""
-    masks: Literal["count", "subject"] = "count"
+    masks: Masks = "count"
     """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
     estimate_cameras: bool = False
     """Find the cameras of the photographs though the folder holds some of a kind that is not read."""
@@ -77,9 +78,8 @@ class Train(TrainingCommand):
     """Makes a mesh from photographs with cameras: COLMAP, NeRF-synthetic, nerfstudio or LLFF folders.
 
     Without cameras, they are found first (extra photos) and saved beside the photographs. Of a video (extra
-    video), frames are taken, to a folder beside it. Beside the result
-    NAME: its configuration, a preview, and a folder NAME.run with metrics, previews and a checkpoint, from
-    which --resume continues after Ctrl-C.
+    video), frames are taken, to a folder beside it. Beside the result NAME: its configuration, a preview, and
+    a folder NAME.run with metrics, previews and a checkpoint, from which --resume continues after Ctrl-C.
     """
 
     COMMON = (
@@ -183,7 +183,7 @@ class Train(TrainingCommand):
 
         dataset = load_dataset(
             self.input,
-            downscale=self.target.downscale or 1,
+            downscale=1 if self.target.downscale is None else self.target.downscale,
             test_every=self.target.test_every,
             cache_bytes=self.target.cache_bytes,
             missing=self.target.missing,

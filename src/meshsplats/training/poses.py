@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,7 +105,7 @@ def judge(model: Any, pairs: Mapping[tuple[int, int], int]) -> Poses:
     return Poses(model, agreeing, tuple(contradicting))
 
 
-def _judged(models: Sequence[Any] | Any, pairs: Mapping[tuple[int, int], int]) -> Poses | None:
+def _judged(models: Iterable[Any], pairs: Mapping[tuple[int, int], int]) -> Poses | None:
     """The largest of ``models``; None if there is none."""
     best = max(models, key=lambda model: model.num_reg_images(), default=None)
     return None if best is None else judge(best, pairs)

@@ -23,6 +23,7 @@ from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyErr
 from meshsplats.images.reading import load_image, read_exif, read_header
 from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
 from meshsplats.training.poses import find_poses
+from meshsplats.training.suspects import shortened
 
 CAMERAS, POINTS = "transforms.json", "sparse_points.ply"
 """Files beside the photographs."""
@@ -121,31 +122,30 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
         )
         _match(pycolmap, Path(database), [path.name for path in images], say)
         poses = find_poses(pycolmap, Path(database), place, Path(work), say)
-    best = None if poses is None else poses.model
-    count = 0 if best is None else best.num_reg_images()
-    if best is None or count < FEWEST:
+    count = 0 if poses is None else poses.model.num_reg_images()
+    if poses is None or count < FEWEST:
         raise ValueError(
             f"{folder}: {count} of {len(photographs)} photographs match each other, at least {FEWEST} must."
             " Photographs must overlap by two thirds, be sharp, and show a subject with texture that does not"
             " move"
         )
+    best = poses.model
     named = {image.name: path.name for image, path in zip(images, photographs, strict=True)}
     placed = {named[image.name] for image in best.images.values() if image.has_pose}
     lost = [path.name for path in photographs if path.name not in placed]
     if lost:
         warnings.warn(
             f"{folder}: {len(lost)} of {len(photographs)} photographs match no others and are left out:"
-            f" {', '.join(lost[:5])}" + (", ..." if len(lost) > 5 else ""),
+            f" {shortened(lost)}",
             DataWarning,
             stacklevel=2,
         )
-    if poses is not None and poses.doubtful:
-        names = [named[name] for name in poses.suspects()]
+    if poses.doubtful:
+        suspects = shortened([named[name] for name in poses.suspects()])
         warnings.warn(
             f"{folder}: some cameras may be wrong: {len(poses.contradicting):,} pairs of photographs that"
-            f" match contradict them, most of {', '.join(names[:5])}"
-            + (", ..." if len(names) > 5 else "")
-            + ". Photographs between those of such a pair help, or the cameras of another program",
+            f" match contradict them, most of {suspects}."
+            " Photographs between those of such a pair help, or the cameras of another program",
             DataWarning,
             stacklevel=2,
         )

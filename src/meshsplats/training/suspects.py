@@ -51,13 +51,13 @@ class Suspects:
         lines = []
         if self.blurred:
             lines.append(
-                f"{_photographs(len(self.blurred))} blurred beside the others: {_listed(self.blurred)}."
+                f"{_photographs(len(self.blurred))} blurred beside the others: {shortened(self.blurred)}."
                 " Without, the mesh may be sharper"
             )
         if self.doubles:
             names = [f"{one} and {other}" for one, other in self.doubles]
             lines.append(
-                f"the same photograph twice: {_listed(names)}. If one is held out, its score means nothing;"
+                f"the same photograph twice: {shortened(names)}. If one is held out, its score means nothing;"
                 " if their cameras differ, one is wrong"
             )
         return lines
@@ -67,7 +67,8 @@ def _photographs(count: int) -> str:
     return "1 photograph is" if count == 1 else f"{count} photographs are"
 
 
-def _listed(names: Sequence[str]) -> str:
+def shortened(names: Sequence[str]) -> str:
+    """The first of ``names``, and whether there are more."""
     return ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
 
 

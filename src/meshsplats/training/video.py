@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
@@ -11,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._foreign import VIDEO_SUFFIXES
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import MAX_PIXELS
+from meshsplats.images.writing import save_image
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 FRAMES_PER_SECOND = 2.0
 FEWEST_FRAMES, MOST_FRAMES = 40, 120
 """Frames by default: so many per second, but not fewer or more than these. The time for their cameras grows
@@ -29,8 +29,6 @@ decides."""
 LONG = 600.0
 """Seconds. Of longer videos, only key frames are looked at, one in a second or in ten: to decode all takes
 too long."""
-QUALITY = 95
-"""Of the JPEG files."""
 NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
 
 
@@ -48,7 +46,7 @@ class Frames(NamedTuple):
 
 def is_video(path: Path) -> bool:
     """Whether ``path`` is a file with the suffix of a video."""
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def photographs_of(
@@ -101,7 +99,7 @@ def save_frames(
     if count is not None and count < 2:
         raise ValueError(f"at least 2 frames are needed, got {count}")
     if folder.exists():
-        raise FileExistsError(f"{folder}: is there already")
+        raise FileExistsError(f"{folder}: is there already, without frames: move it away")
     say(f"looking at the frames of {video.name}")
     frames = look_at_frames(video)
     chosen = choose_frames(frames, count or usual_count(frames.seconds))
@@ -112,11 +110,11 @@ def save_frames(
         (made / IMAGES).mkdir(parents=True)
         for index, frame in enumerate(_decoded(video)):
             if index in wanted:
-                turned = np.ascontiguousarray(_turned(frame.to_ndarray(format="rgb24"), frame.rotation))
-                _save(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", turned)
+                turned = _turned(frame.to_ndarray(format="rgb24"), frame.rotation)
+                save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", turned / np.float32(255))
             if index == chosen[-1]:
                 break
-        shutil.move(made, folder)
+        made.rename(folder)
     return len(chosen)
 
 
@@ -196,9 +194,3 @@ def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
 def _turned(pixels: np.ndarray, degrees: float) -> np.ndarray:
     """``pixels`` (h, w, 3) turned counter-clockwise by the nearest quarter turn."""
     return np.rot90(pixels, round(degrees / 90) % 4)
-
-
-def _save(path: Path, pixels: np.ndarray) -> None:
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path, quality=QUALITY, subsampling=0)
