@@ -44,7 +44,7 @@ def kind(monkeypatch):
         return FoundCameras(looks[0], 0.4, UP, 1.0, 0.0, 3.0, cameras)
 
     monkeypatch.setattr(showing, "find_cameras", found)
-    monkeypatch.setattr(showing, "kind_from_outside", lambda cloud, up: (looks[0], 0.4))
+    monkeypatch.setattr(showing, "kind_from_outside", lambda cloud, up, threads: (looks[0], 0.4))
     return looks
 
 

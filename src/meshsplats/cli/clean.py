@@ -30,17 +30,6 @@ from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-_RULES = {
-    "crop": "outside the box",
-    "min_opacity": "fainter than {:g}",
-    "max_distance": "farther than {:g} radii",
-    "max_size": "longer than {:g} radii",
-    "sparse": "fewer than {:.1%} of the usual neighbours",
-    "min_part": "in parts below {:.1%} of all opacity",
-}
-"""Names of the rules in the table."""
-
-
 if TYPE_CHECKING:
     RuleOptions = CleaningRules
 else:
@@ -57,8 +46,9 @@ else:
 class Clean(Command):
     """Removes floaters: splats that are faint, far away, alone, or in small separate parts.
 
-    Prints what each rule removes. NAME.preview.png beside the result NAME shows before | removed, in red |
-    after.
+    By default, walls and skies of a place stay, which the rules alone would take for floaters: it is looked
+    at from within. Prints what each rule removes. NAME.preview.png beside the result NAME shows before |
+    removed, in red | after.
     """
 
     input: tyro.conf.Positional[Path]
@@ -75,6 +65,7 @@ class Clean(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.conversion.surroundings import floaters
         from meshsplats.evaluation.viewers import alpha_for_viewers
         from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.formats.meshes import save_mesh
@@ -83,8 +74,6 @@ class Clean(Command):
         preview = beside(self.output, PREVIEW)
         outputs = [preview] if self.preview_only else [self.output, preview]
         check_outputs(outputs, self.force, inputs=[self.input])
-        explicit = any(value is not None for value in vars(self.rules).values())
-        rules = self.rules if explicit else FLOATERS
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", StraysWarning)  # which names this command
             scene = load_scene(self.input, self.reading)
@@ -92,7 +81,9 @@ class Clean(Command):
             check_splat_endings(written_ending(self.output.name))
         else:
             check_mesh_suffix(self.output)
-        found = find(scene, rules)
+        explicit = any(value is not None for value in vars(self.rules).values())
+        rules = self.rules if explicit else FLOATERS
+        found = find(scene, rules) if explicit else floaters(scene, self.input, threads=self.threads)
         left = remove(scene, found)
         alpha = {}
         result = left if self.preview_only else written(left, self.origin)
@@ -115,7 +106,8 @@ class Clean(Command):
         preview: Path,
         seconds: float,
     ) -> None:
-        counts, total = found.counts(), len(found.opacities)
+        counts = found.counts()
+        around = counts.pop("surroundings", None)
         places = left.means if isinstance(left, GaussianCloud) else left.vertices
         lower, upper = (
             [round(float(v), 4) for v in side + left.origin]
@@ -126,23 +118,17 @@ class Clean(Command):
                 "input": shown_path(self.input),
                 "output": None if self.preview_only else str(self.output),
                 "preview": str(preview),
-                "splats": total,
+                "splats": len(found.opacities),
                 "kept": int(found.kept.sum()),
                 "removed": counts,
+                "surroundings": around,
                 "lower": lower,
                 "upper": upper,
                 "seconds": round(seconds, 3),
             }
             print(json.dumps(result))
             return
-        named = {"all": "together"}
-        named |= {n: _RULES[n].format(getattr(rules, n)) if n != "crop" else _RULES[n] for n in found.gone}
-        if len(counts) == 2:
-            del counts["all"]
-        width = max(len(named[name]) for name in counts)
-        for name, count in counts.items():
-            share = f"{count['splats']:>9,} of {total:,} splats, {count['opacity']:.2%} of the opacity"
-            print(f"{named[name]:<{width}}  {share}")
+        print(*found.in_words(rules), sep="\n")
         print(f"kept: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
         if not self.preview_only:
             print(f"{self.output} ({size_of(self.output)})")

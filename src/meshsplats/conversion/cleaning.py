@@ -57,6 +57,18 @@ class CleaningRules:
                 raise ValueError(f"crop must be x0 y0 z0 x1 y1 z1 with x0 < x1 and so on, got {self.crop}")
 
 
+_WORDS = {
+    "crop": "outside the box",
+    "min_opacity": "fainter than {:g}",
+    "max_distance": "farther than {:g} radii",
+    "max_size": "longer than {:g} radii",
+    "sparse": "fewer than {:.1%} of the usual neighbours",
+    "min_part": "in parts below {:.1%} of all opacity",
+    "all": "together",
+    "surroundings": "kept, as they surround the place",
+}
+"""Names of the rules in tables."""
+
 FLOATERS = CleaningRules(max_size=1000, sparse=0.05, min_part=0.01)
 """The default rules."""
 
@@ -71,6 +83,10 @@ class Findings:
     """(n,) float32 opacities of the splats; for a mesh, the greatest of each splat's vertices."""
     owner: np.ndarray | None = None
     """(f,) int64 index of the splat that each triangle of a mesh belongs to; None for splats themselves."""
+    surroundings: np.ndarray | None = None
+    """(n,) bool: splats that would be among them, but surround a place (``surroundings.floaters``)."""
+    camera: Camera | None = None
+    """A view from within, where the scene is a place."""
 
     @property
     def kept(self) -> np.ndarray:
@@ -78,9 +94,12 @@ class Findings:
         return ~np.any(list(self.gone.values()), axis=0)
 
     def counts(self) -> dict[str, dict[str, float]]:
-        """For each rule, and for ``all`` together: count of removed splats and their share of all opacity."""
+        """For each rule, and for ``all`` together: count of removed splats and their share of all opacity.
+        With ``surroundings``, the same of those that stay."""
         whole = max(float(self.opacities.sum(dtype=np.float64)), 1e-300)
         masks = {**self.gone, "all": ~self.kept}
+        if self.surroundings is not None:
+            masks["surroundings"] = self.surroundings
         return {
             name: {
                 "splats": int(mask.sum()),
@@ -88,6 +107,19 @@ class Findings:
             }
             for name, mask in masks.items()
         }
+
+    def in_words(self, rules: CleaningRules) -> list[str]:
+        """A line for each of the ``rules``, by which they were found, and for all together."""
+        counts, total = self.counts(), len(self.opacities)
+        if len(self.gone) == 1:
+            del counts["all"]
+        values = {**vars(rules), "crop": None}
+        names = [_WORDS[name].format(values.get(name)) for name in counts]
+        return [
+            f"{name:<{max(map(len, names))}}  {count['splats']:>9,} of {total:,} splats,"
+            f" {count['opacity']:.2%} of the opacity"
+            for name, count in zip(names, counts.values(), strict=True)
+        ]
 
 
 def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> Findings:
@@ -203,8 +235,11 @@ def save_strip(
     what is ``left``."""
     from meshsplats.images.writing import save_image, strip
 
-    lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
-    whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
+    if found.camera is not None:
+        whole = rest = found.camera
+    else:
+        lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
+        whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
     shown = ((scene, whole), (_marked(scene, found), whole), (left, rest))
     images = [_image(part, camera, threads) for part, camera in shown]
     save_image(path, strip(images, ("before", "removed", "after")))

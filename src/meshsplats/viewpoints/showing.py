@@ -64,6 +64,7 @@ def default_views(
     up: np.ndarray | None = None,
     film: bool = False,
     given: Sequence[Camera] | None = None,
+    threads: int | None = None,
 ) -> tuple[list[Camera], str] | None:
     """Up to ``count`` views of splats that are no object, and a line that says where they come from. None for
     objects, which are seen from all around, and for meshes.
@@ -77,6 +78,7 @@ def default_views(
         up: (3,) direction, where the user names it.
         film: the views are on a smooth round.
         given: cameras relative to the scene's origin, in place of those of the folder.
+        threads: at most this many; all processors by default.
     """
     if not isinstance(scene, GaussianCloud) or not len(scene):
         return None
@@ -87,7 +89,7 @@ def default_views(
     given = (cameras_beside(source, scene.origin) or []) if given is None else given
     if given:
         toward = guess_up(scene, given) if up is None else unit_up(up)
-        if kind_from_outside(scene, toward)[0] == "object":
+        if kind_from_outside(scene, toward, threads)[0] == "object":
             return None
         some = _spread(given, keys_of(count) if film else count)
         views = [_in_shape(camera.with_near_plane(scene.means), side) for camera in some]
@@ -97,7 +99,7 @@ def default_views(
             ), f"seen on a round through {len(views)} of its {len(given)} cameras"
         return views, f"seen from {len(views)} of its {len(given)} cameras"
     number = keys_of(count) if film else count
-    found = find_cameras(scene, number, up=up, width=side[0], height=side[1])
+    found = find_cameras(scene, number, up=up, width=side[0], height=side[1], threads=threads)
     if found.kind == "object":
         return None
     if film:

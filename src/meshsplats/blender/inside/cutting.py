@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats.blender.inside import objects
 from meshsplats.blender.inside.host import bpy
+from meshsplats.conversion import surroundings
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, find
 from meshsplats.mesh import SplatMesh
 
@@ -63,13 +64,15 @@ def chosen_splats(
 
 
 def floaters(obj: Any, rules: CleaningRules = FLOATERS) -> tuple[SplatMesh, np.ndarray]:
-    """As ``chosen_splats``: the splats that ``rules`` name, as ``meshsplats clean`` does.
+    """As ``chosen_splats``: the splats that ``rules`` name; by default less what surrounds a place, as
+    ``meshsplats clean`` does.
 
     Raises:
         ValueError: as ``chosen_splats``; no splat would be left.
     """
     mesh, _ = chosen_splats(obj)
-    return mesh, ~find(mesh, rules).kept[mesh.splats.of_face]
+    found = surroundings.floaters(mesh) if rules == FLOATERS else find(mesh, rules)
+    return mesh, ~found.kept[mesh.splats.of_face]
 
 
 def _within(region: Any, points: np.ndarray, shape: str) -> np.ndarray:
