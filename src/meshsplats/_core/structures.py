@@ -213,6 +213,8 @@ class FusingStruct(CoreStruct):
         ("size", c_int64 * 3),
         ("low", c_double * 3),
         ("voxel", c_double),
+        ("center", c_double * 3),
+        ("radius", c_double),
         ("truncation", c_double),
         ("behind", c_double),
         ("depth", c_void_p),

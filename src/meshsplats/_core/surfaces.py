@@ -6,6 +6,7 @@ bits with any number of threads.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,27 @@ class Grid(NamedTuple):
     """Distance of neighbouring points."""
     shape: tuple[int, ...]
     """Number of points along each axis."""
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the ball within which the points are evenly spaced..."""
+    radius: float = 0.0
+    """...and its radius r; 0: they are everywhere. Beyond it, points at the distance d from the centre lie
+    r * (2 - r / d) from it on the grid (Barron and others 2022), so that those from which one looks at far
+    things are the closest."""
+
+    def contracted(self, points: np.ndarray) -> np.ndarray:
+        """Where (n, 3) points of the scene lie, on a scale on which the grid is even."""
+        return self._scaled(points, lambda ratio: (2 - 1 / ratio) / ratio)
+
+    def in_scene(self, points: np.ndarray) -> np.ndarray:
+        """The points of the scene whose ``contracted`` are ``points`` (n, 3)."""
+        return self._scaled(points, lambda ratio: 1 / (np.maximum(2 - ratio, 1e-3) * ratio))
+
+    def _scaled(self, points: np.ndarray, factor: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        if not self.radius:
+            return points
+        beside = points - self.center
+        ratio = np.linalg.norm(beside, axis=1, keepdims=True) / self.radius
+        return np.where(ratio > 1, self.center + factor(np.maximum(ratio, 1)) * beside, points)
 
 
 def fuse_depth(
@@ -42,7 +64,8 @@ def fuse_depth(
         total, weight: (x, y, z) float32, added to: sums of truncated distances along the rays, positive in
             front of the surface, in units of the truncation, and their weights.
         depth: (h, w) float32 camera depth, infinite in empty pixels.
-        truncation: of the distances, scene units; points that lie farther behind are left out.
+        truncation: of the distances, scene units, and more where the grid is contracted; points that lie
+            farther behind are left out.
         behind: weight of distances behind the surface, 1 of those before it.
     """
     run(
@@ -52,6 +75,8 @@ def fuse_depth(
             size=grid.shape,
             low=tuple(grid.low),
             voxel=grid.voxel,
+            center=grid.center,
+            radius=grid.radius,
             truncation=truncation,
             behind=behind,
             depth=pointer(depth),

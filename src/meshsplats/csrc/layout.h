@@ -208,6 +208,8 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsFusing, size),
     MS_FIELD(MsFusing, low),
     MS_FIELD(MsFusing, voxel),
+    MS_FIELD(MsFusing, center),
+    MS_FIELD(MsFusing, radius),
     MS_FIELD(MsFusing, truncation),
     MS_FIELD(MsFusing, behind),
     MS_FIELD(MsFusing, depth),

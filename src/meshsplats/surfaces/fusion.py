@@ -30,6 +30,10 @@ _NEARLY, _ALL = 0.02, 0.001
 _REACH = 0.25
 """How far the box of a place reaches beyond nearly all, relative to the longest side of that: what is farther
 away is a background for whose sake all voxels would be coarse."""
+_MOST, _AROUND = 0.95, 1.5
+"""The grid of a place is even as far around as most of its cameras are, and this much farther."""
+_FAR = 2.0
+"""Nearly all of a place must reach so many times farther for that."""
 _CLOSE = 0.9
 """Distance before a surface, in units of the truncation, from which there must be something behind."""
 _GAP = 3
@@ -195,12 +199,21 @@ def grid_around(scene: GaussianCloud | SplatMesh, resolution: int) -> Grid:
     return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1))
 
 
-def grid_of(points: np.ndarray, resolution: int) -> Grid:
-    """The grid around what cameras see of a place, ``points`` (n, 3), about ``resolution`` voxels along its
-    longest side: around all of it but strays, unless these lie far beyond nearly all.
+def grid_of(points: np.ndarray, cameras: Sequence[Camera], resolution: int) -> Grid:
+    """The grid around what ``cameras`` see of a place, ``points`` (n, 3), about ``resolution`` voxels along
+    its longest side: around all of it but strays, unless these lie far beyond nearly all. Where some of it is
+    far away, it is contracted beyond half of the distances that they see.
 
     Raises ValueError for points without extent.
     """
+    centers = np.array([camera.center for camera in cameras])
+    middle = np.median(centers, axis=0)
+    apart = float(np.quantile(np.linalg.norm(centers - middle, axis=1), _MOST))
+    depth, far = np.quantile(np.linalg.norm(points - middle, axis=1), [0.5, 1 - _NEARLY])
+    radius = max(float(depth), _AROUND * apart)
+    even = Grid(middle, 1.0, ())
+    ball = even if far < _FAR * radius else even._replace(center=tuple(middle.tolist()), radius=radius)
+    points = ball.contracted(points)
     lowest, low, high, highest = np.quantile(points, [_ALL, _NEARLY, 1 - _NEARLY, 1 - _ALL], axis=0)
     reach = _REACH * float((high - low).max())
     low, high = np.maximum(lowest, low - reach), np.minimum(highest, high + reach)
@@ -208,4 +221,5 @@ def grid_of(points: np.ndarray, resolution: int) -> Grid:
     if not voxel > 0:
         raise ValueError("the scene has no extent")
     low = low - 2 * voxel
-    return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 3))
+    shape = tuple(int(n) for n in np.ceil((high - low) / voxel) + 3)
+    return ball._replace(low=low, voxel=voxel, shape=shape)

@@ -126,14 +126,15 @@ def surfaces_from(
     """
     levels = level_options(chosen, count)
     said = progress or (lambda *_: None)
-    vertices, faces, relief = _fused(scene, sources, chosen, threads, said)
+    vertices, faces, relief, grid = _fused(scene, sources, chosen, threads, said)
     result = []
     for number, level in enumerate(levels):
         if number:
-            vertices, faces = coarser(vertices, faces)
+            vertices, faces = coarser(grid.contracted(vertices), faces)
+            vertices = grid.in_scene(vertices)
         views = tuple(reduced(view, level.size) for view in sources.views)
         seen = replace(sources, views=views)
-        base, fitted, uv = _surface_of(scene, vertices, faces, seen, level, threads, said)
+        base, fitted, uv = _surface_of(scene, vertices, faces, grid, seen, level, threads, said)
         if level.texture and relief is not None:
             side = -(-level.texture // _MAP)
             base = replace(base, normal_map=normal_map(vertices, faces, uv, side, relief))
@@ -146,14 +147,16 @@ def _surface_of(
     scene: GaussianCloud | SplatMesh,
     vertices: np.ndarray,
     faces: np.ndarray,
+    grid: Grid,
     sources: Sources,
     chosen: SurfaceOptions,
     threads: int | None,
     progress: ProgressOf,
 ) -> tuple[BaseMesh, np.ndarray, np.ndarray]:
     """The surface of these triangles with their texture, and where fitting put the vertices; the texture
-    coordinates (f, 3, 2) of the triangles as given."""
-    surface = Surface(vertices, faces, *_blank_texture(vertices, faces, chosen.texture))
+    coordinates (f, 3, 2) of the triangles as given. Its charts are as large as on the ``grid``: what is far
+    from all cameras of a place needs few texels."""
+    surface = Surface(vertices, faces, *_blank_texture(grid.contracted(vertices), faces, chosen.texture))
     if chosen.texture or chosen.rounds:
         surface = _fitted(surface, sources, chosen, threads, progress)
     fitted, uv = surface.vertices, surface.uv
@@ -189,9 +192,9 @@ def _fused(
     options: SurfaceOptions,
     threads: int | None,
     progress: ProgressOf,
-) -> tuple[np.ndarray, np.ndarray, Relief | None]:
+) -> tuple[np.ndarray, np.ndarray, Relief | None, Grid]:
     """The surface in the depth images: vertices (v, 3) float64, triangles (f, 3) int32; with all of its
-    triangles, where a normal map wants them."""
+    triangles, where a normal map wants them; and the grid that it is from."""
     mesh = scene
     if isinstance(mesh, GaussianCloud):
         # Voxels are far larger than the splats of so many.
@@ -220,14 +223,14 @@ def _fused(
     relief = None
     if 0 < options.faces < len(faces):
         if options.normal_map and options.texture:
-            relief = relief_of(grid.low + grid.voxel * vertices, faces)
+            relief = relief_of(grid.in_scene(grid.low + grid.voxel * vertices), faces)
         vertices, faces = collapsed(vertices, faces, options.faces)
     if not sources.closed:
         vertices, faces = close_holes(vertices, faces)
-    vertices = grid.low + grid.voxel * vertices
+    vertices = grid.in_scene(grid.low + grid.voxel * vertices)
     if options.shape == "floor":
         vertices, faces = _floored(scene, vertices, faces, sources, grid.voxel)
-    return vertices, faces, relief
+    return vertices, faces, relief, grid
 
 
 def _floored(
@@ -263,7 +266,7 @@ def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, thre
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
-    return grid_of(every, resolution)
+    return grid_of(every, cameras, resolution)
 
 
 def _fitted(
