@@ -30,7 +30,8 @@ namespace ms {
 
 // Distances r from the centre that are longer than the radius are contracted to radius * (2 - radius / r) on
 // the grid (Barron and others 2022).
-template <bool Contracted> inline void fuse_on(const MsFusing &in) {
+template <bool Contracted>
+inline void fuse_on(const MsFusing &in) {
     const double *m = in.camera.world_to_camera;
     parallel_blocks(in.threads, in.size[0], 1, [&](int64_t begin, int64_t end, int) {
         for (int64_t i = begin; i < end; ++i) {
