@@ -25,7 +25,7 @@
 #include "mesh_tile.h"
 #include "shading.h"
 #include "splat_order_tile.h"
-#include "splats.h"
+#include "splat_tile.h"
 #include "ssim.h"
 #include "stereo.h"
 

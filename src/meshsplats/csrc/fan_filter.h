@@ -6,92 +6,18 @@
 // A = (M + s I)^(1/2) M^(-1/2) = (I + s M^-1)^(1/2), so that the density has the covariance M + s I. Depths
 // and opacities do not change.
 //
-// For a triangle of area T with opacities a_i at positions q_i, a = sum a_i, Q = sum q_i and B = sum a_i q_i,
-// the integrals of opacity times 1, q and q q^T over the triangle are
-//     T a / 3,  T / 12 (a Q + B),  T / 60 (a Q Q^T + B Q^T + Q B^T + sum (a + 2 a_i) q_i q_i^T).
-//
-// Two limits need care. A fan seen edge on has no width in one direction, where A would be unbounded:
-// MIN_VARIANCE bounds it. Nor does it have an area in the image to weigh its triangles by: areas are those of
-// triangles (x, y, k / z), where k scales depth to DEPTH_SHARE of its extent parallel to the image.
+// fan_moments.h finds c and M. A fan seen edge on has no width in one direction, where A would be unbounded:
+// MIN_VARIANCE bounds it.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
-#include <stdexcept>
 
+#include "fan_moments.h"
 #include "parallel.h"
 #include "pooled_vector.h"
-#include "triangle.h"
 
 namespace ms {
-
-struct SharedVertices : std::runtime_error {
-    SharedVertices() : std::runtime_error("two splats share a vertex") {}
-};
-
-// The vertices of all fans in one list, fan by fan. A slot is a position in this list: fan i has the faces
-// [faces[i], faces[i + 1]) and the slots [slots[i], slots[i + 1]). Where the vertices of each fan follow
-// those of the fan before, as conversion makes them, the list is that of the vertices itself; it may then
-// include a few vertices of no face.
-class FanVertices {
-  public:
-    std::vector<int32_t> faces, slots;
-
-    explicit FanVertices(const MsMesh &mesh) {
-        MS_ASSERT(mesh.face_splat && mesh.vertex_count <= INT32_MAX);
-        faces.reserve(mesh.face_count / 6 + 2);
-        slots.reserve(faces.capacity());
-        if (!list_in_order(mesh)) list_in_any_order(mesh);
-    }
-    int32_t fan_count() const { return (int32_t)faces.size() - 1; }
-    int32_t slot(int32_t vertex) const { return slot_of_vertex_.empty() ? vertex : slot_of_vertex_[vertex]; }
-    int32_t vertex(int32_t slot) const { return vertex_of_slot_.empty() ? slot : vertex_of_slot_[slot]; }
-
-  private:
-    // False if a fan has a vertex below the last one of the fans before, or if many vertices are of no face.
-    bool list_in_order(const MsMesh &mesh) {
-        constexpr int64_t MAX_VERTICES = 12;  // of a fan, for each of its triangles
-        int64_t end = 0;                      // vertices up to here are of the fans before
-        bool in_order = true;
-        for (int64_t i = 0; i < mesh.face_count;) {
-            faces.push_back((int32_t)i);
-            slots.push_back((int32_t)end);
-            int32_t least = INT32_MAX, most = -1;
-            const int32_t splat = mesh.face_splat[i];
-            for (; i < mesh.face_count && mesh.face_splat[i] == splat; ++i) {
-                const int32_t *f = mesh.faces + 3 * i;
-                for (int k = 0; k < 3; ++k) MS_ASSERT(f[k] >= 0 && f[k] < mesh.vertex_count);
-                least = std::min(least, std::min(f[0], std::min(f[1], f[2])));
-                most = std::max(most, std::max(f[0], std::max(f[1], f[2])));
-            }
-            in_order &= (least >= end) & (most - end < MAX_VERTICES * (i - faces.back()));
-            end = (int64_t)most + 1;
-        }
-        faces.push_back((int32_t)mesh.face_count);
-        slots.push_back((int32_t)end);
-        return in_order;
-    }
-    void list_in_any_order(const MsMesh &mesh) {
-        slots.clear();
-        slot_of_vertex_.assign(mesh.vertex_count, -1);
-        vertex_of_slot_.reserve(std::min(mesh.vertex_count, 3 * mesh.face_count));
-        for (int32_t fan = 0; fan < fan_count(); ++fan) {
-            const int32_t first = (int32_t)vertex_of_slot_.size();
-            slots.push_back(first);
-            for (int64_t i = 3 * (int64_t)faces[fan]; i < 3 * (int64_t)faces[fan + 1]; ++i) {
-                int32_t &slot = slot_of_vertex_[mesh.faces[i]];
-                if (slot >= 0 && slot < first) throw SharedVertices();
-                if (slot >= 0) continue;
-                slot = (int32_t)vertex_of_slot_.size();
-                vertex_of_slot_.push_back(mesh.faces[i]);
-            }
-        }
-        slots.push_back((int32_t)vertex_of_slot_.size());
-    }
-
-    // Empty where a slot is a vertex.
-    std::vector<int32_t> slot_of_vertex_, vertex_of_slot_;
-};
 
 class FanFilter {
   public:
@@ -136,7 +62,7 @@ class FanFilter {
 
   private:
     static constexpr double MIN_VARIANCE = 1e-4;  // added to M, as a share of the filter's variance
-    static constexpr double DEPTH_SHARE = 0.1;
+    static constexpr double DEPTH_SHARE = 0.1;  // of depth, scaled by k, in the extent parallel to the image
     static constexpr double OPACITY_BIAS = 1e-6;  // added to opacities: transparent fans need moments, too
 
     struct VertexGradient {
@@ -144,45 +70,20 @@ class FanFilter {
         double z;     // of the camera depth
         double alpha;
     };
-    // A projected vertex: position in samples, 1 / depth, opacity with its bias.
-    struct Vertex {
-        double x, y, w, a;
-    };
     // The memory in which a thread processes a block of consecutive fans: their vertices, from the slot
     // `base` on. Aligned, as its neighbours are of other threads.
     struct alignas(64) Workspace {
         int32_t base;
-        PooledVector<Vertex> vertices;
+        PooledVector<FanVertex> vertices;
         PooledVector<VertexGradient> gradients;
         std::vector<int32_t> order;  // fans to process
-    };
-    // Fans that are processed together, one in each lane. No lane depends on its neighbours.
-    struct FanBatch {
-        int size;  // lanes in use; the others repeat the last fan
-        int32_t fan[WD];
-        int32_t first[WD];     // first triangles
-        int32_t count[WD];     // numbers of triangles
-        int32_t fewest, most;  // of the counts
-        vd inverse_mass;       // 1 / (60 integral of opacity over doubled areas)
-        vd x, y;               // mean c
-        vd m[3];               // covariance M: xx, xy, yy
-        vd inverse[3];         // of M with MIN_VARIANCE added
-        vd k;                  // scale of depths: that of the fan's first vertex
-        vd a[3];               // A: xx, xy, yy
-        bool active[WD];       // false: the fan stays as it is
-    };
-    // Triangle `index` of each fan of a batch.
-    struct Triangles {
-        int32_t slot[3][WD] = {};   // corners, less the workspace's base
-        vd x[3], y[3], w[3], a[3];  // corners: position relative to an origin, 1 / depth, opacity
-        vd alpha_sum;               // over the corners
-        vd u[3], v[3], n[3];        // edges 0 to 1 and 0 to 2 in (x, y, k / z), and their cross product
-        vd area;                    // doubled: |n|; 0 in the lanes of fans that have no such triangle
     };
     // Gradients of the densities at q, relative to the mean: (q^T h q + c . q - level) inverse_mass.
     struct DensityGradient {
         vd h[3], c[2], level;
     };
+
+    FanBlock block_of(const Workspace &work) const { return {mesh_, fans_, work.vertices.data(), work.base}; }
 
     // Calls body(begin, end, work) with an empty order for blocks of fans.
     template <class Body>
@@ -231,27 +132,12 @@ class FanFilter {
                 batch.fewest = std::min(batch.fewest, batch.count[lane]);
                 batch.most = std::max(batch.most, batch.count[lane]);
             }
-            solve_transforms(work, batch);
+            find_moments(block_of(work), depth_scale_, batch);
+            solve_transforms(batch);
             body(batch);
         }
     }
 
-    // The vertices with the indices i, by field.
-    static void gather(const Workspace &work, const int32_t *i, vd fields[4]) {
-        const double *rows[WD];
-        for (int lane = 0; lane < WD; ++lane) rows[lane] = &work.vertices[i[lane]].x;
-        transpose(rows, fields);
-    }
-    static vd root(const vd &a) {
-        vd roots;
-        for (int lane = 0; lane < WD; ++lane) roots[lane] = std::sqrt(a[lane]);
-        return roots;
-    }
-    static void cross(const vd a[3], const vd b[3], vd out[3]) {
-        out[0] = a[1] * b[2] - a[2] * b[1];
-        out[1] = a[2] * b[0] - a[0] * b[2];
-        out[2] = a[0] * b[1] - a[1] * b[0];
-    }
     // a b a for symmetric 2 x 2 matrices xx, xy, yy.
     static void congruence(const vd a[3], const vd b[3], vd out[3]) {
         const vd p = a[0] * b[0] + a[1] * b[1], q = a[0] * b[1] + a[1] * b[2], r = a[1] * b[0] + a[2] * b[1],
@@ -261,80 +147,8 @@ class FanFilter {
         out[2] = r * a[1] + t * a[2];
     }
 
-    // Loads triangle `index` of each fan, relative to the origins (x0, y0). `t` holds the triangles before:
-    // most share the fan's centre with them and begin at the corner where they end; other corners are loaded.
-    void load_triangles(const Workspace &work, const FanBatch &batch, int index, const vd &x0, const vd &y0,
-                        Triangles &t) const {
-        bool same_center = index > 0, joined = index > 0;
-        for (int lane = 0; lane < WD; ++lane) {
-            const int64_t face = batch.first[lane] + std::min(index, batch.count[lane] - 1);
-            int32_t corner[3];
-            for (int j = 0; j < 3; ++j) corner[j] = fans_.slot(mesh_.faces[3 * face + j]) - work.base;
-            same_center &= corner[0] == t.slot[0][lane];
-            joined &= corner[1] == t.slot[2][lane];
-            for (int j = 0; j < 3; ++j) t.slot[j][lane] = corner[j];
-        }
-        if (!same_center) load_corners(work, x0, y0, 0, t);
-        if (joined) {
-            t.x[1] = t.x[2], t.y[1] = t.y[2], t.w[1] = t.w[2], t.a[1] = t.a[2];
-        } else {
-            load_corners(work, x0, y0, 1, t);
-        }
-        load_corners(work, x0, y0, 2, t);
-        t.alpha_sum = t.a[0] + t.a[1] + t.a[2];
-        t.u[0] = t.x[1] - t.x[0], t.u[1] = t.y[1] - t.y[0], t.u[2] = batch.k * (t.w[1] - t.w[0]);
-        t.v[0] = t.x[2] - t.x[0], t.v[1] = t.y[2] - t.y[0], t.v[2] = batch.k * (t.w[2] - t.w[0]);
-        cross(t.u, t.v, t.n);
-        t.area = root(t.n[0] * t.n[0] + t.n[1] * t.n[1] + t.n[2] * t.n[2]);
-        if (index >= batch.fewest)
-            for (int lane = 0; lane < WD; ++lane)
-                if (index >= batch.count[lane]) t.area[lane] = 0;
-    }
-    static void load_corners(const Workspace &work, const vd &x0, const vd &y0, int j, Triangles &t) {
-        vd fields[4];
-        gather(work, t.slot[j], fields);
-        t.x[j] = fields[0] - x0, t.y[j] = fields[1] - y0, t.w[j] = fields[2], t.a[j] = fields[3];
-    }
-
-    // Means, covariances and A of the fans of a batch.
-    void solve_transforms(const Workspace &work, FanBatch &batch) const {
-        int32_t origin[WD];
-        for (int lane = 0; lane < WD; ++lane)
-            origin[lane] = fans_.slot(mesh_.faces[3 * (int64_t)batch.first[lane]]) - work.base;
-        vd origins[4];
-        gather(work, origin, origins);
-        const vd &x0 = origins[0], &y0 = origins[1], &w0 = origins[2];
-        batch.k = depth_scale_ / w0;
-        vd mass = {}, sx = {}, sy = {}, xx = {}, xy = {}, yy = {}, nearest = w0;
-        Triangles t;
-        for (int index = 0; index < batch.most; ++index) {
-            load_triangles(work, batch, index, x0, y0, t);
-            // Q = (x, y), B = (bx, by), and the sum of (a + 2 a_i) q_i q_i^T.
-            const vd x = t.x[0] + t.x[1] + t.x[2], y = t.y[0] + t.y[1] + t.y[2];
-            vd bx = {}, by = {}, txx = {}, txy = {}, tyy = {};
-            for (int j = 0; j < 3; ++j) {
-                const vd weight = t.alpha_sum + 2 * t.a[j];
-                bx += t.a[j] * t.x[j];
-                by += t.a[j] * t.y[j];
-                txx += weight * t.x[j] * t.x[j];
-                txy += weight * t.x[j] * t.y[j];
-                tyy += weight * t.y[j] * t.y[j];
-                nearest = t.w[j] < nearest ? t.w[j] : nearest;
-            }
-            mass += 20 * t.alpha_sum * t.area;
-            sx += 5 * t.area * (t.alpha_sum * x + bx);
-            sy += 5 * t.area * (t.alpha_sum * y + by);
-            xx += t.area * (txx + x * (t.alpha_sum * x + 2 * bx));
-            xy += t.area * (txy + t.alpha_sum * x * y + bx * y + by * x);
-            yy += t.area * (tyy + y * (t.alpha_sum * y + 2 * by));
-        }
-        batch.inverse_mass = 1 / mass;
-        const vd x = sx * batch.inverse_mass, y = sy * batch.inverse_mass;
-        batch.x = x0 + x;
-        batch.y = y0 + y;
-        batch.m[0] = xx * batch.inverse_mass - x * x;
-        batch.m[1] = xy * batch.inverse_mass - x * y;
-        batch.m[2] = yy * batch.inverse_mass - y * y;
+    // A of the fans of a batch, and which of them it moves.
+    void solve_transforms(FanBatch &batch) const {
         // B = I + s M^-1. The square root of a 2 x 2 matrix B with determinant d^2 is
         // (B + d I) / sqrt(tr B + 2 d).
         const double s = variance_, least = MIN_VARIANCE * s;
@@ -352,7 +166,7 @@ class FanFilter {
         constexpr double MAX_TRANSFORM = 1e30;
         for (int lane = 0; lane < WD; ++lane)
             batch.active[lane] =
-                (nearest[lane] > 0) & (mass[lane] > 0) & (determinant[lane] > 0) &
+                (batch.nearest[lane] > 0) & (batch.mass[lane] > 0) & (determinant[lane] > 0) &
                 (batch.a[0][lane] + std::fabs(batch.a[1][lane]) + batch.a[2][lane] < MAX_TRANSFORM);
     }
 
@@ -365,7 +179,7 @@ class FanFilter {
             for (int i = 0; i < 3; ++i) a[i] = batch.a[i][lane];
         }
         for (int32_t slot = fans_.slots[fan]; slot < end; ++slot) {
-            const Vertex &p = work.vertices[slot - work.base];
+            const FanVertex &p = work.vertices[slot - work.base];
             const double x = p.x - x0, y = p.y - y0;
             filtered_[fans_.vertex(slot)] = {x0 + (a[0] * x + a[1] * y), y0 + (a[1] * x + a[2] * y), p.w};
         }
@@ -394,7 +208,7 @@ class FanFilter {
                     continue;
                 }
                 const VertexGradient &g = work.gradients[i];
-                const Vertex &p = work.vertices[i];
+                const FanVertex &p = work.vertices[i];
                 if (!(p.w > 0)) continue;  // of no face
                 add_position(v, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
                              g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
@@ -420,7 +234,7 @@ class FanFilter {
                 const float *from = grad + 3 * (int64_t)v;
                 VertexGradient &to = work.gradients[i];
                 to = {0, 0, 0, 0};
-                const Vertex &p = work.vertices[i];
+                const FanVertex &p = work.vertices[i];
                 if (!(p.w > 0)) continue;  // of no face
                 const Projected &q = filtered_[v];
                 const double z = 1 / p.w, x = from[0] * unit_x * z, y = from[1] * unit_y * z, dx = p.x - x0,
@@ -451,14 +265,15 @@ class FanFilter {
     }
 
     // Adds the gradients through the densities, whose moments determine A and c: the derivatives of the
-    // integrals at the top of this file with respect to opacities, positions and areas.
+    // integrals at the top of fan_moments.h with respect to opacities, positions and areas.
     void backward_density(const FanBatch &batch, const DensityGradient &density, Workspace &work) const {
         const vd *h = density.h, *c = density.c;
         vd grad_k = {};
         int32_t origin[WD];
-        Triangles t;
+        const FanBlock block = block_of(work);
+        FanTriangles t;
         for (int index = 0; index < batch.most; ++index) {
-            load_triangles(work, batch, index, batch.x, batch.y, t);
+            t.load(block, batch, index, batch.x, batch.y);
             if (index == 0) std::copy(t.slot[0], t.slot[0] + WD, origin);
             vd hx[3], hy[3], quadratic[3], linear[3];  // h q_j, q_j^T h q_j, c . q_j
             for (int j = 0; j < 3; ++j) {
@@ -509,7 +324,7 @@ class FanFilter {
     }
 
     // Adds the gradients of the corners through the areas of the triangles, whose gradients are `grad_area`.
-    static void add_area_gradient(const Triangles &t, const vd &grad_area, vd grad[3][3]) {
+    static void add_area_gradient(const FanTriangles &t, const vd &grad_area, vd grad[3][3]) {
         vd grad_n[3], grad_u[3], grad_v[3];
         vd scale = grad_area / t.area;
         for (int lane = 0; lane < WD; ++lane) scale[lane] = t.area[lane] > 0 ? scale[lane] : 0;

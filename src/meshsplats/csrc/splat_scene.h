@@ -1,10 +1,9 @@
-// Renders Gaussian splats as they were trained: whole splats in the order of their centres' depths.
+// Gaussian splats as a camera sees them: projected, coloured, and in the order of their centres' depths.
 //
 // EWA splatting (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting (Kerbl et al. 2023): the
-// projected covariance is dilated, alpha below 1/255 is skipped and limited to 0.99, and a sample stops
-// before the splat that would leave a transmittance below 1e-4. The kernel 'antialiased' compensates opacity
-// for the dilation (Yu et al. 2024); '2dgs' intersects rays with the planes of flat splats (Huang et al.
-// 2024).
+// projected covariance is dilated, and alpha below 1/255 is skipped. The kernel 'antialiased' compensates
+// opacity for the dilation (Yu et al. 2024); '2dgs' intersects rays with the planes of flat splats (Huang et
+// al. 2024). splat_tile.h blends them.
 #pragma once
 
 #include <memory>
@@ -14,7 +13,7 @@
 
 namespace ms {
 
-constexpr float MIN_ALPHA = 1.0f / 255, MAX_ALPHA = 0.99f, MIN_SPLAT_TRANSMITTANCE = 1e-4f;
+constexpr float MIN_ALPHA = 1.0f / 255;
 
 enum Kernel { KERNEL_3DGS = 0, KERNEL_ANTIALIASED = 1, KERNEL_2DGS = 2 };
 
@@ -35,23 +34,6 @@ struct ProjectedPlane {
     double m[3][3];
     float w[3];
 };
-
-// exp(x) for x <= 0 with a relative error of about 2e-7: Cody-Waite range reduction and a Taylor polynomial
-// of degree 7. The same bits at every vector width.
-inline vf exp_negative(vf x) {
-    typedef int32_t vi __attribute__((vector_size(4 * W)));
-    x = vmax(x, set1(-87.0f));
-    vf scaled = x * set1(1.44269504f);
-    vi n = __builtin_convertvector(scaled - set1(0.5f), vi);
-    vf whole = __builtin_convertvector(n, vf);
-    vf r = (x - whole * set1(0.693359375f)) + whole * set1(2.12194440e-4f);
-    vf p = set1(1.0f / 5040);
-    for (float c : {1.0f / 720, 1.0f / 120, 1.0f / 24, 1.0f / 6, 0.5f, 1.0f, 1.0f}) p = p * r + set1(c);
-    vi bits = (n + 127) << 23;
-    vf power_of_two;
-    __builtin_memcpy(&power_of_two, &bits, sizeof power_of_two);
-    return p * power_of_two;
-}
 
 // Display colour along the unit direction d from the camera: 1/2 + sum of coefficients times real spherical
 // harmonics, at least 0. Of degree 0 alone it is also limited to 1, as a vertex colour is. `used` is 1, 4, 9
@@ -293,190 +275,6 @@ class SplatScene {
             box.high[i] = origin + std::max(middle + half, low_pass);
         }
         return true;
-    }
-};
-
-// Renders the splats into one tile. Samples are stored in rows.
-class SplatTile {
-  public:
-    SplatTile(const SplatScene &scene, const Grid &grid, const MsOptions &options, const MsImage &image,
-              const MsCamera &camera, const MsSplats &cloud)
-        : scene_(scene),
-          grid_(grid),
-          options_(options),
-          image_(image),
-          camera_(camera),
-          planar_(cloud.kernel == KERNEL_2DGS),
-          near_((float)camera.near),
-          inverse_low_pass_(1 / std::max(cloud.dilation, 1e-6f) / (grid.samples * grid.samples)) {
-        for (int i = 0; i < TILE; ++i) center_[i] = i + 0.5f;
-    }
-
-    int64_t fragments() const { return fragments_; }
-
-    void render(int tile_x, int tile_y, const TileEntry *list, int64_t length) {
-        int x0 = tile_x * grid_.tile_side, y0 = tile_y * grid_.tile_side;
-        int columns = std::min(grid_.tile_side, grid_.width - x0),
-            rows = std::min(grid_.tile_side, grid_.height - y0);
-        MS_ASSERT(columns > 0 && rows > 0);
-        for (int y = 0; y < TILE; ++y)
-            for (int x = 0; x < TILE; ++x) {
-                red_[y][x] = green_[y][x] = blue_[y][x] = 0;
-                transmittance_[y][x] = 1;
-            }
-        for (int y = 0; y < rows; ++y) active_[y] = (1u << columns) - 1;
-        for (int64_t i = 0; i < length; ++i) {
-            MS_ASSERT(i == 0 || list[i].key <= list[i - 1].key);
-            blend(list[i].first, x0, y0, rows);
-            if (i % SPLATS_PER_CHECK == SPLATS_PER_CHECK - 1) {
-                uint32_t any = 0;
-                for (int y = 0; y < rows; ++y) any |= active_[y];
-                if (!any) break;
-            }
-        }
-        resolve(x0, y0, columns, rows);
-    }
-
-  private:
-    static constexpr int SPLATS_PER_CHECK = 16;  // between checks whether the tile is finished
-
-    const SplatScene &scene_;
-    const Grid &grid_;
-    const MsOptions &options_;
-    const MsImage &image_;
-    const MsCamera &camera_;
-    bool planar_;
-    float near_, inverse_low_pass_;  // 1 / variance of the low-pass filter, 1 / square samples
-    alignas(64) float center_[TILE];
-    alignas(64) float red_[TILE][TILE], green_[TILE][TILE], blue_[TILE][TILE], transmittance_[TILE][TILE];
-    uint32_t active_[TILE];  // by row, one bit per column
-    int64_t fragments_ = 0;
-
-    // A ProjectedSplat relative to the corner of a tile: u = a x + b y + c, v = d y + e, squared distance u^2
-    // + v^2.
-    struct TileSplat {
-        float a, b, c, d, e;
-    };
-    // A ProjectedPlane relative to the corner of a tile, which is at (x, y) from the projected centre.
-    struct TilePlane {
-        float x, y, m[3][3], w[3];
-    };
-
-    static vf select_bits(unsigned chosen, vf yes, vf no) {
-#if defined(__AVX512F__)
-        return select((vm)chosen, yes, no);
-#else
-        typedef int vi __attribute__((vector_size(4 * W)));
-        vi lane;
-        for (int i = 0; i < W; ++i) lane[i] = (chosen >> i & 1) ? -1 : 0;
-        return select((vm)lane, yes, no);
-#endif
-    }
-
-    // Blends one splat behind all earlier ones.
-    void blend(int32_t index, int x0, int y0, int rows) {
-        MS_ASSERT(index >= 0 && index < (int32_t)scene_.splats.size());
-        const ProjectedSplat &splat = scene_.splats[index];
-        // In double precision, because the offsets cancel where the centre is far away.
-        const double dx = x0 - splat.x, dy = y0 - splat.y;
-        TileSplat flat{};
-        TilePlane plane;
-        if (planar_)
-            plane = plane_at(scene_.planes[index], dx, dy);
-        else
-            flat = splat_at(splat, dx, dy);
-        vf opacity = set1(splat.opacity);
-        // One more row on either side, for rounding.
-        int first = (int)std::min(std::max(splat.low - y0 - 1, 0.0f), (float)rows);
-        int last = (int)std::max(std::min(splat.high - y0, rows - 1.0f), -1.0f);
-        for (int y = first; y <= last; ++y) {
-            if (!active_[y]) continue;
-            const float v = flat.d * (y + 0.5f) + flat.e, row_u = flat.b * (y + 0.5f) + flat.c,
-                        row_v2 = v * v;
-            for (int x = 0; x < TILE; x += W) {
-                unsigned active = (active_[y] >> x) & ((1u << W) - 1);
-                if (!active) continue;
-                vf power;
-                if (planar_) {
-                    power = plane_power(plane, load(center_ + x), y + 0.5f);
-                } else {
-                    vf u = set1(flat.a) * load(center_ + x) + set1(row_u);
-                    power = set1(-0.5f) * (u * u + set1(row_v2));
-                }
-                // Conservative and cheaper than exp: log(1/255) = -5.54.
-                active &= greater_equal_bits(power, set1(-5.6f));
-                if (!active) continue;
-                vf alpha = vmin(opacity * exp_negative(power), set1(MAX_ALPHA));
-                active &= greater_equal_bits(alpha, set1(MIN_ALPHA));
-                if (!active) continue;
-                vf transmittance = load(transmittance_[y] + x);
-                vf next = transmittance * (set1(1.0f) - alpha);
-                unsigned blended = active & greater_equal_bits(next, set1(MIN_SPLAT_TRANSMITTANCE));
-                active_[y] &= ~((active & ~blended) << x);
-                if (!blended) continue;
-                vf weight = select_bits(blended, transmittance * alpha, set1(0.0f));
-                store(red_[y] + x, load(red_[y] + x) + weight * set1(splat.rgb[0]));
-                store(green_[y] + x, load(green_[y] + x) + weight * set1(splat.rgb[1]));
-                store(blue_[y] + x, load(blue_[y] + x) + weight * set1(splat.rgb[2]));
-                store(transmittance_[y] + x, select_bits(blended, next, transmittance));
-                fragments_ += __builtin_popcount(blended);
-            }
-        }
-    }
-
-    static TileSplat splat_at(const ProjectedSplat &splat, double dx, double dy) {
-        return {(float)splat.m[0], (float)splat.m[1], (float)(splat.m[0] * dx + splat.m[1] * dy),
-                (float)splat.m[2], (float)(splat.m[2] * dy)};
-    }
-    static TilePlane plane_at(const ProjectedPlane &from, double dx, double dy) {
-        TilePlane plane;
-        for (int k = 0; k < 3; ++k) {
-            plane.m[k][0] = (float)from.m[k][0];
-            plane.m[k][1] = (float)from.m[k][1];
-            plane.m[k][2] = (float)(from.m[k][0] * dx + from.m[k][1] * dy + from.m[k][2]);
-            plane.w[k] = from.w[k];
-        }
-        plane.x = (float)dx;
-        plane.y = (float)dy;
-        return plane;
-    }
-
-    // -1/2 the squared distance in the splat's plane, or to the centre in the image by the low-pass filter if
-    // that is less.
-    vf plane_power(const TilePlane &s, vf x, float y) const {
-        vf p[3];
-        for (int k = 0; k < 3; ++k) p[k] = set1(s.m[k][0]) * x + set1(s.m[k][1] * y + s.m[k][2]);
-        vf u = p[0] / p[2], v = p[1] / p[2], square = u * u + v * v;
-        vf depth = set1(s.w[0]) * u + set1(s.w[1]) * v + set1(s.w[2]);
-        vf dx = x + set1(s.x);
-        float dy = y + s.y;
-        vf low_pass = set1(inverse_low_pass_) * (dx * dx + set1(dy * dy));
-        // A ray parallel to the plane makes `square` NaN, and comparisons with NaN are false.
-        vm hit = mask_and(greater_equal(depth, set1(near_)), greater(low_pass, square));
-        return set1(-0.5f) * select(hit, square, low_pass);
-    }
-
-    // Averages the samples of each pixel and writes the pixels.
-    void resolve(int x0, int y0, int columns, int rows) {
-        int s = grid_.samples;
-        float share = 1.0f / (s * s);
-        for (int y = 0; y < rows; y += s)
-            for (int x = 0; x < columns; x += s) {
-                int64_t pixel = (int64_t)((y0 + y) / s) * camera_.width + (x0 + x) / s;
-                float sum[4] = {0, 0, 0, 0};
-                for (int j = y; j < y + s; ++j)
-                    for (int i = x; i < x + s; ++i) {
-                        sum[0] += red_[j][i];
-                        sum[1] += green_[j][i];
-                        sum[2] += blue_[j][i];
-                        sum[3] += transmittance_[j][i];
-                    }
-                const float *background =
-                    options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
-                for (int c = 0; c < 3; ++c)
-                    image_.color[3 * pixel + c] = sum[c] * share + sum[3] * share * background[c];
-                image_.alpha[pixel] = 1 - sum[3] * share;
-            }
     }
 };
 
