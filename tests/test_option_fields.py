@@ -11,7 +11,17 @@ from typing import Annotated, Literal
 import pytest
 from conftest import script
 
-from meshsplats._options import Advanced, Fixed, Range, With, check_options, docstrings, reachable, settings
+from meshsplats._options import (
+    Advanced,
+    Fixed,
+    Range,
+    With,
+    changed,
+    check_options,
+    docstrings,
+    reachable,
+    settings,
+)
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.conversion.cleaning import CleaningRules
 from meshsplats.conversion.options import ConversionOptions
@@ -127,3 +137,9 @@ def test_the_page_of_options_is_that_of_the_source():
     pytest.importorskip("tyro")
     module = script("tools/options_page.py")
     assert module.PAGE.read_text(encoding="utf-8") == module.page(), "run tools/options_page.py"
+
+
+def test_options_that_differ_from_their_defaults_are_changed():
+    assert changed(Baking()) == []
+    assert changed(Baking(heat=200, glaze=True, loaves=1)) == ["heat", "glaze"]
+    assert changed(Toasting()) == []

@@ -17,7 +17,7 @@ LOWEST = (
 )
 """Rooms that import no other room."""
 FLOORS = (
-    ("_json", "binding", "camera", "cluster", "draw_order", "gaussians", "mesh_joining"),
+    ("_json", "_option_values", "binding", "camera", "cluster", "draw_order", "gaussians", "mesh_joining"),
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),

@@ -216,6 +216,13 @@ def check_options(
             raise ValueError(f"{name} has no effect without {condition}" + (f", got {got}" if got else ""))
 
 
+def changed(options: Any) -> list[str]:
+    """Names of the fields of a dataclass whose values are not their defaults."""
+    return [
+        name for name, setting in settings(type(options)).items() if getattr(options, name) != setting.default
+    ]
+
+
 def reachable(kind: type) -> dict[str, Setting]:
     """The options of ``kind`` that can be changed: not those that are fixed, nor those for another value of a
     fixed one."""

@@ -17,7 +17,7 @@ from meshsplats._files.atomic import replace_folder, write_text
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.formats.outputs import CONFIGURATION, check_outputs
+from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import (
     SAMPLES,
@@ -44,23 +44,27 @@ class ChainOptions:
     """The meshes of a chain and their files."""
 
     levels: int = 4
+    """Number of meshes."""
     factor: Literal[2, 4] = 4
-    """Splats of each level per splat of the next."""
+    """Splats of each level per splat of the next: 4, for half the size on the screen, or 2."""
     width: int = 800
-    """Side in pixels of images that just hold the subject, of the finest level."""
+    """Screen size of the finest level: side in pixels of images that just hold the subject."""
     max_splats: int | None = None
-    """Of the finest level; None: all."""
-    format: str = "glb"
-    """Suffix of the files, without a dot."""
+    """Maximum number of splats of the finest level. Default: all."""
+    format: MeshEnding = "glb"
+    """File format of the meshes."""
     alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
-    """As for ``save_mesh``; 'auto': measured for each level (``choose_alpha``), for a .glb. 'ordered' (.glb):
-    in an order of blending, and optimised through it."""
-    up: Sequence[float] | np.ndarray | None = None
-    sh_degree: int | None = None
-    """Of the images of the splats; None: all that are stored."""
+    """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
+    not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
+    cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
     order: Order | None = None
     """In which triangles are blended and tuned; None: that of the meshes and of the configuration."""
+    sh_degree: int | None = None
+    """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
+    up: Sequence[float] | np.ndarray | None = None
+    """Direction that points up in the world; None: that of the splats."""
     threads: int | None = None
+    """Maximum number of threads; None: all processors."""
 
     def plan(self, splats: int) -> list[Level]:
         """The levels of so many ``splats`` (``plan_levels``). ValueError for orders that contradict each

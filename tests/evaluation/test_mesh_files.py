@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from _splats import few_splats
 
 from meshsplats import convert, load_mesh
@@ -40,3 +42,13 @@ def test_each_format_gets_what_it_has(tmp_path):
     material = GltfDocument(paths[1]).json["materials"][0]
     assert (material["alphaMode"], material["alphaCutoff"]) == ("MASK", 0.25)
     assert "KHR_materials_unlit" not in material.get("extensions", {})
+
+
+def test_a_file_takes_what_its_format_has():
+    asked = MeshFileOptions(
+        lit=True, smooth=True, alpha="ordered", nodes=3, quick=True, compression="meshopt"
+    )
+    assert asked.taken_by(Path("a.glb")) == asked
+    assert asked.taken_by(Path("a.usda")) == lit
+    assert asked.taken_by(Path("a.npz")) == MeshFileOptions()
+    assert MeshFileOptions(alpha="opaque", cutoff=0.3).taken_by(Path("a.obj")).cutoff == 0.3

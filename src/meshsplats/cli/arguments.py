@@ -15,9 +15,9 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 import tyro
 
 from meshsplats import _toml as toml
+from meshsplats._option_values import converted, from_text, short
 from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say
-from meshsplats.cli.values import converted, from_text, short
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
@@ -151,10 +151,11 @@ def as_cli_options(
     metavars: Mapping[str, str] = types.MappingProxyType({}),
     defaults: Callable[[str], str] = lambda name: "",
     flags: bool = False,
+    presets: bool = True,
     checked: bool = True,
 ) -> type[T]:
-    """A library's dataclass of options as a group of the command line, where each may be left out and is then
-    None. Help, placeholders and whether an option has a flag follow from its fields (``_options.settings``).
+    """A library's dataclass of options as a group of the command line. Help, placeholders and whether an
+    option has a flag follow from its fields (``_options.settings``).
 
     Args:
         options: the dataclass.
@@ -163,21 +164,23 @@ def as_cli_options(
         metavars: placeholders for values; by default the choices, the range, N or X.
         defaults: the end of an option's help, by its name.
         flags: booleans are flags and False by default.
+        presets: options that are left out are None, as presets have their values; else they are those of the
+            library.
         checked: whether values are checked at once, by ``__post_init__``.
     """
     known = reachable(options)
     parts: list[tuple[str, Any, Any]] = []
     hints = get_type_hints(options)
     for name, setting in settings(options).items():
-        start: Any = None
-        hint: Any = hints[name] | None
+        start: Any = None if presets else setting.default
+        hint: Any = hints[name] | None if presets else hints[name]
         if name in without or name not in known:
             hint = tyro.conf.Suppress[object]
         elif setting.advanced:
             hint = Annotated[hint, tyro.conf.Fixed]
         elif bool in setting.kinds and flags:
             hint, start = bool, False
-        else:
+        elif presets or setting.optional:
             metavar = metavars.get(name) or _placeholder(setting)
             hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
         parts.append((name, hint, start))

@@ -13,6 +13,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import check_mesh_suffix, plural, size_of, written
 from meshsplats.cli.images import ViewOptions
+from meshsplats.cli.messages import say
 from meshsplats.formats.outputs import check_outputs
 
 
@@ -66,7 +67,7 @@ class Bake(Command):
                 f"{self.input}: the mesh has no filter, there is nothing to bake; --filter-px2 gives it one"
                 + more
             )
-        cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
+        cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS, say=say)
         if degree:  # with the filter, which shows how much of each vertex a view sees
             mesh = replace(mesh, plain_colors=plain_colors_of(mesh, cameras)).plain
         baked = bake_filter(mesh, cameras, filter_px2=px2)

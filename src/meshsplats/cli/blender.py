@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -31,6 +30,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.images import EXCLUSIVE_VIEWS, ViewOptions
 from meshsplats.cli.messages import UsageError, say
+from meshsplats.cli.progress import InBar, terminal_bar
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs
 from meshsplats.frames import view_names
@@ -147,7 +147,8 @@ class Blender(Command):
         else:
             scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
             coarser = [level.relative_to(scene.origin) for level in coarser]
-        cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800, film=not suffix)
+        count = 1 if suffix else 60
+        cameras = self._views().make(scene, self.input, count=count, side=800, film=not suffix, say=say)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
         images = self._images(suffix, len(cameras))
@@ -166,7 +167,7 @@ class Blender(Command):
             subject = LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
         if not suffix:
             self.output.mkdir(exist_ok=True)
-        with _progress_display(len(images)) as show:
+        with terminal_bar() as bar:
             result = draw(
                 subject,
                 cameras,
@@ -175,7 +176,7 @@ class Blender(Command):
                 options=options,
                 executable=self.executable,
                 announce=lambda ahead: say(in_words(ahead, options, len(images))),
-                progress=show,
+                progress=Lines(say) if bar is None else partial(_show, bar, max(len(images), 1)),
             )
         save_cameras(cameras, records[0], origin=scene.origin)
         write_configuration(records[1], "blender", self)
@@ -302,18 +303,5 @@ class Blender(Command):
         print(summary)
 
 
-@contextmanager
-def _progress_display(total: int) -> Iterator[Callable[[Progress], object]]:
-    """A function that shows the progress of Blender: as a bar where stderr is a terminal, else in a line now
-    and then."""
-    if not sys.stderr.isatty():
-        yield Lines(say)
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    columns = (TextColumn("Blender"), BarColumn(), TextColumn("{task.fields[text]}"))
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=max(total, 1), text="starts")
-        yield lambda at: bar.update(task, completed=at.done + at.share, text=where(at))
+def _show(bar: InBar, total: int, at: Progress) -> None:
+    bar.phase("Blender", (at.done + at.share) / total, where(at))

@@ -7,13 +7,14 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import tyro
 
+from meshsplats._options import changed
 from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats._words import direction_in_words
 from meshsplats._words import parse_color as parse_color
@@ -91,14 +92,10 @@ class SplatOptions:
 
     def refuse_for(self, path: Path) -> None:
         """UsageError for options that have no effect on ``path``, which is not a file of splats."""
-        given = [name for name in ("kernel", "time", "activated") if name in self._changed]
+        given = [name for name in ("kernel", "time", "activated") if name in changed(self)]
         if given:
             flags = ", ".join(spelled(type(self), name) for name in given)
             raise UsageError(f"{shown_path(path)} holds no splats: {flags} would have no effect")
-
-    @property
-    def _changed(self) -> set[str]:
-        return {f.name for f in fields(self) if getattr(self, f.name) != f.default}
 
     @property
     def arguments(self) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import PartOptions, SplatOptions, optional_color, parse_color, print_table, track
 from meshsplats.cli.images import EXCLUSIVE_VIEWS, DrawOptions, ViewOptions
+from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration, write_json
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import choose_background
@@ -72,7 +73,7 @@ class Compare(Command):
         self.draw.check_device()
         cloud = self.part.of(self.reading.load(self.splats))
         photographs = self.views.photographs(cloud.origin)
-        cameras = self.views.make(cloud, self.splats, count=8, side=400, photographs=photographs)
+        cameras = self.views.make(cloud, self.splats, count=8, side=400, photographs=photographs, say=say)
         strips = view_names(len(cameras))
         names = (*strips, RESULTS, CAMERAS, CONFIGURATION)
         check_outputs([self.output / name for name in names], self.force, self.output)

@@ -208,7 +208,7 @@ class Convert(ConvertCommand):
                     print(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
         if result["preview"]:
             print(f"preview: {result['preview']}")
-        if result.get("converted") is not None and self.compression == "none":
+        if result.get("converted") is not None and self.files.compression == "none":
             print(f"next: {self._next(seen_from(cameras, job.source, np.zeros(3)))}")
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from meshsplats._options import changed
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.common import SplatOptions, check_data, check_splat_endings, optional_up
 from meshsplats.cli.messages import UsageError
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.options import PRESETS
-from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.scene_views import cameras_named
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
 from meshsplats.file_conversion import Product
 from meshsplats.formats.mesh_formats import takes
@@ -26,21 +26,23 @@ from meshsplats.formats.scenes import SUFFIXES as SCENE_SUFFIXES
 from meshsplats.formats.sniff import identify
 from meshsplats.jobs import Job, sources
 from meshsplats.mesh import checked_cutoff
-from meshsplats.rendering.ordering import NODES, check_nodes
+from meshsplats.rendering.ordering import check_nodes
 
 _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
 _FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
     *("conversion", "reading", "origin", "json", "force", "skip_existing", "spz_version", "linear"),
-    *("up", "scale", "with_mesh", "collider"),
+    *("up", "scale", "with_mesh", "collider", "files"),
 )
 """Options of the command that have one."""
 
 
 if TYPE_CHECKING:
     ConvertOptions = ConversionOptions
+    FileOptions = MeshFileOptions
 else:
+    FileOptions = as_cli_options(MeshFileOptions, "How meshes are saved.", presets=False)
     ConvertOptions = as_cli_options(
         ConversionOptions,
         "In parentheses: the values of the presets.",
@@ -83,27 +85,7 @@ class ConvertCommand(Command):
     file, else -y."""
     scale: option.Number = None
     """Factor for all lengths of the result, of meshes and splats: metres in an output unit, say."""
-    lit: bool = False
-    """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
-    smooth: bool = False
-    """With --lit: normals of the surface that the splats form, in place of the triangles' own, which look
-    mottled under light."""
-    color_type: tyro.conf.Fixed[Literal["uint16", "float32"]] = "uint16"
-    """.glb: storage of colours."""
-    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid", "ordered"] = "auto"
-    """auto: for .glb, blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by
-    a few images of both; else blend. blend: the viewer blends true opacities; mask (.glb): it draws as solid
-    what has at least ``cutoff``; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
-    with soft_share: solid and blended triangles apart; ordered (.glb), for web viewers and engines alone:
-    every triangle twice, for either side, in an order of blending that suits views from all around."""
-    nodes: tyro.conf.Fixed[int | Literal["auto"] | None] = None
-    """--alpha ordered: parts that viewers sort, each a draw call; auto: few, if they do. Default: 8."""
-    quick: tyro.conf.Fixed[bool] = False
-    """--alpha ordered: an order by a formula, in a second, and several dB worse."""
-    cutoff: tyro.conf.Fixed[float | None] = None
-    """--alpha opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
-    compression: Literal["none", "meshopt"] = "none"
-    """.glb: meshopt: a quarter to a third of the size, for viewers that can unpack it."""
+    files: FileOptions = field(default_factory=FileOptions)
     as_splats: bool = False
     """Write splats, not a mesh, as .ply, .glb or .usdc, too: all of them, or those that --crop, --max-splats
     and min_opacity leave."""
@@ -153,25 +135,26 @@ class ConvertCommand(Command):
         if self.spz_version is not None or self.linear is not None:
             raise UsageError("--set spz_version and linear are for splats: --as-splats")
         names = [f"mesh.{kind}" for kind in kinds]
-        if self.lit and not any(takes(name, "lit") for name in names):
+        files = self.files
+        if files.lit and not any(takes(name, "lit") for name in names):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
-        if self.smooth and not self.lit:
+        if files.smooth and not files.lit:
             raise UsageError("--smooth has no effect without --lit")
-        only_glb = self.color_type != "uint16" or self.alpha in GLB_ALPHA or self.compression != "none"
+        only_glb = files.color_type != "uint16" or files.alpha in GLB_ALPHA or files.compression != "none"
         if only_glb and not any(takes(name, "alpha") for name in names):
             raise UsageError(
                 "--alpha mask, hybrid or ordered, --compression and --set color_type are for .glb files"
             )
-        if self.cutoff is not None:
-            if self.alpha not in ("opaque", "mask"):
+        if files.cutoff is not None:
+            if files.alpha not in ("opaque", "mask"):
                 raise UsageError("--set cutoff is for --alpha opaque or mask")
-            checked_cutoff(self.cutoff)
-        if self.alpha != "ordered" and (self.nodes is not None or self.quick):
+            checked_cutoff(files.cutoff)
+        if files.alpha != "ordered" and (files.nodes is not None or files.quick):
             raise UsageError("--set nodes and quick are for --alpha ordered")
-        if self.alpha == "ordered" and (self.lit or self.compression != "none"):
+        if files.alpha == "ordered" and (files.lit or files.compression != "none"):
             raise UsageError("--alpha ordered goes with neither --lit nor --compression")
-        if self.nodes is not None:
-            check_nodes(self.nodes)
+        if files.nodes is not None:
+            check_nodes(files.nodes)
         check_data(self.data, self.missing, self.cameras)
         self.options_for(sources(self.input))  # checks the values before the work
 
@@ -191,7 +174,7 @@ class ConvertCommand(Command):
 
         if tuple(kinds) != ("ply",):
             raise UsageError("--stream writes .ply; for other programs, 'meshsplats tiles' makes .glb tiles")
-        if self.fidelity is not None or self.alpha not in ("auto", "blend") or self.scale is not None:
+        if self.fidelity is not None or self.files.alpha not in ("auto", "blend") or self.scale is not None:
             raise UsageError("--fidelity, --alpha and --scale need all in memory: leave out --stream")
         refuse_whole(self.options_for(sources(self.input)))
 
@@ -202,8 +185,7 @@ class ConvertCommand(Command):
             if not all(f".{kind}" in SCENE_SUFFIXES for kind in kinds) or self.linear is not None:
                 raise UsageError("--with-mesh and --collider are for .glb and USD, with display colours")
             check_outputs([self.output], True, inputs=meshes)
-        standard = {f.name: f.default for f in fields(self) if f.name not in _FOR_SPLATS}
-        idle = [name for name, value in standard.items() if getattr(self, name) != value]
+        idle = [name for name in (*changed(self), *changed(self.files)) if name not in _FOR_SPLATS]
         explicit = asdict(self.conversion)
         if self.conversion.budget == "drop" or self.conversion.max_splats is None:
             idle += [name for name in ("cameras", "data") if getattr(self, name) is not None]
@@ -215,31 +197,23 @@ class ConvertCommand(Command):
 
     def seen_by(self) -> list[Camera] | None:
         """The cameras of the options, in the world; None: each input may have its own."""
-        if self.data is not None:
-            dataset = load_dataset(self.data, missing=self.missing, origin=(0, 0, 0))
-            return [view.camera for view in dataset.train or dataset.views]
-        return None if self.cameras is None else load_cameras(self.cameras)
+        return cameras_named(self.cameras, self.data, self.missing)
 
     def alone(self, job: Job, path: Path) -> ConvertCommand:
         """The command that writes ``path`` of ``job`` alone."""
-        alone = replace(self, input=(job.source,), output=path, formats=())
-        if not takes(path, "alpha"):
-            alone = replace(alone, color_type="uint16", compression="none")
-            if self.alpha in GLB_ALPHA:
-                alone = replace(alone, alpha="auto", cutoff=None, nodes=None, quick=False)
-        return alone if takes(path, "lit") else replace(alone, lit=False, smooth=False)
+        return replace(self, input=(job.source,), output=path, formats=(), files=self.files.taken_by(path))
 
     def check_kind(self, job: Job) -> None:
         """UsageError for options that have no effect on the input of ``job``, which is to be a mesh."""
         kind = identify(job.source)
-        if kind == "splats" and self.alpha == "hybrid":
+        if kind == "splats" and self.files.alpha == "hybrid":
             raise UsageError(
                 f"{job.shown} holds splats: --alpha hybrid is for a mesh with solid triangles, as finetune"
                 " --opacity cutoff --soft-share makes"
             )
         if kind != "mesh":
             return
-        views = () if self.alpha == "ordered" else ("cameras", "data")
+        views = () if self.files.alpha == "ordered" else ("cameras", "data")
         idle = [name for name in (*views, "fidelity") if getattr(self, name) is not None]
         idle += ["preset"] if self.preset != "default" else []
         idle += [name for name, value in asdict(self.conversion).items() if value is not None]
@@ -253,7 +227,7 @@ class ConvertCommand(Command):
         return Product(
             preset=self.preset,
             conversion=self.conversion,
-            files=self._files,
+            files=self.files,
             up=optional_up(self.up),
             scale=self.scale,
             keeps_origin=self.origin == "keep",
@@ -264,20 +238,6 @@ class ConvertCommand(Command):
             collider=self.collider,
             scored_views=self.fidelity,
             look=self.look_of_result,
-        )
-
-    @property
-    def _files(self) -> MeshFileOptions:
-        """How meshes are saved."""
-        return MeshFileOptions(
-            self.alpha,
-            self.cutoff,
-            self.lit,
-            self.smooth,
-            self.color_type,
-            self.compression,
-            nodes=NODES if self.nodes is None else self.nodes,
-            quick=self.quick,
         )
 
     @property

@@ -31,7 +31,6 @@ from meshsplats.cli.common import (
 from meshsplats.cli.images import OrderOfBlending
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.cli.records import write_configuration
-from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
@@ -50,6 +49,7 @@ from meshsplats.evaluation.results import (
     save_report,
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names, score_table
+from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs
 from meshsplats.frames import view_names
 from meshsplats.gaussians import GaussianCloud
@@ -236,7 +236,7 @@ class Evaluate(Command):
                 threads=self.threads,
             )
             return Dataset((), views, "splats", self.look, splats.origin)
-        made = TargetOptions(look=self.look, sh_degree=self.sh_degree).make(
+        made = Targets(look=self.look, sh_degree=self.sh_degree).make(
             splats, self.splats, background, self.threads
         )
         return replace(made, train=())
@@ -324,21 +324,7 @@ class Evaluate(Command):
         return self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
 
     def _tuned_candidates(self, scene: GaussianCloud | SplatMesh, dataset: Dataset) -> Candidates:
-        from meshsplats.conversion import ConversionOptions
-        from meshsplats.finetuning import starting_mesh
-        from meshsplats.finetuning.initial import for_photographs
+        from meshsplats.finetuning.candidates import tuned_candidates
 
         assert self.tune is not None
-        if isinstance(scene, SplatMesh):
-            return Candidates(_tuned(scene, dataset, self.tune, self.threads), None, scene)
-        options = ConversionOptions()
-        if self.tune == "default":
-            options = for_photographs(options, scene, dataset.train, self.threads)
-        mesh = starting_mesh(scene, [view.camera for view in dataset.train], options, preset=self.tune)
-        return Candidates(_tuned(mesh, dataset, self.tune, self.threads), scene, mesh)
-
-
-def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) -> SplatMesh:
-    from meshsplats.finetuning import RunOptions, finetune, make_config
-
-    return finetune(mesh, dataset, make_config(preset), run=RunOptions(threads=threads, report_every=0))
+        return tuned_candidates(scene, dataset, self.tune, self.threads)

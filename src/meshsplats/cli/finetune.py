@@ -15,7 +15,7 @@ from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, again, check_mesh_suffix, load_scene, plural
-from meshsplats.cli.messages import UsageError, command_line
+from meshsplats.cli.messages import UsageError
 from meshsplats.cli.training import (
     Plan,
     Trained,
@@ -34,7 +34,6 @@ from meshsplats.finetuning.config import worthwhile_views, worthwhile_zooms
 from meshsplats.finetuning.initial import for_photographs, starts_with_filter
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
-from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -237,24 +236,17 @@ class Finetune(TrainingCommand):
         """The command that scores the result on held-out views, or one that renders it if there are none."""
         if config.order == "file":
             return ["web viewers and engines that cull back sides show this file; our own commands sort it"]
-        target, dataset, folder = self.target, plan.dataset, self.output.with_suffix("")
+        target, dataset = self.target, plan.dataset
         if self.conversion.crop is not None or (target.data is None and not dataset.test):
-            words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
-            return [f"next: {command_line(words)}"]
-        words = ["meshsplats", "evaluate", self.output]
+            return self.rendering_next()
+        words: list[object] = []
         if target.data is not None:
             words += again(target, "data", downscale=1, test_every=8, missing="few", masks="count")
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
             words += ["--look", dataset.look] if dataset.look != "area" else []
             words += ["--sh-degree", target.sh_degree] if target.sh_degree is not None else []
-        if plan.background is not None:
-            words += ["--background", plan.background.name]
-        elif config.background == "black":
-            words += ["--background", "black"]
-        words += ["--samples", samples_of(dataset.train[0], config)]
-        words += ["-o", f"{folder}-evaluation"]
-        return [f"next: {command_line(words)}"]
+        return self.evaluating_next(words, plan, config)
 
     def _zooms(self, config: FinetuneConfig, scene: GaussianCloud | SplatMesh) -> Sequence[int]:
         """Zooms of the training views of a ``scene`` of splats."""

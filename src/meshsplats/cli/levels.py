@@ -6,16 +6,16 @@ import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from meshsplats.chains import TABLE, ChainOptions, begin_folder, check_folder, make_chain, partial_folder
 from meshsplats.cli import option
-from meshsplats.cli.arguments import Command
+from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import SplatOptions, optional_up, placed, say_origin, size_of
 from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
@@ -23,10 +23,17 @@ from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, recorded_options
+from meshsplats.formats.outputs import CONFIGURATION, recorded_options
 from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words
+
+if TYPE_CHECKING:
+    ChainArguments = ChainOptions
+else:
+    ChainArguments = as_cli_options(
+        ChainOptions, "The meshes and their files.", without=("order", "up", "threads"), presets=False
+    )
 
 MINUTES = 2.0
 """Default length of the fine-tuning of a level."""
@@ -50,20 +57,7 @@ class Levels(Command):
     """Splat file, or the folder of a trained model."""
     output: option.Output
     """Folder for the meshes; it appears when all of them are done."""
-    levels: int = 4
-    """Number of meshes."""
-    factor: Literal[2, 4] = 4
-    """Splats of each level per splat of the next: 4, for half the size on the screen, or 2."""
-    width: int = 800
-    """Screen size of the finest level: side in pixels of images that just hold the subject."""
-    max_splats: option.Count = None
-    """Maximum number of splats of the finest level. Default: all."""
-    format: MeshEnding = "glb"
-    """File format of the meshes."""
-    alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
-    """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
-    not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
-    cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
+    chain: ChainArguments = field(default_factory=ChainArguments)
     no_tune: bool = False
     """Convert only: seconds in place of minutes."""
     minutes: option.Number = None
@@ -73,8 +67,6 @@ class Levels(Command):
     order: Literal["fragment", "splat"] = "fragment"
     """Order in which triangles are blended, tuned and scored: exact at every sample, or whole splats by their
     centres."""
-    sh_degree: option.Count = None
-    """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
     up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
     file, else -y."""
@@ -105,18 +97,7 @@ class Levels(Command):
             with progress_display() as show:
                 yield show
 
-        options = ChainOptions(
-            levels=self.levels,
-            factor=self.factor,
-            width=self.width,
-            max_splats=self.max_splats,
-            format=self.format,
-            alpha=self.alpha,
-            up=optional_up(self.up),
-            sh_degree=self.sh_degree,
-            order=self.order,
-            threads=self.threads,
-        )
+        options = replace(self.chain, order=self.order, up=optional_up(self.up), threads=self.threads)
         options.plan(len(cloud))  # before the folder is made
         self._begin()
         try:
@@ -144,18 +125,18 @@ class Levels(Command):
 
     def _configured(self) -> FinetuneConfig | None:
         """Configuration of the fine-tuning; UsageError for options that contradict each other."""
-        if self.levels < 1:
-            raise UsageError(f"--levels must be at least 1, got {self.levels}")
-        if self.max_splats is not None and self.max_splats < 1:
-            raise UsageError(f"--max-splats must be at least 1, got {self.max_splats}")
+        if self.chain.levels < 1:
+            raise UsageError(f"--levels must be at least 1, got {self.chain.levels}")
+        if self.chain.max_splats is not None and self.chain.max_splats < 1:
+            raise UsageError(f"--max-splats must be at least 1, got {self.chain.max_splats}")
         if self.no_tune and (self.minutes is not None or self.steps is not None):
             raise UsageError("--minutes and --steps have no effect with --no-tune")
         if self.minutes is not None and self.steps is not None:
             raise UsageError("give --minutes or --steps, not both")
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
-        if self.alpha not in ("auto", "opaque") and not takes(f"level.{self.format}", "alpha"):
-            raise UsageError(f"--alpha {self.alpha} is for .glb files, not .{self.format}")
+        if self.chain.alpha not in ("auto", "opaque") and not takes(f"level.{self.chain.format}", "alpha"):
+            raise UsageError(f"--alpha {self.chain.alpha} is for .glb files, not .{self.chain.format}")
         optional_up(self.up)
         if self.no_tune:
             return None
@@ -186,13 +167,13 @@ class Levels(Command):
         heads = (
             f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}"
         )
-        print(f"{heads}  alpha" if self.format == "glb" else heads)
+        print(f"{heads}  alpha" if self.chain.format == "glb" else heads)
         for row in rows:
             size = size_of(self.output / row["file"])
             print(
                 f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{size:>10}"
                 f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
-                + (f"  {row['alpha']['alpha']}" if self.format == "glb" and row["alpha"] else "")
+                + (f"  {row['alpha']['alpha']}" if self.chain.format == "glb" and row["alpha"] else "")
             )
         views = sorted({row["views"] for row in rows})
         count = " to ".join(map(str, (views[0], views[-1])[: len(views)]))

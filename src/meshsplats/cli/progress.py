@@ -18,8 +18,15 @@ if TYPE_CHECKING:
 @contextmanager
 def progress_display() -> Iterator[Display]:
     """Shows a run: as a bar where stderr is a terminal, else a line for each phase and score."""
+    with terminal_bar() as bar:
+        yield bar or _Lines()
+
+
+@contextmanager
+def terminal_bar() -> Iterator[InBar | None]:
+    """A bar on stderr for the length of the block; None where that is no terminal."""
     if not sys.stderr.isatty():
-        yield _Lines()
+        yield None
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn
@@ -28,31 +35,29 @@ def progress_display() -> Iterator[Display]:
     plain = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[text]}"))
     columns = (next(plain), BarColumn(), next(plain))
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        yield _InBar(bar)
+        yield InBar(bar)
 
 
-class _InBar:
+class InBar:
+    """A bar with the name of a phase before it and a text behind."""
+
     def __init__(self, bar: Bar) -> None:
         self._bar, self._task = bar, bar.add_task("", total=None, text="")
         self._loss: float | None = None
         self._phase = ""
 
-    def phase(self, text: str, share: float | None = None) -> None:
+    def phase(self, text: str, share: float | None = None, more: str = "") -> None:
         if text != self._phase:  # rich takes a total of None for no change, and a new task for a pulse
             self._phase = text
             self._bar.remove_task(self._task)
             self._task = self._bar.add_task(text, total=None, text="")
         if share is not None:
-            self._bar.update(self._task, total=1.0, completed=share)
+            self._bar.update(self._task, total=1.0, completed=share, text=more)
 
     def __call__(self, progress: Progress) -> None:
         if progress.loss is not None:  # smoothed: it differs from view to view
             self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
-        text = _text(progress, self._loss)
-        self.phase("fine-tuning")
-        self._bar.update(
-            self._task, description="fine-tuning", total=1.0, completed=progress.fraction, text=text
-        )
+        self.phase("fine-tuning", progress.fraction, _text(progress, self._loss))
 
 
 class _Lines:

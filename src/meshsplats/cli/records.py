@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats import _toml as toml
+from meshsplats._option_values import relative_to
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
 from meshsplats.cli.messages import shown_path
-from meshsplats.cli.values import relative_to
 from meshsplats.formats.outputs import recorded_options
 
 

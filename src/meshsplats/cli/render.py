@@ -29,7 +29,7 @@ from meshsplats.cli.common import (
     track,
 )
 from meshsplats.cli.images import EXCLUSIVE_VIEWS, DrawOptions, ViewOptions, announce_cost
-from meshsplats.cli.messages import UsageError
+from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.records import write_configuration
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import choose_background
@@ -115,9 +115,8 @@ class Render(Command):
         self._check_scene(scene)
         photographs = self.views.photographs(scene.origin)
         count = 1 if single else 60
-        cameras = self.views.make(
-            scene, self.input, count=count, side=800, photographs=photographs, film=not single
-        )
+        how: dict[str, Any] = {"photographs": photographs, "film": not single}
+        cameras = self.views.make(scene, self.input, count=count, side=800, say=say, **how)
         if tileset is None:
             places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
             if hidden := hiding_near_plane(cameras, places):

@@ -7,12 +7,10 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
-from meshsplats.camera import Camera
-from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cameras.files import cameras_beside
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
@@ -25,7 +23,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
-from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.scene_views import cameras_named
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
 from meshsplats.formats.sniff import identify
@@ -76,7 +74,9 @@ class Simplify(Command):
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; simplify needs a splat file or a model folder")
         cloud = self.reading.load(self.input)
-        cameras = self._cameras(cloud.origin)
+        cameras = cameras_named(self.cameras, self.data, self.missing, cloud.origin)
+        if cameras is None:
+            cameras = cameras_beside(self.input, cloud.origin)
         start = time.perf_counter()
         count = self.count if self.share is None else max(1, round(self.share * len(cloud)))
         assert count is not None
@@ -114,11 +114,3 @@ class Simplify(Command):
         if self.share is not None and not 0 < self.share <= 1:
             raise UsageError(f"--share must be above 0 and at most 1, got {self.share}")
         check_data(self.data, self.missing, self.cameras)
-
-    def _cameras(self, origin: np.ndarray) -> list[Camera] | None:
-        if self.data is not None:
-            dataset = load_dataset(self.data, missing=self.missing, origin=origin)
-            return [view.camera for view in dataset.train or dataset.views]
-        if self.cameras is not None:
-            return load_cameras(self.cameras, origin=origin)
-        return cameras_beside(self.input, origin)

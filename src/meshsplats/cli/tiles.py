@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,6 +14,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import ClusterOptions, SplatOptions, alpha_in_words, parse_up, say_origin
 from meshsplats.cli.messages import Terminated, UsageError, say
+from meshsplats.cli.progress import terminal_bar
 from meshsplats.cli.records import write_configuration
 from meshsplats.conversion import ConversionOptions
 from meshsplats.errors import ClusterError
@@ -92,7 +90,7 @@ class Tiles(Command):
         origin = None if isinstance(self.origin, str) else self.origin
         source = self.reading.stream(self.input, origin, up=self.up)
         try:
-            with self.cluster.workers(self.threads) as workers, _progress() as show:
+            with self.cluster.workers(self.threads) as workers, terminal_bar() as bar:
                 found = build_tiles(
                     source,
                     self.output,
@@ -101,7 +99,7 @@ class Tiles(Command):
                     replace_old=self.force,
                     threads=self.threads,
                     workers=workers,
-                    on_progress=show,
+                    on_progress=None if bar is None else lambda done, total: bar.phase("tiles", done / total),
                 )
         except (KeyboardInterrupt, Terminated, OSError, ClusterError):
             if (partial_folder(self.output) / JOURNAL).is_file():
@@ -148,17 +146,3 @@ class Tiles(Command):
         options = TileOptions(self.max_triangles, self.as_splats, *given)
         options.resolved()
         return options
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None] | None]:
-    """Shows progress on stderr, where that is a terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("tiles", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

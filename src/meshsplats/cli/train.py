@@ -12,7 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import again, check_mesh_suffix, check_splat_endings, placed, say_origin
-from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.training import Plan, Trained, TrainingCommand
 from meshsplats.datasets.image_files import Masks, Missing
@@ -23,7 +23,6 @@ from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
-from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.outputs import check_outputs
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.training.as_splats import FITTED_SHARE
@@ -168,15 +167,10 @@ class Train(TrainingCommand):
 
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
         """The command that scores the result on held-out views, or one that renders it if there are none."""
-        target, folder = self.target, self.output.with_suffix("")
         if not plan.dataset.test:
-            return [f"next: {command_line(['meshsplats', 'render', self.output, '-o', f'{folder}-images'])}"]
-        words: list[str | Path | int] = ["meshsplats", "evaluate", self.output, "--data", self.input]
-        words += again(target, downscale=1, test_every=8, missing="few", masks="count")
-        if plan.background is not None:
-            words += ["--background", plan.background.name]
-        words += ["--samples", samples_of(plan.dataset.train[0], config), "-o", f"{folder}-evaluation"]
-        return [f"next: {command_line(words)}"]
+            return self.rendering_next()
+        how = again(self.target, downscale=1, test_every=8, missing="few", masks="count")
+        return self.evaluating_next(["--data", self.input, *how], plan, config)
 
     def _dataset(self, config: TrainConfig) -> tuple[Dataset, Background]:
         from meshsplats.datasets.folder import load_dataset

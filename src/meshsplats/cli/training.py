@@ -18,7 +18,7 @@ from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.common import draw_preview, optional_color, plural, size_of, written
-from meshsplats.cli.messages import UsageError, say
+from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.cli.targets import TargetOptions
@@ -261,6 +261,22 @@ class TrainingCommand(Command):
         if len(lengths) > 1:
             raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
         return tuning | lengths
+
+    def rendering_next(self) -> list[str]:
+        """``next_steps``: the command that renders the result."""
+        return [f"next: {command_line(['meshsplats', 'render', self.output, '-o', self._beside('images')])}"]
+
+    def evaluating_next(self, words: Sequence[object], plan: Plan, config: FinetuneConfig) -> list[str]:
+        """``next_steps``: the command that scores the result on held-out views. ``words``: their options."""
+        words = ["meshsplats", "evaluate", self.output, *words]
+        if plan.background is not None or config.background == "black":
+            words += ["--background", "black" if plan.background is None else plan.background.name]
+        words += ["--samples", samples_of(plan.dataset.train[0], config)]
+        return [f"next: {command_line([*words, '-o', self._beside('evaluation')])}"]
+
+    def _beside(self, name: str) -> str:
+        """A folder for what is made of the result."""
+        return f"{self.output.with_suffix('')}-{name}"
 
     @property
     def _name(self) -> str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from meshsplats._options import Advanced
 from meshsplats.camera import Camera
 from meshsplats.conversion.normals import shading_normals
 from meshsplats.draw_order import DrawOrder
@@ -25,23 +26,36 @@ GLB_ALPHA = ("mask", "hybrid", "ordered")
 class MeshFileOptions:
     """How a mesh is saved, in one or several formats. What a format does not have does not count there."""
 
-    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid", "ordered"] = "auto"
-    """'auto': for a .glb, measured (``choose_alpha``); 'opaque': cut to solid triangles before; 'ordered': in
-    an order of blending for viewers that cull (``drawing_order``)."""
-    cutoff: float | None = None
-    """Least opacity that is drawn, of 'mask' and 'opaque'; None: ``CUTOFF``."""
     lit: bool = False
-    """.glb, .usd: a material that takes light."""
+    """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     smooth: bool = False
-    """Normals of the surface that the splats form."""
-    color_type: Literal["uint16", "float32"] = "uint16"
-    """.glb."""
+    """With ``lit``: normals of the surface that the splats form, in place of the triangles' own, which look
+    mottled under light."""
+    color_type: Annotated[Literal["uint16", "float32"], Advanced] = "uint16"
+    """.glb: storage of colours."""
+    alpha: Literal["auto", "blend", "mask", "opaque", "hybrid", "ordered"] = "auto"
+    """auto: for .glb, blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by
+    a few images of both; else blend. blend: the viewer blends true opacities; mask (.glb): it draws as solid
+    what has at least ``cutoff``; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
+    with soft_share: solid and blended triangles apart; ordered (.glb), for web viewers and engines alone:
+    every triangle twice, for either side, in an order of blending that suits views from all around."""
+    nodes: Annotated[int | Literal["auto"] | None, Advanced] = None
+    """``alpha`` ordered: parts that viewers sort, each a draw call; auto: few, if they do. Default: 8."""
+    quick: Annotated[bool, Advanced] = False
+    """``alpha`` ordered: an order by a formula, in a second, and several dB worse."""
+    cutoff: Annotated[float | None, Advanced] = None
+    """``alpha`` opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
     compression: Literal["none", "meshopt"] = "none"
-    """.glb."""
-    nodes: int | Literal["auto"] = NODES
-    """Of 'ordered'."""
-    quick: bool = False
-    """Of 'ordered': an order by a formula."""
+    """.glb: meshopt: a quarter to a third of the size, for viewers that can unpack it."""
+
+    def taken_by(self, path: Path) -> MeshFileOptions:
+        """Those that have an effect on the file ``path``; the others as by default."""
+        taken = self
+        if not takes(path, "alpha"):
+            taken = replace(taken, color_type="uint16", compression="none")
+            if self.alpha in GLB_ALPHA:
+                taken = replace(taken, alpha="auto", cutoff=None, nodes=None, quick=False)
+        return taken if takes(path, "lit") else replace(taken, lit=False, smooth=False)
 
     def prepared(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
         """``mesh`` cut and with normals, where that is asked for. ``cameras``: where it is seen from."""
@@ -62,7 +76,9 @@ class MeshFileOptions:
         """The order of blending of the .glb among ``paths``, where it is to have one."""
         if self.alpha != "ordered" or not any(takes(path, "alpha") for path in paths):
             return None
-        return drawing_order(mesh, cameras or None, nodes=self.nodes, quick=self.quick)
+        return drawing_order(
+            mesh, cameras or None, nodes=NODES if self.nodes is None else self.nodes, quick=self.quick
+        )
 
     def save(
         self,
