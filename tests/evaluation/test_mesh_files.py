@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from _splats import few_splats
@@ -45,9 +46,8 @@ def test_each_format_gets_what_it_has(tmp_path):
 
 
 def test_a_file_takes_what_its_format_has():
-    asked = MeshFileOptions(
-        lit=True, smooth=True, alpha="ordered", nodes=3, quick=True, compression="meshopt"
-    )
+    lit = MeshFileOptions(lit=True, smooth=True)
+    asked = replace(lit, alpha="ordered", nodes=3, quick=True, compression="meshopt")
     assert asked.taken_by(Path("a.glb")) == asked
     assert asked.taken_by(Path("a.usda")) == lit
     assert asked.taken_by(Path("a.npz")) == MeshFileOptions()
