@@ -38,7 +38,7 @@ from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh
-from meshsplats.images.writing import save_animation, save_array, save_image
+from meshsplats.images.writing import encode_array, save_animation, save_image
 from meshsplats.mesh import SplatMesh
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
@@ -94,7 +94,7 @@ def test_images_on_a_full_disk(small_disk):
     for name, save in [
         ("a.png", lambda path: save_image(path, image)),
         ("a.webp", lambda path: save_animation(path, frames)),
-        ("a.npy", lambda path: save_array(path, image)),
+        ("a.npy", lambda path: write_bytes(path, encode_array(image))),
     ]:
         with pytest.raises(OSError) as caught:
             save(small_disk / name)

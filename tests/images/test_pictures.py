@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 from PIL import Image, ImageFont
@@ -11,9 +13,9 @@ from meshsplats.images.writing import (
     CAPTION,
     GAP,
     amplified_error,
+    encode_array,
+    encode_depth_png,
     save_animation,
-    save_array,
-    save_depth_png,
     save_image,
     straight_rgba,
     strip,
@@ -79,18 +81,17 @@ def test_straight_alpha_composes_to_the_same_image():
     np.testing.assert_array_equal(rgba[..., 3], alpha)
 
 
-def test_depth_png(tmp_path):
+def test_depth_png():
     depth = np.array([[0, 1e-9, 2.5], [4.99, 5.0, 1e9]])
-    save_depth_png(tmp_path / "d.png", depth, 0.5)
-    with Image.open(tmp_path / "d.png") as image:
+    with Image.open(io.BytesIO(encode_depth_png(depth, 0.5))) as image:
         np.testing.assert_array_equal(np.asarray(image), [[0, 1, 5], [10, 10, 65535]])
     with pytest.raises(ValueError, match="unit"):
-        save_depth_png(tmp_path / "e.png", depth, 0)
+        encode_depth_png(depth, 0)
 
 
-def test_array(tmp_path):
-    save_array(tmp_path / "d.npy", np.eye(2))
-    np.testing.assert_array_equal(np.load(tmp_path / "d.npy", allow_pickle=False), np.eye(2))
+def test_array():
+    read = np.load(io.BytesIO(encode_array(np.eye(2))), allow_pickle=False)
+    np.testing.assert_array_equal(read, np.eye(2))
 
 
 def moving_square(count: int = 6, side: int = 24, channels: int = 3) -> list[np.ndarray]:

@@ -86,16 +86,11 @@ def encode_image(path: str | os.PathLike[str], image: np.ndarray) -> bytes:
     return _encoded(Image.fromarray(to_bytes(image)), **encoder)
 
 
-def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float) -> None:
-    """Writes ``depth`` (h, w) as 16-bit grey PNG: ``round(depth / unit)``, at most 65535; 0 means empty.
+def encode_depth_png(depth: np.ndarray, unit: float) -> bytes:
+    """A file with ``depth`` (h, w) as 16-bit grey PNG: ``round(depth / unit)``, at most 65535; 0 means empty.
 
     ``unit`` is the depth of one step in scene units, > 0; a reader needs it to get depths back.
     """
-    write_bytes(path, encode_depth_png(depth, unit))
-
-
-def encode_depth_png(depth: np.ndarray, unit: float) -> bytes:
-    """The content of the file that ``save_depth_png`` writes."""
     from PIL import Image
 
     if not (np.isfinite(unit) and unit > 0):
@@ -106,13 +101,8 @@ def encode_depth_png(depth: np.ndarray, unit: float) -> bytes:
     return _encoded(Image.fromarray(steps), format="PNG")
 
 
-def save_array(path: str | os.PathLike[str], array: np.ndarray) -> None:
-    """Writes ``array`` as .npy; replaces an older file."""
-    write_bytes(path, encode_array(array))
-
-
 def encode_array(array: np.ndarray) -> bytes:
-    """The content of the file that ``save_array`` writes."""
+    """A .npy file with ``array``."""
     encoded = io.BytesIO()  # as in _encoded: to a file, NumPy reports only how many numbers did not fit
     np.save(encoded, array, allow_pickle=False)
     return encoded.getvalue()
