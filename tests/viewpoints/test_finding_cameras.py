@@ -102,20 +102,13 @@ def test_views_of_a_room_look_in_several_directions_from_the_start(found):
 
 
 @pytest.mark.slow
-def test_threads_do_not_change_a_bit(found):
-    again = find_cameras(room(), COUNT, threads=1)
-    for a, b in zip(found.cameras, again.cameras, strict=True):
-        assert np.array_equal(a.world_to_camera, b.world_to_camera)
-        assert (a.fx, a.near) == (b.fx, b.near)
-    assert np.array_equal(found.up, again.up)
-    assert found.ground == again.ground
-
-
-@pytest.mark.slow
-def test_fewer_views_are_the_first_of_more(found):
-    fewer = find_cameras(room(), 5, threads=2)
+def test_fewer_views_by_one_thread_are_the_first_of_more_to_the_bit(found):
+    fewer = find_cameras(room(), 5, threads=1)
     for a, b in zip(fewer.cameras, found.cameras[:5], strict=True):
         assert np.array_equal(a.world_to_camera, b.world_to_camera)
+        assert (a.fx, a.near) == (b.fx, b.near)
+    assert np.array_equal(found.up, fewer.up)
+    assert found.ground == fewer.ground
 
 
 @pytest.mark.slow
@@ -236,7 +229,7 @@ def test_what_is_kept_of_many_splats_is_no_more_than_views_need(monkeypatch):
 
 @pytest.mark.slow
 def test_targets_of_a_room_are_its_inside():
-    auto = splat_dataset(room(), train=4, test=2, width=32, threads=2)
+    auto = splat_dataset(room(4000, 1500), train=4, test=2, width=32, threads=2)
     for view in (*auto.train, *auto.test):
         assert (np.abs(view.camera.center) < HALF).all()
     dome = splat_dataset(room(), train=4, test=2, width=32, placement="object")
@@ -246,8 +239,16 @@ def test_targets_of_a_room_are_its_inside():
 
 
 @pytest.mark.slow
-def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys):
+def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys, monkeypatch):
     pytest.importorskip("PIL")
+    searches = []
+
+    def once(*arguments, **options):  # as a search takes seconds
+        if not searches:
+            searches.append(find_cameras(*arguments, **options))
+        return searches[0]
+
+    monkeypatch.setattr("meshsplats.cli.cameras.find_cameras", once)
     save_gaussians(room(4000, 600), tmp_path / "room.ply")
     out = tmp_path / "cameras.json"
     options = ["--count", "3", "--width", "64", "--height", "48", "--threads", "2"]
