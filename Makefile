@@ -54,7 +54,7 @@ CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help dawn node-packages demo fuzz fuzz-core test test-slow test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
+.PHONY: help dawn node-packages environments demo fuzz fuzz-core test test-slow test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
 	test-memory test-threads test-windows test-arm64 wheels release docs lint format clean
 .DEFAULT_GOAL := help
 
@@ -166,6 +166,9 @@ $(BLENDER_VENV)/%/installed: build/wheel/made
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install mitsuba $(blender_numpy) \
 	  || echo 'Mitsuba cannot be installed here: the test that compares it with Cycles is skipped'
 	@touch $@
+
+# All that the sanitizers, the lowest versions and Blender need, which takes long, but no more than one processor.
+environments: $(SANITIZED)/address.so $(SANITIZED)/thread.so $(LOWEST_VENV)/installed $(BPY:%=$(BLENDER_VENV)/%/installed)
 
 # Slow tests run in the newest of the versions alone.
 BLENDER_TESTS := $(BPY:%=test-blender-%)
