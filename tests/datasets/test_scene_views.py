@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,8 +58,14 @@ def test_views_of_a_file_are_relative_to_the_scene_and_scaled(tmp_path):
     found = made(tmp_path, far, cameras=tmp_path / "c.json", width=32)
     assert np.allclose(centres(found), centres(cameras) - [10, 0, 0], atol=1e-5)
     assert {c.width for c in found} == {32}
-    assert not SceneViews(cameras=tmp_path / "c.json").moving
+
+
+def test_only_views_that_follow_each_other_make_a_turntable():
+    still = {"cameras": Path("c.json"), "data": Path("photographs"), "dome": 5}
+    assert not any(SceneViews(**{name: value}).moving for name, value in still.items())
+    assert SceneViews().moving
     assert SceneViews(orbit=3).moving
+    assert SceneViews(look_around=3).moving
 
 
 def test_views_of_photographs_are_those_held_out_and_training_views_those_named(tmp_path):
