@@ -144,8 +144,7 @@ def spelled(command: type, name: str) -> str:
 
 
 def as_cli_options(
-    options: type[T],
-    about: str,
+    about: str | None = None,
     *,
     without: Collection[str] = (),
     metavars: Mapping[str, str] = types.MappingProxyType({}),
@@ -153,13 +152,12 @@ def as_cli_options(
     flags: bool = False,
     presets: bool = True,
     checked: bool = True,
-) -> type[T]:
-    """A library's dataclass of options as a group of the command line. Help, placeholders and whether an
-    option has a flag follow from its fields (``_options.settings``).
+) -> Callable[[type[T]], type[T]]:
+    """Makes of a class whose base is a library's dataclass of options a group of the command line. Help,
+    placeholders and whether an option has a flag follow from the fields (``_options.settings``).
 
     Args:
-        options: the dataclass.
-        about: description of the group.
+        about: description of the group; by default the docstring of the class.
         without: names of options that the command lacks, beside those that cannot be changed.
         metavars: placeholders for values; by default the choices, the range, N or X.
         defaults: the end of an option's help, by its name.
@@ -168,24 +166,29 @@ def as_cli_options(
             library.
         checked: whether values are checked at once, by ``__post_init__``.
     """
-    known = reachable(options)
-    parts: list[tuple[str, Any, Any]] = []
-    hints = get_type_hints(options)
-    for name, setting in settings(options).items():
-        start: Any = None if presets else setting.default
-        hint: Any = hints[name] | None if presets else hints[name]
-        if name in without or name not in known:
-            hint = tyro.conf.Suppress[object]
-        elif setting.advanced:
-            hint = Annotated[hint, tyro.conf.Fixed]
-        elif bool in setting.kinds and flags:
-            hint, start = bool, False
-        elif presets or setting.optional:
-            metavar = metavars.get(name) or _placeholder(setting)
-            hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
-        parts.append((name, hint, start))
-    namespace = {"__doc__": about} | ({} if checked else {"__post_init__": lambda self: None})
-    return make_dataclass(options.__name__, parts, bases=(options,), namespace=namespace, frozen=True)
+
+    def made(group: type[T]) -> type[T]:
+        parts: list[tuple[str, Any, Any]] = []
+        known, hints = reachable(group), get_type_hints(group)
+        for name, setting in settings(group).items():
+            start: Any = None if presets else setting.default
+            hint: Any = hints[name] | None if presets else hints[name]
+            if name in without or name not in known:
+                hint = tyro.conf.Suppress[object]
+            elif setting.advanced:
+                hint = Annotated[hint, tyro.conf.Fixed]
+            elif bool in setting.kinds and flags:
+                hint, start = bool, False
+            elif presets or setting.optional:
+                metavar = metavars.get(name) or _placeholder(setting)
+                hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
+            parts.append((name, hint, start))
+        names: dict[str, Any] = {"__doc__": about or group.__doc__, "__module__": group.__module__}
+        if not checked:
+            names["__post_init__"] = lambda self: None
+        return make_dataclass(group.__name__, parts, bases=(group,), namespace=names, frozen=True)
+
+    return made
 
 
 def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:

@@ -56,16 +56,9 @@ def _default_light(name: str) -> str:
     return "" if name == "hdri" else f"(default: {_listed(getattr(LightOptions, name))})"
 
 
-if TYPE_CHECKING:
-    LightArguments = LightOptions
-else:
-    LightArguments = as_cli_options(
-        LightOptions,
-        "Light and surroundings of lit images. Lengths are relative to the subject. Defaults: --lights sun.",
-        metavars={"sun": "AZIMUTH ELEVATION", "hdri": "FILE"},
-        defaults=_default_light,
-        flags=True,
-    )
+@as_cli_options(metavars={"sun": "AZIMUTH ELEVATION", "hdri": "FILE"}, defaults=_default_light, flags=True)
+class LightArguments(LightOptions):
+    """Light and surroundings of lit images. Lengths are relative to the subject. Defaults: --lights sun."""
 
 
 @dataclass(frozen=True)

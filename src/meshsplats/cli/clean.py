@@ -7,7 +7,6 @@ import time
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
@@ -30,16 +29,14 @@ from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-if TYPE_CHECKING:
-    RuleOptions = CleaningRules
-else:
-    RuleOptions = as_cli_options(
-        CleaningRules,
-        "Rules: splats with any of these properties are removed."
-        f" Default: --max-size {FLOATERS.max_size:g} --sparse {FLOATERS.sparse}"
-        f" --min-part {FLOATERS.min_part}.",
-        metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
-    )
+
+@as_cli_options(
+    "Rules: splats with any of these properties are removed."
+    f" Default: --max-size {FLOATERS.max_size:g} --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+    metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
+)
+class RuleOptions(CleaningRules):
+    pass
 
 
 @dataclass(frozen=True)

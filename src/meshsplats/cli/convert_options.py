@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -38,17 +38,14 @@ _FOR_SPLATS = (
 """Options of the command that have one."""
 
 
-if TYPE_CHECKING:
-    ConvertOptions = ConversionOptions
-    FileOptions = MeshFileOptions
-else:
-    FileOptions = as_cli_options(MeshFileOptions, "How meshes are saved.", presets=False)
-    ConvertOptions = as_cli_options(
-        ConversionOptions,
-        "In parentheses: the values of the presets.",
-        metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
-        defaults=of_presets(PRESETS),
-    )
+@as_cli_options(presets=False)
+class FileOptions(MeshFileOptions):
+    """How meshes are saved."""
+
+
+@as_cli_options(metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"}, defaults=of_presets(PRESETS))
+class ConvertOptions(ConversionOptions):
+    """In parentheses: the values of the presets."""
 
 
 @dataclass(frozen=True)

@@ -41,14 +41,10 @@ from meshsplats.mesh import SplatMesh
 if TYPE_CHECKING:
     from meshsplats.finetuning.cells import CellScene
 
-    StartOptions = ConversionOptions
-else:
-    StartOptions = as_cli_options(
-        ConversionOptions,
-        "The mesh at the start.",
-        without=("look",),  # that of the targets
-        metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
-    )
+
+@as_cli_options(without=("look",), metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"})
+class StartOptions(ConversionOptions):  # with the look of the targets
+    """The mesh at the start."""
 
 
 @dataclass(frozen=True)

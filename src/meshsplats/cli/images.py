@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -28,19 +28,10 @@ LONG_SECONDS = 10
 """Images that take longer than this, as far as can be estimated, are announced."""
 
 
-if TYPE_CHECKING:
-    Views = SceneViews
-else:
-    Views = as_cli_options(
-        SceneViews,
-        "",
-        metavars={"cameras": "FILE", "data": "FOLDER", "look_at": "X Y Z", "up": "TEXT"},
-        presets=False,
-    )
-
-
-@dataclass(frozen=True)
-class ViewOptions(Views):
+@as_cli_options(
+    metavars={"cameras": "FILE", "data": "FOLDER", "look_at": "X Y Z", "up": "TEXT"}, presets=False
+)
+class ViewOptions(SceneViews):
     """Cameras and image size. Orbit, dome, look-around, cameras and data exclude each other."""
 
     def check(self) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -28,17 +28,15 @@ from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words
 
-if TYPE_CHECKING:
-    ChainArguments = ChainOptions
-else:
-    ChainArguments = as_cli_options(
-        ChainOptions, "The meshes and their files.", without=("order", "up", "threads"), presets=False
-    )
-
 MINUTES = 2.0
 """Default length of the fine-tuning of a level."""
 _CHANGEABLE = ("output", "threads")
 """Options that may change when a chain is resumed."""
+
+
+@as_cli_options(without=("order", "up", "threads"), presets=False)
+class ChainArguments(ChainOptions):
+    """The meshes and their files."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -31,14 +31,11 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.prior import bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS
 
-if TYPE_CHECKING:
-    PriorTuningOptions = FinetuneConfig
-else:
-    PriorTuningOptions = tuning_options(
-        "The optimisation.",
-        lambda name: f"(default: {getattr(prior_config(), name)})",
-        without=("order",),  # layers on a base share a depth, which only the order of fragments knows
-    )
+
+# Layers on a base share a depth, which only the order of fragments knows.
+@tuning_options(lambda name: f"(default: {getattr(prior_config(), name)})", without=("order",))
+class PriorTuningOptions(FinetuneConfig):
+    """The optimisation."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +80,7 @@ class Prior(TrainingCommand):
     splats: option.File = None
     """Splats whose images are the targets, in place of --data: a file or a model folder."""
     laying: LayOptions = field(default_factory=LayOptions)
-    tuning: PriorTuningOptions = field(default_factory=PriorTuningOptions)
+    tuning: PriorTuningOptions = field(default_factory=PriorTuningOptions)  # type: ignore[assignment]
     reading: SplatOptions = field(default_factory=SplatOptions)
 
     @property

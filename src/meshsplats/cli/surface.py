@@ -6,7 +6,7 @@ import json
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -23,14 +23,10 @@ from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_out
 from meshsplats.mesh import SplatMesh
 from meshsplats.surfaces.options import SurfaceOptions, level_options
 
-if TYPE_CHECKING:
-    Options = SurfaceOptions
-else:
-    Options = as_cli_options(
-        SurfaceOptions,
-        "What is made, and how.",
-        defaults=lambda name: f"(default: {getattr(SurfaceOptions(), name)})",
-    )
+
+@as_cli_options(defaults=lambda name: f"(default: {getattr(SurfaceOptions(), name)})")
+class Options(SurfaceOptions):
+    """What is made, and how."""
 
 
 Collider = Annotated[

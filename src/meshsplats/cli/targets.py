@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from meshsplats._options import changed
 from meshsplats.cli.arguments import as_cli_options, spelled
@@ -14,16 +13,9 @@ from meshsplats.finetuning.targets import PLACING, Targets
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-if TYPE_CHECKING:
-    TargetArguments = Targets
-else:
-    TargetArguments = as_cli_options(
-        Targets, "", metavars={"data": "FOLDER", "cameras": "FILE", "up": "TEXT"}, presets=False
-    )
 
-
-@dataclass(frozen=True)
-class TargetOptions(TargetArguments):
+@as_cli_options(metavars={"data": "FOLDER", "cameras": "FILE", "up": "TEXT"}, presets=False)
+class TargetOptions(Targets):
     """Targets: photographs (--data), else images of the splats."""
 
     def check(self) -> None:

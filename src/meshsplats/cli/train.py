@@ -10,11 +10,10 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cli import option
-from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import again, check_mesh_suffix, check_splat_endings, placed, say_origin
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.progress import progress_display
-from meshsplats.cli.training import Plan, Trained, TrainingCommand
+from meshsplats.cli.training import Plan, Trained, TrainingCommand, tuning_options
 from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import BLACK, Background
@@ -32,15 +31,10 @@ from meshsplats.training.run import SO_FAR, check_training_memory, train
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    GrowingOptions = TrainConfig
-else:
-    GrowingOptions = as_cli_options(
-        TrainConfig,
-        "The optimisation, and the growth of the set of fans.",
-        without=("preset", *LENGTHS),
-        defaults=lambda name: f"(default: {getattr(TrainConfig, name)})",
-        checked=False,
-    )
+
+@tuning_options(lambda name: f"(default: {getattr(TrainConfig, name)})")
+class GrowingOptions(TrainConfig):
+    """The optimisation, and the growth of the set of fans."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +86,7 @@ class Train(TrainingCommand):
     as_splats: option.File = None
     """Also write splats to this file, .ply, .spz or .sog, for their viewers: a fifth of the time."""
     target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
-    tuning: GrowingOptions = field(default_factory=GrowingOptions)
+    tuning: GrowingOptions = field(default_factory=GrowingOptions)  # type: ignore[assignment]
 
     @property
     def has_photographs(self) -> bool:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
@@ -39,6 +39,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
 
+Config = TypeVar("Config", bound=FinetuneConfig)
 STARTUP_SECONDS = 1.0
 """Time that Python and the libraries take before the command's own clock starts."""
 _CHANGEABLE = {
@@ -48,22 +49,21 @@ _CHANGEABLE = {
 """Options that may change when a run is resumed."""
 
 
-def tuning_options(
-    about: str, default_of: Callable[[str], str], without: Sequence[str] = ()
-) -> type[FinetuneConfig]:
-    """The configuration of an optimisation as command-line options. ``about``: their description;
-    ``default_of``: the end of an option's help; ``without``: options that it does not have."""
-    return as_cli_options(
-        FinetuneConfig, about, without=("preset", *LENGTHS, *without), defaults=default_of, checked=False
-    )
-
-
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    TuningOptions = FinetuneConfig
-else:
-    TuningOptions = tuning_options("In parentheses: the values of the presets.", of_presets(PRESETS))
+
+def tuning_options(
+    default_of: Callable[[str], str], without: Sequence[str] = ()
+) -> Callable[[type[Config]], type[Config]]:
+    """``as_cli_options`` for the configuration of an optimisation. ``default_of``: the end of an option's
+    help; ``without``: options that the command lacks."""
+    return as_cli_options(without=("preset", *LENGTHS, *without), defaults=default_of, checked=False)
+
+
+@tuning_options(of_presets(PRESETS))
+class TuningOptions(FinetuneConfig):
+    """In parentheses: the values of the presets."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from meshsplats._options import Advanced
 from meshsplats.camera import Camera
@@ -17,6 +17,9 @@ from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.ordering import NODES, drawing_order
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 GLB_ALPHA = ("mask", "hybrid", "ordered")
 """Values of ``alpha`` that only .glb files have."""
@@ -48,7 +51,7 @@ class MeshFileOptions:
     compression: Literal["none", "meshopt"] = "none"
     """.glb: meshopt: a quarter to a third of the size, for viewers that can unpack it."""
 
-    def taken_by(self, path: Path) -> MeshFileOptions:
+    def taken_by(self, path: Path) -> Self:
         """Those that have an effect on the file ``path``; the others as by default."""
         taken = self
         if not takes(path, "alpha"):

@@ -16,7 +16,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -217,7 +217,7 @@ def _begin(
 ) -> None:
     """Notes what the run is about, or refuses to resume another one."""
     assert run.folder is not None
-    chosen = options.conversion or ConversionOptions()
+    chosen = ConversionOptions(**asdict(options.conversion or ConversionOptions()))  # not a subclass
     facts: dict[str, Any] = {
         "configuration": config.to_dict(),
         "cell_splats": options.splats,
