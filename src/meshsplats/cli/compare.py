@@ -13,7 +13,7 @@ import tyro
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import PartOptions, SplatOptions, optional_color, parse_color, print_table, track
+from meshsplats.cli.common import PartOptions, SplatOptions, optional_color, print_table, track
 from meshsplats.cli.images import EXCLUSIVE_VIEWS, DrawOptions, ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration, write_json
@@ -67,8 +67,7 @@ class Compare(Command):
 
         if not self.amplify > 0:
             raise ValueError(f"--amplify must be positive, got {self.amplify}")
-        if self.draw.background is not None:
-            parse_color(self.draw.background)
+        optional_color(self.draw.background)
         self.views.check()
         self.draw.check_device()
         cloud = self.part.of(self.reading.load(self.splats))

@@ -170,8 +170,7 @@ class Evaluate(Command):
         print(f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/")
 
     def _check(self) -> None:
-        if self.background is not None:
-            parse_color(self.background)
+        optional_color(self.background)
         if self.amplify <= 0 or self.strips < 0:
             raise ValueError("--amplify must be positive and --strips >= 0")
         if self.protocol is not None:

@@ -23,7 +23,6 @@ from meshsplats.cli.common import (
     load_scene,
     open_tileset,
     optional_color,
-    parse_color,
     plural,
     size_of,
     track,
@@ -203,8 +202,7 @@ class Render(Command):
         from meshsplats.mesh import checked_cutoff
 
         self.views.check()
-        if self.draw.background is not None:
-            parse_color(self.draw.background)
+        optional_color(self.draw.background)
         if not single and self.output.suffix:
             raise UsageError(f"-o must end in .png for one image, or name a folder, got {self.output.name!r}")
         if self.transparent and self.draw.background is not None:

@@ -23,7 +23,6 @@ from meshsplats.cli.common import (
     load_scene,
     optional_color,
     optional_up,
-    parse_color,
     size_of,
 )
 from meshsplats.cli.images import views_of_a_place
@@ -129,8 +128,7 @@ class View(Command):
                 f"--max-triangles must be from 8, one splat's, to {content.MOST_TRIANGLES:,},"
                 f" got {self.max_triangles}"
             )
-        if self.background is not None:
-            parse_color(self.background)
+        optional_color(self.background)
         optional_up(self.up)
 
     def _scene(self) -> GaussianCloud | SplatMesh | BaseMesh:
