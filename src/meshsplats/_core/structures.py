@@ -368,6 +368,21 @@ class FillingStruct(CoreStruct):
     ]
 
 
+class ResamplingStruct(CoreStruct):
+    _fields_ = [
+        ("points", c_void_p),
+        ("bytes", c_void_p),
+        ("values", c_void_p),
+        ("result", c_void_p),
+        ("count", c_int64),
+        ("height", c_int32),
+        ("width", c_int32),
+        ("channels", c_int32),
+        ("wraps", c_int32),
+        ("threads", c_int32),
+    ]
+
+
 class CarvingStruct(CoreStruct):
     _fields_ = [
         ("views", ViewsStruct),
