@@ -294,9 +294,9 @@ class Pinhole:
 
 @lru_cache(maxsize=64)
 def pinholes(lens: Lens) -> tuple[Pinhole, ...]:
-    """The pinhole images made of one image, the same objects for the same lens: one with the lens's own focal
-    lengths, principal point and size; of an equirectangular panorama the six sides of a cube, a quarter of its
-    width each."""
+    """The pinhole images made of one image, the same objects for the same lens: one with the lens's own
+    focal lengths, principal point and size; of an equirectangular panorama the six sides of a cube, a quarter
+    of its width each."""
     if lens.model != "EQUIRECTANGULAR":
         return (Pinhole(np.eye(3), lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height),)
     side = max(1, round(lens.width / 4))
