@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._core.layout import check_layout
 from meshsplats._core.structures import (
     CameraStruct,
     ImageGradientsStruct,
@@ -19,7 +20,6 @@ from meshsplats._core.structures import (
     OptionsStruct,
     SplatsStruct,
     VertexGradientsStruct,
-    check_layout,
 )
 
 VARIANTS = ("v4", "v3", "baseline")
