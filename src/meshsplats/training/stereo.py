@@ -264,8 +264,9 @@ def between(
     threads: int | None = None,
 ) -> np.ndarray:
     """(pixels,) float32 inverse depths where ``planes`` has none, on walls without texture, say: continued
-    from the pixels around, where those of other views agree and none sees past them. What one view alone has
-    in its image, as the background of a subject that the views go around, has no other depth either."""
+    from the pixels around, where those of other views agree and none sees past them. What the others do not
+    have in their images, or hidden by known depths, has no other depth either: parts of the background of a
+    subject that the views go around."""
     sure = planes.inverse
     seeds = np.zeros(views.pixels, bool)
     for i in range(len(views)):
