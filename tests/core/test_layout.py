@@ -5,9 +5,11 @@ from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
 
 import pytest
 
+from meshsplats._core import layout as core_layout
 from meshsplats._core import structures
+from meshsplats._core.layout import check_layout, layout
 from meshsplats._core.library import available_variants, load_core
-from meshsplats._core.structures import CoreStruct, check_layout, layout
+from meshsplats._core.structures import CoreStruct
 
 
 def test_every_structure_of_the_baseline_core_is_mirrored():
@@ -52,6 +54,6 @@ FANS = structures.FansStruct._fields_
 def test_a_structure_that_differs_is_refused_by_name(monkeypatch, fields, named):
     other = type("FansStruct", (ctypes.Structure,), {"_fields_": fields})
     stand_ins = [other if s is structures.FansStruct else s for s in CoreStruct.__subclasses__()]
-    monkeypatch.setattr(structures, "CoreStruct", type("", (), {"__subclasses__": lambda: stand_ins}))
+    monkeypatch.setattr(core_layout, "CoreStruct", type("", (), {"__subclasses__": lambda: stand_ins}))
     with pytest.raises(ImportError, match=f"differ in {named}: install"):
         check_layout(load_core())

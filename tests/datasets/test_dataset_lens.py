@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from _datasets import pinhole_rays, sky
 
+from meshsplats._core.resampling import resample
 from meshsplats.datasets.lens import MODELS, Lens, pinholes, undistort
 
 # Where pycolmap 4.2.1 puts the point (0.6, -0.4, 1.6) on an image of 640 x 480.
@@ -186,6 +187,30 @@ def test_bytes_are_rounded_not_cut():
     error = whole - exact
     assert abs(error.mean()) < 0.02
     assert np.abs(error).max() < 1.01
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_values_between_pixels_by_hand(kind):
+    image = np.array([[[0, 40], [100, 80]], [[200, 0], [60, 8]]], kind)
+    points = np.array(
+        [[0, 0], [1, 0], [0.25, 0], [0.5, 0.5], [1, 1], [-0.5, 2], [np.nan, 0], [1.75, 0], [2, 1]], np.float32
+    )
+    want = [(0, 40), (100, 80), (25, 50), (90, 32), (60, 8), (200, 0), (0, 0), (100, 80), (60, 8)]
+    np.testing.assert_array_equal(resample(image, points), np.array(want, kind))
+    want[-2:] = (25, 50), (200, 0)  # the first column follows the last one
+    np.testing.assert_array_equal(resample(image, points, wraps=True, threads=2), np.array(want, kind))
+
+
+def test_a_lens_is_worked_out_once_for_all_its_photographs(monkeypatch):
+    asked = []
+    pixels = Lens.pixels
+    monkeypatch.setattr(Lens, "pixels", lambda lens, rays: asked.append(1) or pixels(lens, rays))
+    lenses = [Lens("SIMPLE_RADIAL", 90, 90, 80, 60, 160, 120, (k,)) for k in (0.1, 0.1, 0.1, 0.2)]
+    photo = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
+    images = [undistort(photo, lens, pinholes(lens)[0])[0] for lens in lenses]
+    assert len(asked) == 2
+    np.testing.assert_array_equal(images[0], images[2])
+    assert (images[0] != images[3]).any()
 
 
 def test_six_sides_of_a_panorama():

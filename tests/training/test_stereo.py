@@ -41,7 +41,7 @@ from meshsplats.rendering.core_arguments import camera_struct
 from meshsplats.training import stereo
 from meshsplats.training.initial import ranges_of_cameras
 from meshsplats.training.patches import fused
-from meshsplats.training.stereo import Depths, confirmed, find_depths, suited_views
+from meshsplats.training.stereo import Depths, between, confirmed, find_depths, suited_views
 
 FLAT, SLANTED = ((0, 0, 1), 3.0), ((0.6, -0.2, 0.8), 2.4)
 
@@ -185,6 +185,24 @@ def test_a_plain_wall_is_filled_from_its_frame():
     error = np.abs(filled - truth)[filled > 0] / truth[filled > 0]
     assert np.median(error) < 0.03
     assert not ((filled > 0) & (depths.layout.image(depths.sure, 4) > 0)).any()
+
+
+def test_what_one_view_alone_shows_continues_its_surroundings():
+    """One column of a wall is known in the left of two views, nothing in the right one: what that has in its
+    image, too, should have been matched."""
+    left, right = camera_at((0, 0, 0)), camera_at((0.8, 0, 0))
+    layout = layout_of([view_of(camera, *FLAT) for camera in (left, right)])
+    truth = inverse_of_plane(left, *FLAT)
+    inverse, slopes = (np.zeros(layout.pixels, np.float32) for _ in range(2))
+    layout.image(inverse, 0)[:, 20:24] = truth[:, 20:24]
+    color, counted = np.full((layout.pixels, 3), 128, np.uint8), np.ones(layout.pixels, bool)
+    judges = np.array([[1], [0]], np.int32)
+    filled = between(layout, color, Planes(inverse, slopes, slopes, slopes), counted, judges)
+    shared = right.in_image(right.project((left.center + 3 * rays(left)).reshape(-1, 3))[0])
+    lone = ~shared.reshape(truth.shape)
+    lone[:, 20:24] = False
+    assert 0.1 < lone.mean() < 0.9
+    np.testing.assert_array_equal(layout.image(filled, 0), np.where(lone, truth, 0).astype(np.float32))
 
 
 def test_patches_are_small_where_there_is_texture():

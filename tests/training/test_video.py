@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -163,6 +164,16 @@ def test_a_video_that_is_cut_off_gives_the_frames_before(tmp_path):
     cut.write_bytes(whole[: len(whole) // 2])
     frames = look_at_frames(cut)
     assert 10 < len(frames.sharpness) < 40
+
+
+def test_the_look_at_a_video_says_how_far_it_has_come(tmp_path, monkeypatch):
+    clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(30)]))
+    clock = iter(range(0, 1000, 4))  # four seconds for a frame
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(module, "SAID_EVERY", 60)
+    said: list[str] = []
+    look_at_frames(clip, said.append)
+    assert said[0] == "looking at the frames of walk.mp4: 15 so far, to 0:01"
 
 
 def test_a_video_that_breaks_off_says_where(tmp_path, monkeypatch):

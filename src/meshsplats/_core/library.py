@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._core.layout import check_layout
 from meshsplats._core.structures import (
     CameraStruct,
     ImageGradientsStruct,
@@ -19,7 +20,6 @@ from meshsplats._core.structures import (
     OptionsStruct,
     SplatsStruct,
     VertexGradientsStruct,
-    check_layout,
 )
 
 VARIANTS = ("v4", "v3", "baseline")
@@ -28,7 +28,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 14
+INTERFACE_VERSION = 15
 
 
 def pointer(array: np.ndarray | None) -> int | None:

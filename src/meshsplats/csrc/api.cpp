@@ -17,6 +17,7 @@
 #include "listing.h"
 #include "merging.h"
 #include "ordering.h"
+#include "resampling.h"
 #include "texture.h"
 #include "tsdf.h"
 #include "viewer.h"
@@ -251,7 +252,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 14; }
+MS_EXPORT int ms_interface_version() { return 15; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -391,6 +392,10 @@ MS_EXPORT int ms_fill_depths(const MsFilling *filling, char *message, int messag
 
 MS_EXPORT int ms_count_views(const MsCarving *carving, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::count_views(*carving); });
+}
+
+MS_EXPORT int ms_resample(const MsResampling *resampling, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::resample(*resampling); });
 }
 
 MS_EXPORT int ms_fuse_points(MsFusion *fusion, char *message, int message_size) {

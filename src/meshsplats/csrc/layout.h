@@ -13,6 +13,7 @@
 #include "listing.h"
 #include "merging.h"
 #include "ordering.h"
+#include "resampling.h"
 #include "texture.h"
 #include "tsdf.h"
 #include "viewer.h"
@@ -340,6 +341,17 @@ constexpr MsField FIELDS[] = {
     MS_FIELD(MsFusion, threads),
     MS_FIELD(MsFusion, largest),
     MS_FIELD(MsFusion, found),
+    MS_WHOLE(MsResampling),
+    MS_FIELD(MsResampling, points),
+    MS_FIELD(MsResampling, bytes),
+    MS_FIELD(MsResampling, values),
+    MS_FIELD(MsResampling, result),
+    MS_FIELD(MsResampling, count),
+    MS_FIELD(MsResampling, height),
+    MS_FIELD(MsResampling, width),
+    MS_FIELD(MsResampling, channels),
+    MS_FIELD(MsResampling, wraps),
+    MS_FIELD(MsResampling, threads),
 #endif
 };
 

@@ -14,6 +14,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from meshsplats._core.resampling import resample
+
 ROWS_BYTES = 4 << 20
 """Images are undistorted in strips of rows, so that each array of a strip takes at most about this much."""
 WHOLE = 0.999
@@ -290,11 +292,13 @@ class Pinhole:
     """Distinguishes several pinholes of one lens."""
 
 
-def pinholes(lens: Lens) -> list[Pinhole]:
-    """The pinhole images made of one image: one with the lens's own focal lengths, principal point and
-    size; of an equirectangular panorama the six sides of a cube, a quarter of its width each."""
+@lru_cache(maxsize=64)
+def pinholes(lens: Lens) -> tuple[Pinhole, ...]:
+    """The pinhole images made of one image, the same objects for the same lens: one with the lens's own
+    focal lengths, principal point and size; of an equirectangular panorama the six sides of a cube, a quarter
+    of its width each."""
     if lens.model != "EQUIRECTANGULAR":
-        return [Pinhole(np.eye(3), lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height)]
+        return (Pinhole(np.eye(3), lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height),)
     side = max(1, round(lens.width / 4))
     sides = []
     for suffix, turn, tilt in (
@@ -304,50 +308,42 @@ def pinholes(lens: Lens) -> list[Pinhole]:
         around = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
         over = np.array([[1, 0, 0], [0, np.cos(e), np.sin(e)], [0, -np.sin(e), np.cos(e)]])
         sides.append(Pinhole(over @ around, side / 2, side / 2, side / 2, side / 2, side, side, f"/{suffix}"))
-    return sides
+    return tuple(sides)
 
 
 def undistort(image: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-    """The image of the pinhole, from ``image`` (lens.height, lens.width, c), uint8 or float32.
+    """The image of the pinhole, from ``image`` (lens.height, lens.width, c), uint8 or floating-point.
 
     Values between pixels are bilinear. Returns (h, w, c) of the same type, 0 where the lens saw nothing, and
     (h, w) bool that is True where all four pixels around lie in the image.
     """
-    h, w, channels = image.shape
-    result = np.zeros((pinhole.height, pinhole.width, channels), image.dtype)
-    seen = np.zeros((pinhole.height, pinhole.width), bool)
-    wraps = lens.model == "EQUIRECTANGULAR"
-    flat = image.reshape(h * w, channels)
-    for rows, points in _strips(lens, pinhole):
-        x, y = points[..., 0] - 0.5, points[..., 1] - 0.5  # pixel centres are at halves
-        slack = 1e-6
-        if wraps:  # left and right edge are one, and the poles are rows of one point
-            x, y = np.mod(x, w), np.clip(y, 0, h - 1)
-            valid = np.ones(x.shape, bool)
+    points = _points(lens, pinhole)
+    values = image if image.dtype == np.uint8 else image.astype(np.float32, copy=False)
+    result = resample(values, points, wraps=lens.model == "EQUIRECTANGULAR", threads=1)
+    return result.astype(image.dtype, copy=False), ~np.isnan(points[..., 0])
+
+
+@lru_cache(maxsize=1)
+def _points(lens: Lens, pinhole: Pinhole) -> np.ndarray:
+    """(h, w, 2) float32 column and row, from the centre of the first pixel, in the image of ``lens`` of each
+    pixel of ``pinhole``; NaN where not all four pixels around are in it.
+
+    That of the last lens is kept: most often all photographs of a data set have the same one.
+    """
+    points = np.empty((pinhole.height, pinhole.width, 2), np.float32)
+    slack = 1e-6
+    for rows, found in _strips(lens, pinhole):
+        x, y = found[..., 0] - 0.5, found[..., 1] - 0.5  # pixel centres are at halves
+        if lens.model == "EQUIRECTANGULAR":  # left and right edge are one, and the poles are rows of a point
+            x, y = np.mod(x, lens.width), np.clip(y, 0, lens.height - 1)
         else:
             with np.errstate(invalid="ignore"):
-                valid = (x >= -slack) & (x <= w - 1 + slack) & (y >= -slack) & (y <= h - 1 + slack)
-            x = np.clip(np.where(valid, x, 0), 0, w - 1)
-            y = np.clip(np.where(valid, y, 0), 0, h - 1)
-        left, top = x.astype(np.int32), y.astype(np.int32)
-        right = (left + 1) % w if wraps else np.minimum(left + 1, w - 1)
-        below = np.minimum(top + 1, h - 1)
-        a, b = (x - left).astype(np.float32), (y - top).astype(np.float32)
-        corners = (
-            (top * w + left, (1 - a) * (1 - b)),
-            (top * w + right, a * (1 - b)),
-            (below * w + left, (1 - a) * b),
-            (below * w + right, a * b),
-        )
-        mixed = np.zeros((*x.shape, channels), np.float32)
-        for places, weights in corners:
-            mixed += np.take(flat, places, axis=0) * weights[..., None]
-        if image.dtype == np.uint8:
-            mixed = np.rint(mixed)
-        mixed[~valid] = 0
-        result[rows] = mixed
-        seen[rows] = valid
-    return result, seen
+                valid = (x >= -slack) & (x <= lens.width - 1 + slack)
+                valid &= (y >= -slack) & (y <= lens.height - 1 + slack)
+            x, y = np.where(valid, x, np.nan), np.where(valid, y, np.nan)
+        points[rows] = np.stack([x, y], axis=-1)
+    points.flags.writeable = False
+    return points
 
 
 def _strips(lens: Lens, pinhole: Pinhole) -> Iterator[tuple[slice, np.ndarray]]:

@@ -82,7 +82,8 @@ class Depths(NamedTuple):
     sure: np.ndarray
     """(pixels,) float32 inverse depths that other views confirm, 0: none."""
     filled: np.ndarray
-    """(pixels,) float32 those between them, where the filled ones of several views agree; 0: none."""
+    """(pixels,) float32 those between them, where the filled ones of several views agree or no other view
+    sees the place; 0: none."""
 
     def counts(self, points: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: views that have a surface at ``points`` (n, 3), and that see past them."""
@@ -263,7 +264,9 @@ def between(
     threads: int | None = None,
 ) -> np.ndarray:
     """(pixels,) float32 inverse depths where ``planes`` has none, on walls without texture, say: continued
-    from the pixels around, where those of other views agree and none sees past them."""
+    from the pixels around, where those of other views agree and none sees past them. What the others do not
+    have in their images, or hidden by known depths, has no other depth either: parts of the background of a
+    subject that the views go around."""
     sure = planes.inverse
     seeds = np.zeros(views.pixels, bool)
     for i in range(len(views)):
@@ -274,6 +277,7 @@ def between(
     found = count_witnesses(views, whole, whole, judges, limits, threads)
     against = count_witnesses(views, whole, sure, judges, limits, threads).past
     enough = (found.agree >= FILL_WITNESSES) | ((found.agree >= 1) & (found.seen <= FEW))
+    enough |= found.seen == 0
     return np.where((sure == 0) & enough & (against == 0), whole, 0).astype(np.float32)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,6 +30,8 @@ decides."""
 LONG = 600.0
 """Seconds. Of longer videos, only key frames are looked at, one in a second or in ten: to decode all takes
 too long."""
+SAID_EVERY = 10.0
+"""Seconds after which it is said how far the look at a video has come."""
 NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
 
 
@@ -101,7 +104,7 @@ def save_frames(
     if folder.exists():
         raise FileExistsError(f"{folder}: is there already, without frames: move it away")
     say(f"looking at the frames of {video.name}")
-    frames = look_at_frames(video)
+    frames = look_at_frames(video, say)
     chosen = choose_frames(frames, count or usual_count(frames.seconds))
     say(f"{len(chosen)} of {len(frames.sharpness):,} frames: {folder / IMAGES}")
     wanted = {int(frame): place for place, frame in enumerate(chosen)}
@@ -123,10 +126,11 @@ def usual_count(seconds: float) -> int:
     return int(min(max(round(FRAMES_PER_SECOND * seconds), FEWEST_FRAMES), MOST_FRAMES))
 
 
-def look_at_frames(video: Path) -> Frames:
-    """Sharpness and motion of every frame of ``video``. Errors are those of ``save_frames``."""
+def look_at_frames(video: Path, say: Callable[[str], None] = lambda text: None) -> Frames:
+    """Sharpness and motion of every frame of ``video``. ``say`` is told now and then how far it has come.
+    Errors are those of ``save_frames``."""
     sharpness, motion, before = [], [], None
-    seconds = 0.0
+    seconds, said = 0.0, time.perf_counter()
     for frame in _decoded(video, warn=True):
         scale = min(1.0, LOOK_SIDE / max(frame.width, frame.height))
         size = {"width": max(1, round(scale * frame.width)), "height": max(1, round(scale * frame.height))}
@@ -139,6 +143,10 @@ def look_at_frames(video: Path) -> Frames:
         motion.append(0.0 if before is None else float(np.sqrt(np.square(now - before).mean())))
         before = now
         seconds = max(seconds, float(frame.time or 0))
+        if time.perf_counter() - said >= SAID_EVERY:
+            said = time.perf_counter()
+            place = f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+            say(f"looking at the frames of {video.name}: {len(sharpness):,} so far, to {place}")
     if len(sharpness) < 2:
         raise FileFormatError(f"{video}: {len(sharpness)} frames can be read, at least 2 are needed")
     return Frames(np.array(sharpness), np.array(motion), seconds)
