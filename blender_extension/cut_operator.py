@@ -82,6 +82,25 @@ class CutSplats(bpy.types.Operator):
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
 
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "action")
+        layout.prop(self, "shape")
+        if self.shape != "all":
+            others = [other for other in context.selected_objects if other != context.object]
+            if len(others) == 1:
+                layout.label(text=f"Of {others[0].name}", icon="OBJECT_DATA")
+            else:
+                layout.label(text="Select the region's object, then the splats", icon="ERROR")
+            layout.prop(self, "outside")
+        layout.prop(self, "below_opacity")
+        layout.prop(self, "above_size")
+        layout.prop(self, "by_color")
+        if self.by_color:
+            layout.prop(self, "color")
+            layout.prop(self, "color_distance")
+
     def execute(self, context):
         from meshsplats.blender.inside import cutting
 
@@ -165,7 +184,8 @@ class CleanSplats(bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"MeshSplats: {faces.sum():,} triangles of {len(faces):,} were of floaters")
+        found = f"deleted {faces.sum():,} of {len(faces):,} triangles" if faces.any() else "found no floaters"
+        self.report({"INFO"}, f"MeshSplats: {found}")
         return {"FINISHED"}
 
 
@@ -173,7 +193,7 @@ class AdjustSplats(bpy.types.Operator):
     """Change hue, saturation, brightness, contrast and opacity of the selected splat meshes"""
 
     bl_idname = "object.meshsplats_adjust"
-    bl_label = "Adjust Splats"
+    bl_label = "Adjust Colours"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
     hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE")
@@ -185,6 +205,9 @@ class AdjustSplats(bpy.types.Operator):
     @classmethod
     def poll(cls, context):
         return CutSplats.poll(context)
+
+    def invoke(self, context, event):  # by themselves, its defaults change nothing
+        return context.window_manager.invoke_props_popup(self, event)
 
     def execute(self, context):
         from meshsplats.blender.inside import adjusting, levels, stand_ins

@@ -84,6 +84,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         layout = self.layout
         layout.use_property_split = True
         draw_choices(self, layout, [name for name in CHOICES if name != "axes"])
+        layout.use_property_split = False
         layout.prop(self, "hide_splats")
         draw_choices(self, layout, SCENE_CHOICES)
 
@@ -186,23 +187,22 @@ class SetUpRender(bpy.types.Operator):
         return {"FINISHED"}
 
 
+LIGHTS = [
+    ("sun", "Sun", "An afternoon's sun and an even sky"),
+    ("noon", "Noon", "The sun high in a clear sky"),
+    ("overcast", "Overcast", "Clouds: no shadows with edges"),
+    ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
+]
+
+
 class SetUpStage(Modal, bpy.types.Operator):
-    """Set up sun, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
+    """Set up light, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
 
     bl_idname = "scene.meshsplats_stage"
     bl_label = "Set up Light and Camera"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
-    lights: EnumProperty(
-        name="Light",
-        items=[
-            ("sun", "Sun", "An afternoon's sun and an even sky"),
-            ("noon", "Noon", "The sun high in a clear sky"),
-            ("overcast", "Overcast", "Clouds: no shadows with edges"),
-            ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
-        ],
-        default="sun",
-    )
+    lights: EnumProperty(name="Light", items=LIGHTS, default="sun")
     camera: BoolProperty(name="Camera", description="Add a camera that sees all of them", default=True)
     make_lit: BoolProperty(
         name="Make Lit",
@@ -215,6 +215,11 @@ class SetUpStage(Modal, bpy.types.Operator):
         description="A preview: rougher light and colours, in less time",
         default=False,
     )
+
+    @classmethod
+    def description(cls, context, properties):
+        (light,) = (text for name, _, text in LIGHTS if name == properties.lights)
+        return f"{light}. {cls.__doc__}"
 
     def execute(self, context):
         from meshsplats.blender.inside import objects
@@ -238,6 +243,8 @@ class SetUpStage(Modal, bpy.types.Operator):
         with waiting(context):
             every = objects.splat_objects(context.scene)
             setting.set_up(context.scene, every, self.lights, camera=self.camera, fast=self.fast)
+        if "EEVEE" in context.scene.render.engine:  # Material Preview shows no lamps of the scene
+            setting.show_colors(context.window_manager.windows, "RENDERED")
 
 
 class BakeLight(Modal, bpy.types.Operator):

@@ -67,6 +67,7 @@ class MeshSplatsPanel(bpy.types.Panel):
                 self._chain(layout, collection)
         layout.separator()
         layout.label(text="Light, ground and camera")
+        layout.prop(context.scene, "meshsplats_fast")
         row = layout.row(align=True)
         fast = context.scene.meshsplats_fast
         for lights in ("sun", "noon", "overcast", "studio"):
@@ -76,7 +77,6 @@ class MeshSplatsPanel(bpy.types.Panel):
         button = row.operator(BakeLight.bl_idname, text="Bake Light")
         button.live, button.fast = False, fast
         row.operator(BakeLight.bl_idname, text="Live Light").live = True
-        layout.prop(context.scene, "meshsplats_fast")
         layout.label(text="Render settings")
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
@@ -116,8 +116,11 @@ class MeshSplatsPanel(bpy.types.Panel):
         if LIT in obj.data:
             row = layout.row(align=True)
             row.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
+            usual = layout.operator_context
+            layout.operator_context = "EXEC_DEFAULT"  # without its dialog; all of the panel shares it
             crop = row.operator(CutSplats.bl_idname, text="Crop to Box")
             crop.action, crop.shape, crop.outside = "delete", "box", True
+            layout.operator_context = usual
             row = layout.row(align=True)
             row.operator(CleanSplats.bl_idname, text="Clean")
             row.operator(AdjustSplats.bl_idname, text="Adjust Colours")
@@ -125,12 +128,17 @@ class MeshSplatsPanel(bpy.types.Panel):
             if warning:
                 layout.label(text=warning, icon="ERROR")
         layout.label(text="Material and light of this object")
-        row = layout.row(align=True)
-        row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"
-        row.operator(SetShading.bl_idname, text="Lit").shading = "lit"
-        if obj.data.get(LIT):
+        row, now = layout.row(align=True), obj.data.get(LIT)
+        for shading in ("unlit", "lit"):
+            shown = now is not None and bool(now) == (shading == "lit")
+            button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=shown)
+            button.shading = shading
+        if now:
+            from meshsplats.blender.inside import materials
+
+            baked = any(materials.shows_baked(material) for material in obj.data.materials)
             for live, text in ((False, "Baked"), (True, "Live")):
-                button = row.operator(BakeLight.bl_idname, text=text)
+                button = row.operator(BakeLight.bl_idname, text=text, depress=baked != live)
                 button.live, button.only_active, button.fast = live, True, bpy.context.scene.meshsplats_fast
 
 

@@ -253,6 +253,9 @@ def settle(operator, context, objs):
     context.view_layer.update()
     if operator.frame_view:
         setting.frame_in_viewports(context.window_manager.windows, objs)
+        setting.frame_in_start_camera(context.scene, objs)
+    if operator.show_colors:
+        setting.show_colors(context.window_manager.windows, "MATERIAL")
     if operator.use_cycles:
         context.scene.render.engine = "CYCLES"
     if operator.set_up_scene:
