@@ -11,6 +11,21 @@ from .settings import copy_choices, is_splat_mesh
 from .work import waiting
 
 
+DONE = {"delete": "deleted", "separate": "separated", "hide": "hid", "select": "selected"}
+"""What each action of ``CutSplats`` did."""
+
+
+def can_edit(operator, context):
+    """Whether the active object is a splat mesh in object mode; the tooltip of ``operator`` says what is not."""
+    if not is_splat_mesh(context.object):
+        operator.poll_message_set("The active object is no splat mesh")
+    elif context.object.mode != "OBJECT":
+        operator.poll_message_set("Only in Object Mode")
+    else:
+        return True
+    return False
+
+
 def cut(context, obj, mesh, faces, *, action="delete"):
     """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so
     again."""
@@ -77,7 +92,7 @@ class CutSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return is_splat_mesh(context.object) and context.object.mode == "OBJECT"
+        return can_edit(cls, context)
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
@@ -132,7 +147,7 @@ class CutSplats(bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"MeshSplats: {faces.sum():,} triangles of {len(faces):,} were chosen")
+        self.report({"INFO"}, f"MeshSplats: {DONE[self.action]} {faces.sum():,} of {len(faces):,} triangles")
         return {"FINISHED"}
 
 
@@ -166,7 +181,7 @@ class CleanSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return CutSplats.poll(context)
+        return can_edit(cls, context)
 
     def execute(self, context):
         from meshsplats.blender.inside import cutting
@@ -204,7 +219,7 @@ class AdjustSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return CutSplats.poll(context)
+        return can_edit(cls, context)
 
     def invoke(self, context, event):  # by themselves, its defaults change nothing
         return context.window_manager.invoke_props_popup(self, event)

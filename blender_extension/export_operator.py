@@ -19,22 +19,45 @@ FORMATS = [
     (".ply", "Stanford (.ply)", "Triangles with float colours and opacities, as they are shown"),
     (".usdc", "USD (.usdc)", "Colour and opacity as primvars; needs the Python module pxr"),
 ]
-SPLAT_SUFFIXES = written_suffixes()
+SPLAT_FORMATS = [(suffix, f"*{suffix}", "A format of splat files") for suffix in written_suffixes()]
 
 
 class Export(ExportHelper):
-    """Mix-in for operators that export splat meshes: ``save`` writes some objects, and says what it wrote."""
+    """Mix-in for operators that export splat meshes: ``save`` writes some objects, and says what it wrote.
+    The name's suffix and ``format``, chosen in the dialog, follow each other."""
+
+    _shown = None
+    """The format that the dialog showed last."""
 
     use_selection: BoolProperty(
         name="Selected Only", description="Otherwise all visible splat meshes", default=False
     )
 
+    @classmethod
+    def suffix_of(cls, path):
+        """The longest of the formats' suffixes that ``path`` ends with, or ''."""
+        return max((s for s in cls.suffixes if path.lower().endswith(s)), key=len, default="")
+
+    def invoke(self, context, event):
+        self._shown = self.format
+        return super().invoke(context, event)
+
+    def check(self, context):
+        before = (self.filepath, self.format)
+        suffix = self.suffix_of(self.filepath)
+        if suffix and self.format == self._shown:  # the name was typed
+            self.format = suffix
+        else:
+            self.filepath = self.filepath[: len(self.filepath) - len(suffix)] + self.format
+        self._shown = self.format
+        return before != (self.filepath, self.format)
+
     def execute(self, context):
         from meshsplats.blender.inside import exporting
 
         path = self.filepath
-        if not path.lower().endswith(self.suffixes):
-            path += self.suffix
+        if not self.suffix_of(path):
+            path += self.format
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         try:
@@ -62,18 +85,6 @@ class ExportMeshSplats(Export, bpy.types.Operator):
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix, *_ in FORMATS), options={"HIDDEN"})
     format: EnumProperty(name="Format", description="Of a name without suffix", items=FORMATS)
 
-    @property
-    def suffix(self):
-        return self.format
-
-    def check(self, context):
-        stem = self.filepath
-        for suffix in self.suffixes:
-            stem = stem.removesuffix(suffix)
-        changed = stem + self.format
-        different, self.filepath = changed != self.filepath, changed
-        return different
-
     def save(self, objs, path):
         from meshsplats.blender.inside import exporting
         from meshsplats.formats.meshes import save_mesh
@@ -88,13 +99,15 @@ class ExportSplats(Export, bpy.types.Operator):
     have all their triangles"""
 
     bl_idname = "export_scene.meshsplats_splats"
-    bl_label = "Export Gaussian Splats"
+    bl_label = "Export Splats"
     bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
 
-    filename_ext = suffix = ".ply"
-    suffixes = SPLAT_SUFFIXES
-    check_extension = None  # the name decides among the formats, also with two suffixes
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SPLAT_SUFFIXES), options={"HIDDEN"})
+    filename_ext = ".ply"
+    suffixes = tuple(suffix for suffix, *_ in SPLAT_FORMATS)
+    filter_glob: StringProperty(
+        default=";".join(f"*{suffix}" for suffix, *_ in SPLAT_FORMATS), options={"HIDDEN"}
+    )
+    format: EnumProperty(name="Format", description="Of a name without suffix", items=SPLAT_FORMATS)
 
     def save(self, objs, path):
         from meshsplats.blender.inside import exporting

@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
-from .work import CloudWork, LightWork, Modal, Work, settle, take_over, waiting
+from .work import CloudWork, LightWork, Modal, Work, follow_shading, settle, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -26,7 +26,7 @@ class ConvertAgain(Modal, bpy.types.Operator):
         return obj is not None and bool(obj.meshsplats.path) and not obj.meshsplats.busy
 
     def execute(self, context):
-        from meshsplats.blender.inside import levels
+        from meshsplats.blender.inside import levels, objects
 
         source = context.object.meshsplats
         self._active = context.object.name
@@ -36,6 +36,7 @@ class ConvertAgain(Modal, bpy.types.Operator):
                 copy_choices(obj.meshsplats, source)
                 obj.meshsplats.busy = not bpy.app.background
                 self._names[bpy.path.abspath(obj.meshsplats.path)] = obj.name
+        self._was_lit = objects.is_lit(context.object)
         choices = {name: getattr(source, name) for name in CHOICES}
         return self.begin(context, Work(self._names, choices | {"fast": context.scene.meshsplats_fast}))
 
@@ -57,6 +58,8 @@ class ConvertAgain(Modal, bpy.types.Operator):
         if obj is None:
             self.report({"WARNING"}, "MeshSplats: the object is gone")
         else:
+            if objects.is_lit(obj) != self._was_lit:
+                follow_shading(self, context.scene, not self._was_lit)
             self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
@@ -140,8 +143,8 @@ class SetShading(Modal, bpy.types.Operator):
 
         try:
             chosen = levels.with_levels(context.object)
-            # One click: only these settings show the colours of imports correctly.
-            self._foreign = any(objects.LIT not in obj.data for obj in chosen)
+            lit = self.shading == "lit"
+            self._changed = any(objects.is_lit(obj) != lit for obj in chosen)  # also imports of Blender's own
             meshes = {
                 obj.name: objects.as_splat_mesh(obj) if objects.LIT in obj.data else foreign.splat_mesh(obj)
                 for obj in chosen
@@ -153,12 +156,9 @@ class SetShading(Modal, bpy.types.Operator):
         return self.begin(context, LightWork(meshes, self.shading, fast))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects
-
         take_over(work)
-        if self._foreign:
-            every = objects.splat_objects(context.scene)
-            objects.render_settings(context.scene, every, self.shading == "lit")
+        if self._changed:
+            follow_shading(self, context.scene, self.shading == "lit")
 
 
 class SetUpRender(bpy.types.Operator):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The panel in the side bar of the 3D view."""
 
+import textwrap
+
 import bpy
 
 from .cut_operator import AdjustSplats, CleanSplats, CutSplats
@@ -45,6 +47,13 @@ def modifier_warning(obj):
         return ""
     broken = next((m for m in obj.modifiers if m.type in BREAK_SPLATS and m.show_render), None)
     return "" if broken is None else f"{broken.name} tears splats to strips: Cut Splats cuts whole ones"
+
+
+def draw_warning(layout, text):
+    """Shows ``text`` whole, in as many lines as the side bar's usual width takes."""
+    column = layout.column(align=True)
+    for i, line in enumerate(textwrap.wrap(text, 32)):
+        column.label(text=line, icon="BLANK1" if i else "ERROR")
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -111,7 +120,7 @@ class MeshSplatsPanel(bpy.types.Panel):
             box = layout.box()
             box.label(text=f"Follows {base.name}", icon="MOD_MESHDEFORM")
             if obj.get("meshsplats_problem"):
-                box.label(text=obj["meshsplats_problem"], icon="ERROR")
+                draw_warning(box, obj["meshsplats_problem"])
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
         if LIT in obj.data:
             row = layout.row(align=True)
@@ -126,11 +135,13 @@ class MeshSplatsPanel(bpy.types.Panel):
             row.operator(AdjustSplats.bl_idname, text="Adjust Colours")
         for warning in (light_warning(bpy.context.scene, obj), modifier_warning(obj)):
             if warning:
-                layout.label(text=warning, icon="ERROR")
+                draw_warning(layout, warning)
+        if LIT not in obj.data and not obj.data.color_attributes:
+            return
         layout.label(text="Material and light of this object")
         row, now = layout.row(align=True), obj.data.get(LIT)
-        for shading in ("unlit", "lit"):
-            shown = now is not None and bool(now) == (shading == "lit")
+        for shading, lit in (("unlit", False), ("lit", True)):
+            shown = now is not None and bool(now) == lit
             button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=shown)
             button.shading = shading
         if now:

@@ -267,6 +267,21 @@ def settle(operator, context, objs):
             operator.report({"WARNING"}, f"MeshSplats: {clash}")
 
 
+def follow_shading(operator, scene, lit):
+    """Sets up the render for splat meshes that have become ``lit`` or unlit, unless others in the ``scene``
+    are of the other kind: ``operator`` then says so."""
+    from meshsplats.blender.inside import objects
+
+    every = objects.splat_objects(scene)
+    if all(objects.is_lit(obj) == lit for obj in every):
+        objects.render_settings(scene, every, lit)
+    else:
+        operator.report(
+            {"WARNING"},
+            "MeshSplats: some splats are lit and others not: choose under Render settings whose colours are right",
+        )
+
+
 def take_over(work):
     """Gives the objects that ``work``, a ``LightWork``, was about their new meshes, but for those that were
     edited or deleted meanwhile. Returns the names of those that got theirs."""
