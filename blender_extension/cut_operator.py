@@ -10,13 +10,13 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from .settings import copy_choices, is_splat_mesh
 from .work import waiting
 
-
 DONE = {"delete": "deleted", "separate": "separated", "hide": "hid", "select": "selected"}
 """What each action of ``CutSplats`` did."""
 
 
 def can_edit(operator, context):
-    """Whether the active object is a splat mesh in object mode; the tooltip of ``operator`` says what is not."""
+    """Whether the active object is a splat mesh in object mode; if not, the tooltip of ``operator`` says
+    why."""
     if not is_splat_mesh(context.object):
         operator.poll_message_set("The active object is no splat mesh")
     elif context.object.mode != "OBJECT":

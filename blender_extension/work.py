@@ -278,7 +278,8 @@ def follow_shading(operator, scene, lit):
     else:
         operator.report(
             {"WARNING"},
-            "MeshSplats: some splats are lit and others not: choose under Render settings whose colours are right",
+            "MeshSplats: some splats are lit and others not: choose under Render settings whose colours are"
+            " right",
         )
 
 

@@ -230,7 +230,9 @@ def test_the_camera_of_the_start_scene_sees_what_was_imported(tmp_path):
     bpy.context.view_layer.update()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
     setting.frame_in_start_camera(view, [obj])
-    np.testing.assert_allclose(camera.location, before[:3, 3], atol=1e-6, err_msg="a saved file is the user's")
+    np.testing.assert_allclose(
+        camera.location, before[:3, 3], atol=1e-6, err_msg="a saved file is the user's"
+    )
 
 
 def test_viewports_show_colors_and_then_light():

@@ -97,8 +97,8 @@ def frame_in_viewports(windows: Any, objs: list[Any]) -> None:
 
 
 def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
-    """Moves the camera that Blender starts with, in a file that was not saved yet, until it sees ``objs``; its
-    direction stays."""
+    """Moves the camera that Blender starts with, in a file that was not saved yet, until it sees ``objs``.
+    Its direction stays."""
     camera = scene.camera
     points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if bpy.data.filepath or camera is None or not len(points):
@@ -116,9 +116,7 @@ def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
 def _narrowest_angle(scene: Any, lens: Any) -> float:
     """The angle, in radians, that the camera ``lens`` sees along the shorter side of images."""
     render = scene.render
-    sides = sorted(
-        (render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y)
-    )
+    sides = sorted((render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y))
     return 2 * float(np.arctan(np.tan(lens.angle / 2) * sides[0] / sides[1]))
 
 
@@ -133,4 +131,6 @@ def show_colors(windows: Any, shading: str) -> None:
 
 def _views(windows: Any) -> list[Any]:
     """The 3D views of ``windows``."""
-    return [area.spaces.active for window in windows for area in window.screen.areas if area.type == "VIEW_3D"]
+    return [
+        area.spaces.active for window in windows for area in window.screen.areas if area.type == "VIEW_3D"
+    ]
