@@ -251,3 +251,12 @@ def test_viewports_show_colors_and_then_light():
         views[0].shading.type = before
         setting.show_colors(windows, wanted)
         assert views[0].shading.type == after, (before, wanted)
+
+
+def test_a_blender_that_cannot_denoise_takes_more_samples(empty, monkeypatch):
+    for can, samples in ((True, 16), (False, 64)):
+        monkeypatch.setattr(versions, "can_denoise", lambda can=can: can)
+        rendering.lit_settings(empty, "cycles", samples=16, denoise=True)
+        assert (empty.cycles.use_denoising, empty.cycles.samples) == (can, samples)
+        rendering.lit_settings(empty, "cycles", samples=16, denoise=False)
+        assert (empty.cycles.use_denoising, empty.cycles.samples) == (False, 16)
