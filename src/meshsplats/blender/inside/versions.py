@@ -96,8 +96,8 @@ def enable_cycles() -> None:
 
 
 def can_denoise() -> bool:
-    """Whether this Blender has OpenImageDenoise, without which Cycles fails instead of leaving noise; some Linux
-    distributions' has not. Needs Cycles."""
+    """Whether this Blender has OpenImageDenoise, as not all of Linux distributions have. Cycles fails without,
+    when it is to denoise. Needs Cycles."""
     import _cycles
 
     return bool(_cycles.with_openimagedenoise)
