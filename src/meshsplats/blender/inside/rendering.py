@@ -46,7 +46,7 @@ def lit_settings(
     """Settings for linear light, shown with the view transform Standard (sRGB).
 
     Args:
-        samples: per pixel; four times as many where ``denoise`` is asked for, but not built into this Blender.
+        samples: per pixel; four times as many to ``denoise`` in a Blender that cannot.
         limit: most layers that a ray may pass.
         bounces: how often light is scattered.
         raytracing: EEVEE traces rays for mirrors and glass.

@@ -96,7 +96,7 @@ def enable_cycles() -> None:
 
 
 def can_denoise() -> bool:
-    """Whether this Blender has OpenImageDenoise, as not all of Linux distributions have. Cycles fails without,
+    """Whether this Blender has OpenImageDenoise. Some Linux distributions leave it out, and Cycles then fails
     when it is to denoise. Needs Cycles."""
     import _cycles
 
