@@ -11,7 +11,7 @@ from bpy_extras.io_utils import ExportHelper
 from meshsplats.formats.splat_formats import written_suffixes
 
 from .settings import is_splat_mesh
-from .work import waiting
+from .work import own_warnings, waiting
 
 FORMATS = [
     (".glb", "glTF (.glb)", "For viewers and engines: colours in linear light, blended"),
@@ -61,8 +61,7 @@ class Export(ExportHelper):
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         try:
-            with waiting(context), warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with waiting(context), own_warnings() as caught:
                 written = self.save(exporting.chosen(context.view_layer, selected=self.use_selection), path)
         except (ValueError, OSError, ImportError) as error:
             self.report({"ERROR"}, str(error))
@@ -111,14 +110,14 @@ class ExportSplats(Export, bpy.types.Operator):
 
     def save(self, objs, path):
         from meshsplats.blender.inside import exporting
+        from meshsplats.errors import DataWarning
         from meshsplats.formats.gaussians import save_gaussians
 
         cloud, cut = exporting.exported_splats(objs)
         save_gaussians(cloud, path)
         if cut:
-            warnings.warn(
-                f"MeshSplats: left out {cut:,} splats that lack some of their triangles", stacklevel=1
-            )
+            left_out = f"MeshSplats: left out {cut:,} splats that lack some of their triangles"
+            warnings.warn(left_out, DataWarning, stacklevel=1)
         return f"{len(cloud):,} splats"
 
 

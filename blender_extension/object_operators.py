@@ -2,13 +2,11 @@
 """Operators on objects and scenes: conversion, shading, render settings, stage, mesh priors, levels of
 detail."""
 
-import warnings
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
-from .work import CloudWork, LightWork, Modal, Work, follow_shading, settle, take_over, waiting
+from .work import CloudWork, LightWork, Modal, Work, follow_shading, own_warnings, settle, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -97,8 +95,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         source = context.object
         self._source = source.name
         try:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with own_warnings() as caught:
                 cloud = splat_points.cloud_of(source, context.evaluated_depsgraph_get())
         except ValueError as error:
             self.report({"ERROR"}, str(error))

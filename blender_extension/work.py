@@ -26,6 +26,17 @@ class Result:
     """Of a chain: of each level, the size for which it was made, in pixels."""
 
 
+@contextmanager
+def own_warnings():
+    """Yields a list that collects what MeshSplats warns of, not what other add-ons do meanwhile."""
+    from meshsplats.errors import DataWarning
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", DataWarning)
+        yield caught
+
+
 class Work:
     """Reads files and prepares their meshes. ``progress`` runs from 0 to 1, ``stage`` names the current
     step."""
@@ -64,8 +75,7 @@ class Work:
     def _run_all(self):
         for index, path in enumerate(self.paths):
             try:
-                with warnings.catch_warnings(record=True) as caught:
-                    warnings.simplefilter("always")
+                with own_warnings() as caught:
                     self.results.append(self._one(path, index))
                 self.problems += [f"{path}: {warning.message}" for warning in caught]
             except Stopped:

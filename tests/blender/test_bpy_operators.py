@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import load_gaussians, save_gaussians
 from meshsplats.blender.inside import baking, materials, objects, stand_ins
+from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
 
 ROOT = Path(__file__).parents[2]
@@ -235,3 +237,11 @@ def test_a_blender_without_numpy_is_told_so(extension, monkeypatch):
     with pytest.raises(RuntimeError, match=r"needs NumPy.*\n.*python3-numpy") as caught:
         extension.register()
     assert max(map(len, str(caught.value).splitlines())) < 90, "the window cuts longer lines"
+
+
+def test_warnings_of_other_add_ons_are_not_reported(extension):
+    with sys.modules["blender_extension.work"].own_warnings() as caught:
+        warnings.warn("unclosed file", ResourceWarning, stacklevel=1)
+        warnings.warn("deprecated", UserWarning, stacklevel=1)
+        warnings.warn("3 splats were left out", DataWarning, stacklevel=1)
+    assert [str(warning.message) for warning in caught] == ["3 splats were left out"]
