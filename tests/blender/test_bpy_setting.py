@@ -251,6 +251,10 @@ def test_viewports_show_colors_and_then_light():
         views[0].shading.type = before
         setting.show_colors(windows, wanted)
         assert views[0].shading.type == after, (before, wanted)
+    bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+    views[0].shading.type = "SOLID"
+    setting.show_colors(windows, "MATERIAL")
+    assert views[0].shading.type == "SOLID", "that engine has no Material Preview"
 
 
 def test_a_blender_that_cannot_denoise_takes_more_samples(empty, monkeypatch):

@@ -3,6 +3,7 @@ up."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -126,7 +127,8 @@ def show_colors(windows: Any, shading: str) -> None:
     lesser = {"SOLID"} if shading == "MATERIAL" else {"SOLID", "MATERIAL"}
     for space in _views(windows):
         if space.shading.type in lesser:
-            space.shading.type = shading
+            with suppress(TypeError):  # the engine Workbench has no Material Preview
+                space.shading.type = shading
 
 
 def _views(windows: Any) -> list[Any]:
