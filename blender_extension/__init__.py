@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """MeshSplats for Blender: Gaussian splats, and meshes made of them, by File > Import or drag and drop."""
 
+import importlib.util
+
 from . import (
     cut_operator,
     export_operator,
@@ -19,6 +21,12 @@ from .export_operator import (  # noqa: F401 - Blender's glTF exporter looks for
 
 
 def register():
+    if importlib.util.find_spec("numpy") is None:  # of some Linux distributions' Blenders
+        raise RuntimeError(
+            "MeshSplats needs NumPy, which the Python of this Blender lacks.\n"
+            "Install it (Debian and Ubuntu: apt install python3-numpy) and start Blender again,\n"
+            "or use Blender from blender.org."
+        )
     settings.register()
     import_operator.register()
     export_operator.register()

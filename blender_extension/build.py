@@ -4,6 +4,7 @@ platform and each range of Blender versions, because Blender unpacks only one wh
 
     python blender_extension/build.py -o dist                        # for this machine
     python blender_extension/build.py -o dist --wheel dist/*.whl     # for all that Blender runs on
+    python blender_extension/build.py -o dist --python 3.13          # for a Blender with another Python
 
 The wheel of MeshSplats is built from this source tree, or given with ``--wheel``. Pillow, which .sog files
 need and Blender's Python lacks, is fetched for the same platform, or given with ``--pillow``.
@@ -68,9 +69,10 @@ def manifest(wheels: list[str], blender: str) -> str:
     return re.sub(r"(?m)^# build\.py .*$", lines, text, count=1)
 
 
-def pack(wheels: list[Path], folder: Path, blender: str) -> Path:
+def pack(wheels: list[Path], folder: Path, blender: str, python: str | None = None) -> Path:
     """Writes the extension with ``wheels``, the first that of MeshSplats, into ``folder``; returns the .zip.
-    ``blender`` is the first version of the range that it is for.
+    ``blender`` is the first version of the range that it is for, and ``python`` that of its Python, named
+    where it is not the one of blender.org's builds.
 
     Raises ValueError for wheels of different platforms.
     """
@@ -78,7 +80,8 @@ def pack(wheels: list[Path], folder: Path, blender: str) -> Path:
     platforms = sorted({platform_of(name) for name in names})
     if len(platforms) > 1:
         raise ValueError(f"the wheels are for different platforms: {', '.join(platforms)}")
-    name = f"meshsplats-{names[0].split('-')[1]}-{platforms[0].replace('-', '_')}-blender_{blender}.zip"
+    name = f"meshsplats-{names[0].split('-')[1]}-{platforms[0].replace('-', '_')}-blender_{blender}"
+    name += f"-python_{python}.zip" if python else ".zip"
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / name
     temporary = target.with_suffix(".part")
@@ -97,11 +100,12 @@ def pack(wheels: list[Path], folder: Path, blender: str) -> Path:
     return target
 
 
-def fetch_pillow(platform: str, blender: str, folder: Path) -> Path:
-    """A wheel of Pillow for Blender's Python on ``platform``, as Blender names it, from the package index."""
+def fetch_pillow(platform: str, python: str, folder: Path) -> Path:
+    """A wheel of Pillow for the version ``python`` on ``platform``, as Blender names it, from the package
+    index."""
     folder.mkdir(parents=True)
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
-    command += ["--python-version", RANGES[blender][0], "--dest", str(folder)]
+    command += ["--python-version", python, "--dest", str(folder)]
     for name in PIP_PLATFORMS[platform]:
         command += ["--platform", name]
     subprocess.run([*command, "pillow"], check=True)
@@ -128,17 +132,25 @@ def main() -> None:
     parser.add_argument(
         "--blender", nargs="+", choices=RANGES, default=list(RANGES), help="first version of each range"
     )
+    parser.add_argument(
+        "--python",
+        help="version of Blender's Python, such as 3.13: Blenders of Linux distributions run with that of the"
+        " system, which is not always blender.org's (3.11 up to Blender 5.0, then 3.13)",
+    )
     parser.add_argument("--pillow", type=Path, help="a wheel of Pillow; fetched if left out")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
+        if not options.wheel:
+            print("building the wheel of MeshSplats, which takes a minute", flush=True)
         for wheel in options.wheel or [build_wheel(Path(folder))]:
             if "-musllinux_" in wheel.name:  # Blender does not run there
                 continue
             platform = platform_of(wheel.name)
             for blender in options.blender:
                 place = Path(folder) / f"{platform}-{blender}"
-                pillow = options.pillow or fetch_pillow(platform, blender, place)
-                print(pack([wheel, pillow], options.output, blender))
+                python = options.python or RANGES[blender][0]
+                pillow = options.pillow or fetch_pillow(platform, python, place)
+                print(pack([wheel, pillow], options.output, blender, options.python), flush=True)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,21 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from .settings import copy_choices, is_splat_mesh
 from .work import waiting
 
+DONE = {"delete": "deleted", "separate": "separated", "hide": "hid", "select": "selected"}
+"""What each action of ``CutSplats`` did."""
+
+
+def can_edit(operator, context):
+    """Whether the active object is a splat mesh in object mode; if not, the tooltip of ``operator`` says
+    why."""
+    if not is_splat_mesh(context.object):
+        operator.poll_message_set("The active object is no splat mesh")
+    elif context.object.mode != "OBJECT":
+        operator.poll_message_set("Only in Object Mode")
+    else:
+        return True
+    return False
+
 
 def cut(context, obj, mesh, faces, *, action="delete"):
     """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so
@@ -77,10 +92,29 @@ class CutSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return is_splat_mesh(context.object) and context.object.mode == "OBJECT"
+        return can_edit(cls, context)
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "action")
+        layout.prop(self, "shape")
+        if self.shape != "all":
+            others = [other for other in context.selected_objects if other != context.object]
+            if len(others) == 1:
+                layout.label(text=f"Of {others[0].name}", icon="OBJECT_DATA")
+            else:
+                layout.label(text="Select the region's object, then the splats", icon="ERROR")
+            layout.prop(self, "outside")
+        layout.prop(self, "below_opacity")
+        layout.prop(self, "above_size")
+        layout.prop(self, "by_color")
+        if self.by_color:
+            layout.prop(self, "color")
+            layout.prop(self, "color_distance")
 
     def execute(self, context):
         from meshsplats.blender.inside import cutting
@@ -113,7 +147,7 @@ class CutSplats(bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"MeshSplats: {faces.sum():,} triangles of {len(faces):,} were chosen")
+        self.report({"INFO"}, f"MeshSplats: {DONE[self.action]} {faces.sum():,} of {len(faces):,} triangles")
         return {"FINISHED"}
 
 
@@ -147,7 +181,7 @@ class CleanSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return CutSplats.poll(context)
+        return can_edit(cls, context)
 
     def execute(self, context):
         from meshsplats.blender.inside import cutting
@@ -165,7 +199,8 @@ class CleanSplats(bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"MeshSplats: {faces.sum():,} triangles of {len(faces):,} were of floaters")
+        found = f"deleted {faces.sum():,} of {len(faces):,} triangles" if faces.any() else "found no floaters"
+        self.report({"INFO"}, f"MeshSplats: {found}")
         return {"FINISHED"}
 
 
@@ -173,7 +208,7 @@ class AdjustSplats(bpy.types.Operator):
     """Change hue, saturation, brightness, contrast and opacity of the selected splat meshes"""
 
     bl_idname = "object.meshsplats_adjust"
-    bl_label = "Adjust Splats"
+    bl_label = "Adjust Colours"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
     hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE")
@@ -184,7 +219,10 @@ class AdjustSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return CutSplats.poll(context)
+        return can_edit(cls, context)
+
+    def invoke(self, context, event):  # by themselves, its defaults change nothing
+        return context.window_manager.invoke_props_popup(self, event)
 
     def execute(self, context):
         from meshsplats.blender.inside import adjusting, levels, stand_ins

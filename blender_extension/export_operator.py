@@ -11,7 +11,7 @@ from bpy_extras.io_utils import ExportHelper
 from meshsplats.formats.splat_formats import written_suffixes
 
 from .settings import is_splat_mesh
-from .work import waiting
+from .work import own_warnings, waiting
 
 FORMATS = [
     (".glb", "glTF (.glb)", "For viewers and engines: colours in linear light, blended"),
@@ -19,27 +19,49 @@ FORMATS = [
     (".ply", "Stanford (.ply)", "Triangles with float colours and opacities, as they are shown"),
     (".usdc", "USD (.usdc)", "Colour and opacity as primvars; needs the Python module pxr"),
 ]
-SPLAT_SUFFIXES = written_suffixes()
+SPLAT_FORMATS = [(suffix, f"*{suffix}", "A format of splat files") for suffix in written_suffixes()]
 
 
 class Export(ExportHelper):
-    """Mix-in for operators that export splat meshes: ``save`` writes some objects, and says what it wrote."""
+    """Mix-in for operators that export splat meshes: ``save`` writes some objects, and says what it wrote.
+    The name's suffix and ``format``, chosen in the dialog, follow each other."""
+
+    _shown = None
+    """The format that the dialog showed last."""
 
     use_selection: BoolProperty(
         name="Selected Only", description="Otherwise all visible splat meshes", default=False
     )
 
+    @classmethod
+    def suffix_of(cls, path):
+        """The longest of the formats' suffixes that ``path`` ends with, or ''."""
+        return max((s for s in cls.suffixes if path.lower().endswith(s)), key=len, default="")
+
+    def invoke(self, context, event):
+        self._shown = self.format
+        return super().invoke(context, event)
+
+    def check(self, context):
+        before = (self.filepath, self.format)
+        suffix = self.suffix_of(self.filepath)
+        if suffix and self.format == self._shown:  # the name was typed
+            self.format = suffix
+        else:
+            self.filepath = self.filepath[: len(self.filepath) - len(suffix)] + self.format
+        self._shown = self.format
+        return before != (self.filepath, self.format)
+
     def execute(self, context):
         from meshsplats.blender.inside import exporting
 
         path = self.filepath
-        if not path.lower().endswith(self.suffixes):
-            path += self.suffix
+        if not self.suffix_of(path):
+            path += self.format
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         try:
-            with waiting(context), warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with waiting(context), own_warnings() as caught:
                 written = self.save(exporting.chosen(context.view_layer, selected=self.use_selection), path)
         except (ValueError, OSError, ImportError) as error:
             self.report({"ERROR"}, str(error))
@@ -62,18 +84,6 @@ class ExportMeshSplats(Export, bpy.types.Operator):
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix, *_ in FORMATS), options={"HIDDEN"})
     format: EnumProperty(name="Format", description="Of a name without suffix", items=FORMATS)
 
-    @property
-    def suffix(self):
-        return self.format
-
-    def check(self, context):
-        stem = self.filepath
-        for suffix in self.suffixes:
-            stem = stem.removesuffix(suffix)
-        changed = stem + self.format
-        different, self.filepath = changed != self.filepath, changed
-        return different
-
     def save(self, objs, path):
         from meshsplats.blender.inside import exporting
         from meshsplats.formats.meshes import save_mesh
@@ -88,24 +98,26 @@ class ExportSplats(Export, bpy.types.Operator):
     have all their triangles"""
 
     bl_idname = "export_scene.meshsplats_splats"
-    bl_label = "Export Gaussian Splats"
+    bl_label = "Export Splats"
     bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
 
-    filename_ext = suffix = ".ply"
-    suffixes = SPLAT_SUFFIXES
-    check_extension = None  # the name decides among the formats, also with two suffixes
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SPLAT_SUFFIXES), options={"HIDDEN"})
+    filename_ext = ".ply"
+    suffixes = tuple(suffix for suffix, *_ in SPLAT_FORMATS)
+    filter_glob: StringProperty(
+        default=";".join(f"*{suffix}" for suffix, *_ in SPLAT_FORMATS), options={"HIDDEN"}
+    )
+    format: EnumProperty(name="Format", description="Of a name without suffix", items=SPLAT_FORMATS)
 
     def save(self, objs, path):
         from meshsplats.blender.inside import exporting
+        from meshsplats.errors import DataWarning
         from meshsplats.formats.gaussians import save_gaussians
 
         cloud, cut = exporting.exported_splats(objs)
         save_gaussians(cloud, path)
         if cut:
-            warnings.warn(
-                f"MeshSplats: left out {cut:,} splats that lack some of their triangles", stacklevel=1
-            )
+            left_out = f"MeshSplats: left out {cut:,} splats that lack some of their triangles"
+            warnings.warn(left_out, DataWarning, stacklevel=1)
         return f"{len(cloud):,} splats"
 
 

@@ -23,7 +23,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
     """Import Gaussian splats as a mesh, or a mesh or levels of detail made by MeshSplats"""
 
     bl_idname = "import_scene.meshsplats"
-    bl_label = "Import Gaussian Splats"
+    bl_label = "Import Splats"
     bl_options = {"UNDO", "PRESET"}  # noqa: RUF012 - Blender's own form
 
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
@@ -56,6 +56,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         layout = self.layout
         layout.use_property_split = True
         draw_choices(self, layout)
+        layout.use_property_split = False  # their names are longer than half of the dialog
         layout.prop(self, "at_origin")
         draw_choices(self, layout, SCENE_CHOICES)
 
@@ -102,7 +103,7 @@ class MeshSplatsFileHandler(bpy.types.FileHandler):
 
 
 def menu(self, context):
-    self.layout.operator(ImportMeshSplats.bl_idname, text=f"Gaussian Splats ({', '.join(ENDS[:4])}, ...)")
+    self.layout.operator(ImportMeshSplats.bl_idname, text="Gaussian Splats (.ply, .spz, .sog, ...)")
 
 
 def register():

@@ -2,13 +2,11 @@
 """Operators on objects and scenes: conversion, shading, render settings, stage, mesh priors, levels of
 detail."""
 
-import warnings
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
-from .work import CloudWork, LightWork, Modal, Work, settle, take_over, waiting
+from .work import CloudWork, LightWork, Modal, Work, follow_shading, own_warnings, settle, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -26,7 +24,7 @@ class ConvertAgain(Modal, bpy.types.Operator):
         return obj is not None and bool(obj.meshsplats.path) and not obj.meshsplats.busy
 
     def execute(self, context):
-        from meshsplats.blender.inside import levels
+        from meshsplats.blender.inside import levels, objects
 
         source = context.object.meshsplats
         self._active = context.object.name
@@ -36,6 +34,7 @@ class ConvertAgain(Modal, bpy.types.Operator):
                 copy_choices(obj.meshsplats, source)
                 obj.meshsplats.busy = not bpy.app.background
                 self._names[bpy.path.abspath(obj.meshsplats.path)] = obj.name
+        self._was_lit = objects.is_lit(context.object)
         choices = {name: getattr(source, name) for name in CHOICES}
         return self.begin(context, Work(self._names, choices | {"fast": context.scene.meshsplats_fast}))
 
@@ -57,6 +56,8 @@ class ConvertAgain(Modal, bpy.types.Operator):
         if obj is None:
             self.report({"WARNING"}, "MeshSplats: the object is gone")
         else:
+            if objects.is_lit(obj) != self._was_lit:
+                follow_shading(self, context.scene, not self._was_lit)
             self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
@@ -84,6 +85,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         layout = self.layout
         layout.use_property_split = True
         draw_choices(self, layout, [name for name in CHOICES if name != "axes"])
+        layout.use_property_split = False
         layout.prop(self, "hide_splats")
         draw_choices(self, layout, SCENE_CHOICES)
 
@@ -93,8 +95,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         source = context.object
         self._source = source.name
         try:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with own_warnings() as caught:
                 cloud = splat_points.cloud_of(source, context.evaluated_depsgraph_get())
         except ValueError as error:
             self.report({"ERROR"}, str(error))
@@ -139,8 +140,8 @@ class SetShading(Modal, bpy.types.Operator):
 
         try:
             chosen = levels.with_levels(context.object)
-            # One click: only these settings show the colours of imports correctly.
-            self._foreign = any(objects.LIT not in obj.data for obj in chosen)
+            lit = self.shading == "lit"
+            self._changed = any(objects.is_lit(obj) != lit for obj in chosen)  # also imports of Blender's own
             meshes = {
                 obj.name: objects.as_splat_mesh(obj) if objects.LIT in obj.data else foreign.splat_mesh(obj)
                 for obj in chosen
@@ -152,12 +153,9 @@ class SetShading(Modal, bpy.types.Operator):
         return self.begin(context, LightWork(meshes, self.shading, fast))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects
-
         take_over(work)
-        if self._foreign:
-            every = objects.splat_objects(context.scene)
-            objects.render_settings(context.scene, every, self.shading == "lit")
+        if self._changed:
+            follow_shading(self, context.scene, self.shading == "lit")
 
 
 class SetUpRender(bpy.types.Operator):
@@ -186,23 +184,22 @@ class SetUpRender(bpy.types.Operator):
         return {"FINISHED"}
 
 
+LIGHTS = [
+    ("sun", "Sun", "An afternoon's sun and an even sky"),
+    ("noon", "Noon", "The sun high in a clear sky"),
+    ("overcast", "Overcast", "Clouds: no shadows with edges"),
+    ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
+]
+
+
 class SetUpStage(Modal, bpy.types.Operator):
-    """Set up sun, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
+    """Set up light, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
 
     bl_idname = "scene.meshsplats_stage"
     bl_label = "Set up Light and Camera"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
-    lights: EnumProperty(
-        name="Light",
-        items=[
-            ("sun", "Sun", "An afternoon's sun and an even sky"),
-            ("noon", "Noon", "The sun high in a clear sky"),
-            ("overcast", "Overcast", "Clouds: no shadows with edges"),
-            ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
-        ],
-        default="sun",
-    )
+    lights: EnumProperty(name="Light", items=LIGHTS, default="sun")
     camera: BoolProperty(name="Camera", description="Add a camera that sees all of them", default=True)
     make_lit: BoolProperty(
         name="Make Lit",
@@ -215,6 +212,11 @@ class SetUpStage(Modal, bpy.types.Operator):
         description="A preview: rougher light and colours, in less time",
         default=False,
     )
+
+    @classmethod
+    def description(cls, context, properties):
+        (light,) = (text for name, _, text in LIGHTS if name == properties.lights)
+        return f"{light}. {cls.__doc__}"
 
     def execute(self, context):
         from meshsplats.blender.inside import objects
@@ -238,6 +240,8 @@ class SetUpStage(Modal, bpy.types.Operator):
         with waiting(context):
             every = objects.splat_objects(context.scene)
             setting.set_up(context.scene, every, self.lights, camera=self.camera, fast=self.fast)
+        if "EEVEE" in context.scene.render.engine:  # Material Preview shows no lamps of the scene
+            setting.show_colors(context.window_manager.windows, "RENDERED")
 
 
 class BakeLight(Modal, bpy.types.Operator):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The panel in the side bar of the 3D view."""
 
+import textwrap
+
 import bpy
 
 from .cut_operator import AdjustSplats, CleanSplats, CutSplats
@@ -47,6 +49,13 @@ def modifier_warning(obj):
     return "" if broken is None else f"{broken.name} tears splats to strips: Cut Splats cuts whole ones"
 
 
+def draw_warning(layout, text):
+    """Shows ``text`` whole, in as many lines as the side bar's usual width takes."""
+    column = layout.column(align=True)
+    for i, line in enumerate(textwrap.wrap(text, 32)):
+        column.label(text=line, icon="BLANK1" if i else "ERROR")
+
+
 class MeshSplatsPanel(bpy.types.Panel):
     bl_idname = "VIEW3D_PT_meshsplats"
     bl_label = "MeshSplats"
@@ -67,6 +76,7 @@ class MeshSplatsPanel(bpy.types.Panel):
                 self._chain(layout, collection)
         layout.separator()
         layout.label(text="Light, ground and camera")
+        layout.prop(context.scene, "meshsplats_fast")
         row = layout.row(align=True)
         fast = context.scene.meshsplats_fast
         for lights in ("sun", "noon", "overcast", "studio"):
@@ -76,7 +86,6 @@ class MeshSplatsPanel(bpy.types.Panel):
         button = row.operator(BakeLight.bl_idname, text="Bake Light")
         button.live, button.fast = False, fast
         row.operator(BakeLight.bl_idname, text="Live Light").live = True
-        layout.prop(context.scene, "meshsplats_fast")
         layout.label(text="Render settings")
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
@@ -111,26 +120,36 @@ class MeshSplatsPanel(bpy.types.Panel):
             box = layout.box()
             box.label(text=f"Follows {base.name}", icon="MOD_MESHDEFORM")
             if obj.get("meshsplats_problem"):
-                box.label(text=obj["meshsplats_problem"], icon="ERROR")
+                draw_warning(box, obj["meshsplats_problem"])
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
         if LIT in obj.data:
             row = layout.row(align=True)
             row.operator(CutSplats.bl_idname, icon="SCULPTMODE_HLT", text="Cut Splats ...")
+            usual = layout.operator_context
+            layout.operator_context = "EXEC_DEFAULT"  # without its dialog; all of the panel shares it
             crop = row.operator(CutSplats.bl_idname, text="Crop to Box")
             crop.action, crop.shape, crop.outside = "delete", "box", True
+            layout.operator_context = usual
             row = layout.row(align=True)
             row.operator(CleanSplats.bl_idname, text="Clean")
             row.operator(AdjustSplats.bl_idname, text="Adjust Colours")
         for warning in (light_warning(bpy.context.scene, obj), modifier_warning(obj)):
             if warning:
-                layout.label(text=warning, icon="ERROR")
+                draw_warning(layout, warning)
+        if LIT not in obj.data and not obj.data.color_attributes:
+            return
         layout.label(text="Material and light of this object")
-        row = layout.row(align=True)
-        row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"
-        row.operator(SetShading.bl_idname, text="Lit").shading = "lit"
-        if obj.data.get(LIT):
+        row, now = layout.row(align=True), obj.data.get(LIT)
+        for shading, lit in (("unlit", False), ("lit", True)):
+            shown = now is not None and bool(now) == lit
+            button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=shown)
+            button.shading = shading
+        if now:
+            from meshsplats.blender.inside import materials
+
+            baked = any(materials.shows_baked(material) for material in obj.data.materials)
             for live, text in ((False, "Baked"), (True, "Live")):
-                button = row.operator(BakeLight.bl_idname, text=text)
+                button = row.operator(BakeLight.bl_idname, text=text, depress=baked != live)
                 button.live, button.only_active, button.fast = live, True, bpy.context.scene.meshsplats_fast
 
 

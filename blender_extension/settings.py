@@ -61,7 +61,7 @@ class Choices:
     )
 
 
-SCENE_CHOICES = ("set_up_scene", "use_cycles", "hide_start_scene", "frame_view")
+SCENE_CHOICES = ("set_up_scene", "use_cycles", "hide_start_scene", "frame_view", "show_colors")
 
 
 class SceneChoice:
@@ -84,7 +84,15 @@ class SceneChoice:
         default=True,
     )
     frame_view: BoolProperty(
-        name="Frame in View", description="Turn the 3D views to what was imported", default=True
+        name="Frame in View",
+        description="Turn the 3D views to what was imported and, in a file that was not saved yet, the camera"
+        " that Blender starts with",
+        default=True,
+    )
+    show_colors: BoolProperty(
+        name="Show Colours",
+        description="Switch 3D views from Solid, which is grey, to Material Preview",
+        default=True,
     )
 
 

@@ -26,6 +26,17 @@ class Result:
     """Of a chain: of each level, the size for which it was made, in pixels."""
 
 
+@contextmanager
+def own_warnings():
+    """Yields a list that collects what MeshSplats warns of, not what other add-ons do meanwhile."""
+    from meshsplats.errors import DataWarning
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", DataWarning)
+        yield caught
+
+
 class Work:
     """Reads files and prepares their meshes. ``progress`` runs from 0 to 1, ``stage`` names the current
     step."""
@@ -64,8 +75,7 @@ class Work:
     def _run_all(self):
         for index, path in enumerate(self.paths):
             try:
-                with warnings.catch_warnings(record=True) as caught:
-                    warnings.simplefilter("always")
+                with own_warnings() as caught:
                     self.results.append(self._one(path, index))
                 self.problems += [f"{path}: {warning.message}" for warning in caught]
             except Stopped:
@@ -253,6 +263,9 @@ def settle(operator, context, objs):
     context.view_layer.update()
     if operator.frame_view:
         setting.frame_in_viewports(context.window_manager.windows, objs)
+        setting.frame_in_start_camera(context.scene, objs)
+    if operator.show_colors:
+        setting.show_colors(context.window_manager.windows, "MATERIAL")
     if operator.use_cycles:
         context.scene.render.engine = "CYCLES"
     if operator.set_up_scene:
@@ -262,6 +275,22 @@ def settle(operator, context, objs):
         clash = objects.clash(every, operator.shading == "lit")
         if clash:
             operator.report({"WARNING"}, f"MeshSplats: {clash}")
+
+
+def follow_shading(operator, scene, lit):
+    """Sets up the render for splat meshes that have become ``lit`` or unlit, unless others in the ``scene``
+    are of the other kind: ``operator`` then says so."""
+    from meshsplats.blender.inside import objects
+
+    every = objects.splat_objects(scene)
+    if all(objects.is_lit(obj) == lit for obj in every):
+        objects.render_settings(scene, every, lit)
+    else:
+        operator.report(
+            {"WARNING"},
+            "MeshSplats: some splats are lit and others not: choose under Render settings whose colours are"
+            " right",
+        )
 
 
 def take_over(work):

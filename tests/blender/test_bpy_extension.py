@@ -84,6 +84,16 @@ def test_platform_names():
         build.pack(different, Path("nowhere"), "4.2")
 
 
+def test_a_package_names_the_python_that_is_not_blenders_own(tmp_path):
+    build = script("blender_extension/build.py")
+    wheels = [tmp_path / f"meshsplats-0.1.0-{tag}-linux_x86_64.whl" for tag in ("py3-none", "cp314-cp314")]
+    for wheel in wheels:
+        wheel.write_bytes(b"")
+    assert build.pack(wheels, tmp_path, "4.2").name == "meshsplats-0.1.0-linux_x64-blender_4.2.zip"
+    other = build.pack(wheels, tmp_path, "4.2", "3.14")
+    assert other.name == "meshsplats-0.1.0-linux_x64-blender_4.2-python_3.14.zip"
+
+
 def test_a_whole_session(packed, tmp_path):
     """In a process of its own, where meshsplats comes from the extension's wheel alone."""
     save_gaussians(ball_splats(400)[0], tmp_path / "ball.ply")

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +19,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import load_gaussians, save_gaussians
 from meshsplats.blender.inside import baking, materials, objects, stand_ins
+from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
 
 ROOT = Path(__file__).parents[2]
@@ -145,12 +148,100 @@ def test_the_panel_has_a_button_for_each(ball, extension):
 
             def draw(*arguments, **_):
                 if name == "operator":
-                    drawn.append(arguments[0])
+                    drawn.append((arguments[0], top.operator_context))
                 return Layout()
 
             return draw
 
+    top = Layout(operator_context="INVOKE_REGION_WIN")  # all layouts of a panel share it
     panel = sys.modules["blender_extension.panel"].MeshSplatsPanel
-    panel._object(None, Layout(), ball)
-    assert {"object.meshsplats_cut", "object.meshsplats_clean", "object.meshsplats_adjust"} <= set(drawn)
-    assert drawn.count("object.meshsplats_cut") == 2, "any, and all outside of a box"
+    panel._object(None, top, ball)
+    names = [name for name, _ in drawn]
+    assert {"object.meshsplats_cut", "object.meshsplats_clean", "object.meshsplats_adjust"} <= set(names)
+    assert names.count("object.meshsplats_cut") == 2, "any, and all outside of a box"
+    at_once = [name for name, context in drawn if context == "EXEC_DEFAULT"]
+    assert at_once == ["object.meshsplats_cut"], "the others ask in a dialog, if they have one"
+
+
+def test_a_warning_is_shown_whole_in_the_usual_side_bar(extension):
+    lines = []
+    column = SimpleNamespace(label=lambda text, icon: lines.append((text, icon)))
+    text = "Light was made for other splats: Bake Light"
+    sys.modules["blender_extension.panel"].draw_warning(SimpleNamespace(column=lambda align: column), text)
+    assert " ".join(line for line, _ in lines) == text
+    assert max(len(line) for line, _ in lines) <= 32
+    assert [icon for _, icon in lines] == ["ERROR", "BLANK1"]
+
+
+def test_tooltips_say_why_a_button_is_grey(ball, extension):
+    can_edit, said = sys.modules["blender_extension.cut_operator"].can_edit, []
+    operator = SimpleNamespace(poll_message_set=said.append)
+    assert can_edit(operator, bpy.context)
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert not can_edit(operator, bpy.context)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert not can_edit(operator, SimpleNamespace(object=bpy.data.objects.new("empty", None)))
+    assert said == ["Only in Object Mode", "The active object is no splat mesh"]
+
+
+def test_each_light_has_a_tooltip_of_its_own(extension):
+    stage = sys.modules["blender_extension.object_operators"].SetUpStage
+    texts = [
+        stage.description(None, SimpleNamespace(lights=n)) for n in ("sun", "noon", "overcast", "studio")
+    ]
+    assert len(set(texts)) == 4
+    assert texts[3].startswith("A large lamp on the left, a weaker one on the right. Set up light")
+
+
+def test_name_and_format_of_an_export_follow_each_other(extension):
+    export = sys.modules["blender_extension.export_operator"]
+    dialog = SimpleNamespace(filepath="/a/b.ply", format=".ply", _shown=".ply")
+    dialog.suffix_of = export.ExportSplats.suffix_of
+    for changes, path, suffix in (
+        ({}, "/a/b.ply", ".ply"),
+        ({"format": ".spz"}, "/a/b.spz", ".spz"),
+        ({"filepath": "/a/c.compressed.ply"}, "/a/c.compressed.ply", ".compressed.ply"),
+        ({"filepath": "/a/D.PLY"}, "/a/D.PLY", ".ply"),
+        ({"filepath": "/a/E"}, "/a/E.ply", ".ply"),
+        ({"format": ".compressed.ply"}, "/a/E.compressed.ply", ".compressed.ply"),
+        ({"format": ".ply"}, "/a/E.ply", ".ply"),
+    ):
+        vars(dialog).update(changes)
+        before = (dialog.filepath, dialog.format)
+        assert export.Export.check(dialog, None) == (before != (path, suffix))
+        assert (dialog.filepath, dialog.format) == (path, suffix)
+
+
+@pytest.mark.slow
+def test_lit_and_unlit_set_up_the_render_where_all_splats_are(ball):
+    view = bpy.context.scene
+    view.meshsplats_fast = True
+    other = ball.copy()
+    other.data = ball.data.copy()
+    assert view.view_settings.view_transform == "Raw"
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    assert view.view_settings.view_transform == "Standard"
+    view.view_settings.view_transform = "AgX"
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    assert view.view_settings.view_transform == "AgX", "nothing changed, so that the user's choice stays"
+    view.collection.objects.link(other)  # unlit
+    bpy.ops.object.meshsplats_shading(shading="unlit")
+    assert view.view_settings.view_transform == "Raw"
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    assert view.view_settings.view_transform == "Raw", "one of them is unlit"
+
+
+def test_a_blender_without_numpy_is_told_so(extension, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "numpy" else found(name))
+    with pytest.raises(RuntimeError, match=r"needs NumPy.*\n.*python3-numpy") as caught:
+        extension.register()
+    assert max(map(len, str(caught.value).splitlines())) < 90, "the window cuts longer lines"
+
+
+def test_warnings_of_other_add_ons_are_not_reported(extension):
+    with sys.modules["blender_extension.work"].own_warnings() as caught:
+        warnings.warn("unclosed file", ResourceWarning, stacklevel=1)
+        warnings.warn("deprecated", UserWarning, stacklevel=1)
+        warnings.warn("3 splats were left out", DataWarning, stacklevel=1)
+    assert [str(warning.message) for warning in caught] == ["3 splats were left out"]

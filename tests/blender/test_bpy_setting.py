@@ -12,6 +12,8 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import ball_splats
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Matrix
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
@@ -70,6 +72,8 @@ def test_one_click_sets_everything_up(empty, lights):
     lamps = {"sun": ["Sun"], "noon": ["Sun"], "overcast": [], "studio": ["Fill", "Sun"]}[lights]
     assert names == sorted(["ball", "ball light points", "ball stand-in", "Camera", "Ground", *lamps])
     ground = empty.objects["Ground"]
+    assert ground.data.materials[0].use_backface_culling, "EEVEE's viewports look through it from below"
+    assert empty.objects["ball stand-in"].display_type == "BOUNDS", "no wires over the splats"
     np.testing.assert_allclose(ground.location, (10, -3, 2), atol=0.12)
     assert empty.camera is empty.objects["Camera"]
     from bpy_extras.object_utils import world_to_camera_view
@@ -198,3 +202,65 @@ def test_viewports_show_what_was_imported():
     # The ball of radius 1 fills half to all of the view's height at 16 : 9; viewports take a sensor of 72 mm.
     half = space.region_3d.view_distance * 36 / space.lens * 9 / 16
     assert 1 < half < 2
+
+
+def test_the_camera_of_the_start_scene_sees_what_was_imported(tmp_path):
+    bpy.ops.wm.read_factory_settings()
+    view, obj = bpy.context.scene, ball()
+    obj.location, obj.scale = (100, 20, 3), (9, 9, 9)
+    bpy.context.view_layer.update()
+    before = np.array(view.camera.matrix_world)
+    setting.frame_in_start_camera(view, [obj])
+    bpy.context.view_layer.update()
+    camera = view.camera
+    np.testing.assert_allclose(np.array(camera.matrix_world)[:3, :3], before[:3, :3], atol=1e-6)
+    places = [world_to_camera_view(view, camera, obj.matrix_world @ v.co) for v in obj.data.vertices]
+    across, up, away = np.array(places).T
+    assert 0 < up.min() < 0.2, "nearly as high as the image"
+    assert 0.8 < up.max() < 1
+    assert 0 < across.min() < across.max() < 1
+    assert away.min() > camera.data.clip_start
+    assert away.max() < camera.data.clip_end
+    moved = camera.location.copy()
+    obj.location.x = 0
+    bpy.context.view_layer.update()
+    setting.frame_in_start_camera(view, [obj])
+    assert camera.location == moved, "a camera that was moved is the user's"
+    camera.matrix_world = Matrix(before)
+    bpy.context.view_layer.update()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    setting.frame_in_start_camera(view, [obj])
+    np.testing.assert_allclose(
+        camera.location, before[:3, 3], atol=1e-6, err_msg="a saved file is the user's"
+    )
+
+
+def test_viewports_show_colors_and_then_light():
+    bpy.ops.wm.read_factory_settings()
+    windows = bpy.context.window_manager.windows
+    views = [a.spaces.active for w in windows for a in w.screen.areas if a.type == "VIEW_3D"]
+    assert views
+    for before, wanted, after in (
+        ("SOLID", "MATERIAL", "MATERIAL"),
+        ("WIREFRAME", "MATERIAL", "WIREFRAME"),
+        ("RENDERED", "MATERIAL", "RENDERED"),
+        ("SOLID", "RENDERED", "RENDERED"),
+        ("MATERIAL", "RENDERED", "RENDERED"),
+        ("WIREFRAME", "RENDERED", "WIREFRAME"),
+    ):
+        views[0].shading.type = before
+        setting.show_colors(windows, wanted)
+        assert views[0].shading.type == after, (before, wanted)
+    bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+    views[0].shading.type = "SOLID"
+    setting.show_colors(windows, "MATERIAL")
+    assert views[0].shading.type == "SOLID", "that engine has no Material Preview"
+
+
+def test_a_blender_that_cannot_denoise_takes_more_samples(empty, monkeypatch):
+    for can, samples in ((True, 16), (False, 64)):
+        monkeypatch.setattr(versions, "can_denoise", lambda can=can: can)
+        rendering.lit_settings(empty, "cycles", samples=16, denoise=True)
+        assert (empty.cycles.use_denoising, empty.cycles.samples) == (can, samples)
+        rendering.lit_settings(empty, "cycles", samples=16, denoise=False)
+        assert (empty.cycles.use_denoising, empty.cycles.samples) == (False, 16)

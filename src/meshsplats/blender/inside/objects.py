@@ -113,6 +113,11 @@ def splat_objects(scene: Any) -> list[Any]:
     return [obj for obj in scene.objects if obj.type == "MESH" and LAYERS in obj.data]
 
 
+def is_lit(obj: Any) -> bool | None:
+    """Whether the splat mesh ``obj`` is lit; None for other objects."""
+    return bool(obj.data[LIT]) if obj.type == "MESH" and LIT in obj.data else None
+
+
 def count_layers(objs: Iterable[Any]) -> int:
     """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
     most: dict[tuple[bool, str], int] = {}

@@ -3,6 +3,7 @@ up."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,10 @@ from meshsplats.cameras.trajectories import orbit
 UP = (0.0, 0.0, 1.0)
 _AWAY = 2.5
 """Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
+_START_CAMERA = (7.3589, -6.9258, 4.9583)
+"""Where the camera stands that Blender starts with."""
+_ROOM = 1.1
+"""Half the height of an image, in radii of the subject that the camera is moved to."""
 
 
 def set_up(
@@ -82,10 +87,7 @@ def frame_in_viewports(windows: Any, objs: list[Any]) -> None:
     if not len(points):
         return
     bounds = scene_bounds(points)
-    spaces = [
-        area.spaces.active for window in windows for area in window.screen.areas if area.type == "VIEW_3D"
-    ]
-    for space in spaces:
+    for space in _views(windows):
         view = space.region_3d
         if view.view_perspective == "CAMERA":
             view.view_perspective = "PERSP"
@@ -93,3 +95,44 @@ def frame_in_viewports(windows: Any, objs: list[Any]) -> None:
         view.view_distance = _AWAY * bounds.radius * space.lens / 36
         space.clip_end = max(space.clip_end, 100 * bounds.radius)
         space.clip_start = min(space.clip_start, bounds.radius / 100)
+
+
+def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
+    """Moves the camera that Blender starts with, in a file that was not saved yet, until it sees ``objs``.
+    Its direction stays."""
+    camera = scene.camera
+    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
+    if bpy.data.filepath or camera is None or not len(points):
+        return
+    if camera.name != "Camera" or not np.allclose(camera.location, _START_CAMERA, atol=1e-3):
+        return
+    bounds, lens = scene_bounds(points), camera.data
+    away = _ROOM * bounds.radius / np.sin(_narrowest_angle(scene, lens) / 2)
+    axis = np.array(camera.matrix_world)[:3, 2]
+    camera.location = (bounds.center + away * axis / np.linalg.norm(axis)).tolist()
+    lens.clip_start = min(lens.clip_start, bounds.radius / 100)
+    lens.clip_end = max(lens.clip_end, away + 100 * bounds.radius)
+
+
+def _narrowest_angle(scene: Any, lens: Any) -> float:
+    """The angle, in radians, that the camera ``lens`` sees along the shorter side of images."""
+    render = scene.render
+    sides = sorted((render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y))
+    return 2 * float(np.arctan(np.tan(lens.angle / 2) * sides[0] / sides[1]))
+
+
+def show_colors(windows: Any, shading: str) -> None:
+    """Switches the 3D views of ``windows`` from Solid to ``shading``, MATERIAL or RENDERED; to RENDERED from
+    MATERIAL, too."""
+    lesser = {"SOLID"} if shading == "MATERIAL" else {"SOLID", "MATERIAL"}
+    for space in _views(windows):
+        if space.shading.type in lesser:
+            with suppress(TypeError):  # the engine Workbench has no Material Preview
+                space.shading.type = shading
+
+
+def _views(windows: Any) -> list[Any]:
+    """The 3D views of ``windows``."""
+    return [
+        area.spaces.active for window in windows for area in window.screen.areas if area.type == "VIEW_3D"
+    ]

@@ -155,6 +155,7 @@ def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> A
         if catcher
         else materials.fading("Ground", GREY, FADES[0] * radius, FADES[1] * radius)
     )
+    material.use_backface_culling = True  # so that EEVEE's viewports look through it from below
     obj.data.materials.append(material)
     obj.is_shadow_catcher = catcher
     return obj

@@ -77,7 +77,7 @@ def _child(obj: Any, mesh: Any, home: Any) -> Any:
     for way in ("camera", "glossy", "transmission", "volume_scatter"):
         setattr(child, f"visible_{way}", False)
     child.parent = obj
-    child.display_type = "WIRE"
+    child.display_type = "BOUNDS"  # viewports draw the edges of wires over the splats
     child.hide_select = True
     home.objects.link(child)
     return child

@@ -95,6 +95,14 @@ def enable_cycles() -> None:
         addon_utils.enable("cycles", default_set=False, persistent=False)
 
 
+def can_denoise() -> bool:
+    """Whether this Blender has OpenImageDenoise. Some Linux distributions leave it out, and Cycles then fails
+    when it is to denoise. Needs Cycles."""
+    import _cycles
+
+    return bool(_cycles.with_openimagedenoise)
+
+
 def set_input(modifier: Any, name: str, value: Any) -> None:
     """Gives the input ``name`` of a Geometry Nodes ``modifier`` a value."""
     key = _key(modifier, name)
