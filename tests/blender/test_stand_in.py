@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from _blender_scenes import ball_splats
 from meshsplats import GaussianCloud, convert, orbit, render
 from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
+from meshsplats.blender import subject
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
@@ -31,6 +33,31 @@ def test_lit_scenes_have_plain_colours():
     np.testing.assert_array_equal(unlit["colors"], mesh.colors)
     assert "harmonics" not in lit
     np.testing.assert_array_equal(lit["display"][:, :3], mesh.plain_colors)
+
+
+def test_places_are_lit_by_what_is_seen_from_within(monkeypatch):
+    """Colours, normals and stand-in also have the views that are found in a place; objects and meshes that
+    know no splats have none."""
+    seen = []
+
+    def arrays(mesh, cameras, **options):
+        seen.append(list(cameras))
+        return {}, 0.0
+
+    mesh = convert(ball_splats(300)[0])
+    given, found = orbit(mesh, 3)[:1], orbit(mesh, 2)
+    kinds = iter(["place", "object"])
+    monkeypatch.setattr(subject, "lit_arrays", arrays)
+    monkeypatch.setattr(subject, "_stand_in_arrays", lambda mesh, lit, cameras, *_: ({"n": len(cameras)}, 0))
+    monkeypatch.setattr(
+        subject,
+        "find_cameras",
+        lambda cloud, *_, **__: SimpleNamespace(kind=next(kinds), cameras=found),
+    )
+    counts = [subject.lit_subject(part, given)[0]["n"] for part in (mesh, mesh)]
+    assert counts == [3, 1]
+    assert seen[0] == [*given, *found]
+    assert subject.lit_subject(replace(mesh, face_splat=None, filter_px2=0), given)[0]["n"] == 1
 
 
 def ball_field(count: int = 24, radius: float = 8.0) -> np.ndarray:

@@ -14,8 +14,12 @@ from meshsplats.blender.options import CAREFUL, MAX_LAYERS, Effort, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.conversion.normals import shading_normals, typical_spacing
+from meshsplats.conversion.recovery import splats_of
 from meshsplats.mesh import SplatMesh
+from meshsplats.viewpoints.finding import find_cameras, worth_a_look
 
+_VIEWS = 24
+"""Views that are looked for within a place."""
 _FLOOR = 0.002
 """Share of the opacity that may lie below the ground: strays must not lift the subject off it."""
 
@@ -134,8 +138,11 @@ def lit_subject(
     announce: Announce = lambda phase: None,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Arrays and facts that a lit mesh has besides or instead of those of an unlit one, by the names of
-    ``inside.scene.Subject``. A mesh prior, whose shape changes, has no stand-in."""
+    ``inside.scene.Subject``. A mesh prior, whose shape changes, has no stand-in. They are made of images from
+    around the mesh and from ``cameras``; of a place, also from views from within."""
     mesh = mesh.plain
+    announce("colours")
+    cameras = [*cameras, *_views_within(mesh, threads)]
     lit, self_shadow = lit_arrays(mesh, cameras, effort=effort, threads=threads, announce=announce)
     arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
     if mesh.binding is None:
@@ -143,6 +150,16 @@ def lit_subject(
         made, facts["light_spacing"] = _stand_in_arrays(mesh, lit, cameras, effort, threads)
         arrays |= made
     return arrays, facts
+
+
+def _views_within(mesh: SplatMesh, threads: int | None) -> Sequence[Camera]:
+    """Views from within a place, found in the splats of ``mesh``; none of an object, or without splats. From
+    around it, one sees walls from behind, and the noise that no photograph saw."""
+    cloud = splats_of(mesh)
+    if cloud is None or not worth_a_look(cloud):
+        return []
+    found = find_cameras(cloud, _VIEWS, threads=threads)
+    return [] if found.kind == "object" else found.cameras
 
 
 def lit_arrays(

@@ -22,6 +22,17 @@ _FAINT = 1e-6
 """Weight of a corner of opacity 0 in a mean of colours."""
 
 
+def splats_of(scene: GaussianCloud | SplatMesh) -> GaussianCloud | None:
+    """The splats of ``scene``: of a mesh those that its fans were, or None if most of it is no fans."""
+    if isinstance(scene, GaussianCloud):
+        return scene
+    try:
+        cloud, whole = recover_splats(scene)
+    except ValueError:  # which splats its triangles were is not known
+        return None
+    return cloud if whole.mean() >= 0.5 else None
+
+
 def recover_splats(mesh: SplatMesh) -> tuple[GaussianCloud, np.ndarray]:
     """The splats whose fans, ellipses or stars ``mesh`` consists of, as ``convert`` makes them by default.
 

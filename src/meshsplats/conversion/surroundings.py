@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import FLOATERS, Findings, find
-from meshsplats.conversion.recovery import recover_splats
+from meshsplats.conversion.recovery import splats_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapeOptions
@@ -53,14 +53,9 @@ def floaters(
     found = find(scene, FLOATERS)
     if found.kept.all():
         return found
-    cloud = scene
-    if isinstance(scene, SplatMesh):
-        try:
-            cloud, whole = recover_splats(scene)
-        except ValueError:  # no fans
-            return found
-        if whole.mean() < 0.5:
-            return found
+    cloud = splats_of(scene)
+    if cloud is None:
+        return found
     given: list[Camera] | None = [] if source is None else None
     views = default_views(cloud, source or Path(), PLACES, side=(480, 480), given=given, threads=threads)
     if views is None:
