@@ -64,11 +64,11 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         names = [file.name for file in self.files if file.name]
         # Without a file: the folder, of a model or of levels of detail.
         paths = [os.path.join(self.directory, name) for name in names] or [self.filepath or self.directory]
-        choices = {name: getattr(self, name) for name in CHOICES}
+        choices = {name: getattr(self, name) for name in (*CHOICES, "frame_view")}
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects
+        from meshsplats.blender.inside import objects, setting
 
         objs = []
         for result in work.results:
@@ -81,6 +81,8 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
             for obj, path in zip(made, result.level_paths or (result.path,), strict=True):
                 obj.meshsplats.path = path
                 copy_choices(obj.meshsplats, self)
+            if result.view is not None:
+                setting.remember_view(made[0], result.view.relative_to(result.prepared[0]["origin"]))
             objs.append(made[0])
         if self.at_origin:  # all by the same way: files of one capture keep their places to each other
             away = objs[0].location.copy()

@@ -24,6 +24,8 @@ class Result:
     """Of a chain: the file of each level."""
     screen_sizes: tuple = ()
     """Of a chain: of each level, the size for which it was made, in pixels."""
+    view: object = None
+    """A ``Camera``, relative to the file's origin, that sees a place from within; None of an object."""
 
 
 @contextmanager
@@ -98,15 +100,18 @@ class Work:
         from meshsplats.formats.splat_paths import subject_name
 
         if not is_chain(Path(path)):
-            return Result(path, subject_name(Path(path)), (self._prepared(path, index, 1.0),))
+            prepared, view = self._prepared(path, index, 1.0)
+            return Result(path, subject_name(Path(path)), (prepared,), view=view)
         chain = read_chain(Path(path))
         files = tuple(str(level.path) for level in chain.levels)
         share = 1 / len(files)
-        prepared = tuple(self._prepared(file, index + i * share, share) for i, file in enumerate(files))
-        return Result(path, chain.name, prepared, files, tuple(level.screen_size for level in chain.levels))
+        levels = [self._prepared(file, index + i * share, share) for i, file in enumerate(files)]
+        sizes = tuple(level.screen_size for level in chain.levels)
+        return Result(path, chain.name, tuple(p for p, _ in levels), files, sizes, levels[0][1])
 
     def _prepared(self, path, begin, share):
-        """Arguments of ``objects.add``. Progress, in files, goes from ``begin`` on by ``share``."""
+        """Arguments of ``objects.add``, and a view from within a place. Progress, in files, goes from
+        ``begin`` on by ``share``."""
         from pathlib import Path
 
         from meshsplats.formats.sniff import identify
@@ -115,14 +120,28 @@ class Work:
         if identify(Path(path)) == "mesh":
             from meshsplats.formats.meshes import load_mesh
 
-            mesh = load_mesh(path)
+            scene = mesh = load_mesh(path)
         else:
             from meshsplats.formats.gaussians import load_gaussians
 
-            cloud = load_gaussians(path, axes=self.choices["axes"])
+            scene = load_gaussians(path, axes=self.choices["axes"])
             self._at(begin + 0.3 * share, "converting")
-            mesh = self._converted(cloud)
-        return self._ready(mesh, begin, share)
+            mesh = self._converted(scene)
+        view = None
+        if self.choices.get("frame_view"):
+            self._at(begin + 0.4 * share, "looking for a view")
+            view = self._view(scene, path)
+        return self._ready(mesh, begin, share), view
+
+    def _view(self, scene, path):
+        """The opening view of a place; None of an object, and of a mesh that is no fans of splats."""
+        from pathlib import Path
+
+        from meshsplats.conversion.recovery import splats_of
+        from meshsplats.viewpoints.showing import default_views
+
+        found = default_views(splats_of(scene) or scene, Path(path), 1)
+        return None if found is None else found[0][0]
 
     def _converted(self, cloud, up=None):
         from meshsplats.conversion import convert
@@ -249,8 +268,8 @@ def waiting(context):
 
 
 def settle(operator, context, objs):
-    """Selects new splat meshes, hides Blender's start scene, shows them in the viewports and, if ``operator``
-    is to, sets up the render for all of the scene."""
+    """Selects new splat meshes, hides Blender's start scene, shows them in the viewports, a place from
+    within, and, if ``operator`` is to, sets up the render for all of the scene."""
     from meshsplats.blender.inside import objects, setting
 
     for other in context.selected_objects:
@@ -262,8 +281,13 @@ def settle(operator, context, objs):
         operator.report({"INFO"}, f"MeshSplats: hid what Blender starts with: {', '.join(hidden)}")
     context.view_layer.update()
     if operator.frame_view:
-        setting.frame_in_viewports(context.window_manager.windows, objs)
-        setting.frame_in_start_camera(context.scene, objs)
+        windows = context.window_manager.windows
+        view = setting.view_from_within(objs)
+        if view is None:
+            setting.frame_in_viewports(windows, objs)
+            setting.frame_in_start_camera(context.scene, objs)
+        else:
+            setting.look_from(view, windows, context.scene)
     if operator.show_colors:
         setting.show_colors(context.window_manager.windows, "MATERIAL")
     if operator.use_cycles:

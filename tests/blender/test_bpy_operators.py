@@ -17,8 +17,8 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 from _blender_scenes import ball_splats
 
-from meshsplats import load_gaussians, save_gaussians
-from meshsplats.blender.inside import baking, materials, objects, stand_ins
+from meshsplats import convert, load_gaussians, look_at, save_gaussians
+from meshsplats.blender.inside import baking, materials, objects, setting, stand_ins
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
 
@@ -46,6 +46,34 @@ def ball(extension, tmp_path):
     bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "ball.ply"), at_origin=True)
     bpy.ops.ed.undo_push(message="before")
     return bpy.context.object
+
+
+def test_a_place_is_imported_with_a_view_from_within(extension, tmp_path, monkeypatch):
+    """The first click shows what was photographed, unless nothing is to be framed."""
+    save_gaussians(ball_splats(200)[0], tmp_path / "place.ply")
+    asked = []
+
+    def default_views(scene, source, count):
+        asked.append((len(scene), source, count))
+        return [look_at((0.1, 0.2, 0.3), (1, 0.4, 0.3), fov=60, width=400, height=400)], "a place"
+
+    monkeypatch.setattr("meshsplats.viewpoints.showing.default_views", default_views)
+    for frame_view in (True, False):
+        bpy.ops.wm.read_factory_settings()
+        before = np.array(bpy.context.scene.camera.matrix_world)
+        bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "place.ply"), frame_view=frame_view)
+        bpy.context.view_layer.update()
+        obj, after = bpy.context.object, np.array(bpy.context.scene.camera.matrix_world)
+        assert asked == [(200, tmp_path / "place.ply", 1)]
+        if not frame_view:
+            np.testing.assert_array_equal(after, before)
+            assert setting.VIEW not in obj
+            continue
+        np.testing.assert_allclose(after, setting.view_from_within([obj]).pose, atol=1e-5)
+        # Where the file has the camera, the object's own vertices being relative to its foot.
+        foot = objects.prepare(convert(load_gaussians(tmp_path / "place.ply")), False)["origin"]
+        local = np.array(obj.matrix_world.inverted()) @ after[:, 3]
+        np.testing.assert_allclose(local[:3] + foot, [0.1, 0.2, 0.3], atol=1e-4)
 
 
 def splat_count(obj) -> int:

@@ -13,7 +13,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 from _blender_scenes import ball_splats
 from bpy_extras.object_utils import world_to_camera_view
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
@@ -233,6 +233,54 @@ def test_the_camera_of_the_start_scene_sees_what_was_imported(tmp_path):
     np.testing.assert_allclose(
         camera.location, before[:3, 3], atol=1e-6, err_msg="a saved file is the user's"
     )
+
+
+def test_a_place_is_seen_from_within(tmp_path):
+    """By viewports and by the start camera, wherever the object has been moved; and Studio's camera."""
+    bpy.ops.wm.read_factory_settings()
+    scene, obj = bpy.context.scene, ball()
+    inside = look_at((0.2, -0.3, 0.1), (1, 0.4, 0.3), up=(0, 1, 0), fov=60, width=400, height=300)
+    setting.remember_view(obj, inside)
+    obj.location, obj.scale, obj.rotation_euler = (5, 2, 3), (3, 3, 3), (0.3, 0, 1)
+    bpy.context.view_layer.update()
+    view = setting.view_from_within([obj])
+    setting.look_from(view, bpy.context.window_manager.windows, scene)
+    bpy.context.view_layer.update()
+    x, y = np.meshgrid([-200.0, 0, 200], [-150.0, 0, 150])
+    rays = np.stack([x / inside.fx, y / inside.fy, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    points = inside.center + rays @ inside.world_to_camera[:3, :3]
+    world = points @ np.array(obj.matrix_world)[:3, :3].T + np.array(obj.location)
+    shown = np.array([world_to_camera_view(scene, scene.camera, Vector(p)) for p in world])
+    np.testing.assert_allclose(shown[4, :2], 0.5, atol=1e-5)
+    # Its image, 4 : 3, lies within that of 16 : 9, and is as wide as it can be.
+    assert (shown[:, :2] >= -1e-6).all()
+    assert (shown[:, :2] <= 1 + 1e-6).all()
+    np.testing.assert_allclose(shown[[0, 8], 0], [0.5 - 9 / 32, 0.5 + 9 / 32], atol=1e-5)
+    assert shown[0, 1] > shown[8, 1], "y goes down in images"
+    space = next(a for a in bpy.context.screen.areas if a.type == "VIEW_3D").spaces.active
+    seen = space.region_3d
+    ahead = np.array(seen.view_rotation.to_matrix())[:, 2]
+    eye = np.array(seen.view_location) + seen.view_distance * ahead
+    np.testing.assert_allclose(eye, np.array(scene.camera.matrix_world)[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(ahead, np.array(scene.camera.matrix_world)[:3, 2], atol=1e-5)
+    assert space.lens == pytest.approx(36 * 9 / 16 / view.half)
+    camera = view.camera(400, 300)
+    np.testing.assert_allclose(camera.center, eye, atol=1e-4)
+    np.testing.assert_allclose(camera.fx, 300 / 2 / view.half)
+    assert setting.view_from_within([]) is None
+    for broken in ([1.0] * 5, [float("nan")] * 18, [0.0] * 18):
+        obj[setting.VIEW] = broken
+        assert setting.view_from_within([obj]) is None
+
+
+def test_studio_looks_at_a_place_from_within(empty):
+    obj = ball()
+    setting.remember_view(obj, look_at((0.2, -0.3, 0.1), (1, 0.4, 0.3), fov=60, width=400, height=300))
+    bpy.context.view_layer.update()
+    setting.set_up(empty, [obj], fast=True)
+    bpy.context.view_layer.update()
+    pose = setting.view_from_within([obj]).pose
+    np.testing.assert_allclose(np.array(empty.camera.matrix_world), pose, atol=1e-5)
 
 
 def test_viewports_show_colors_and_then_light():

@@ -4,18 +4,21 @@ up."""
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, meshes, objects, scene, stage
+from meshsplats.blender.inside import baking, frame, meshes, objects, scene, stage
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import CAREFUL, FAST, LIGHTS, LightOptions
 from meshsplats.blender.subject import ground_height, lowest
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 
 UP = (0.0, 0.0, 1.0)
+VIEW = "MeshSplats view"
+"""Name of an object's property: a view of a place from within, as ``remember_view`` stores it."""
 _AWAY = 2.5
 """Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
 _START_CAMERA = (7.3589, -6.9258, 4.9583)
@@ -24,12 +27,31 @@ _ROOM = 1.1
 """Half the height of an image, in radii of the subject that the camera is moved to."""
 
 
+class View(NamedTuple):
+    """A view of a place from within, in Blender's world."""
+
+    pose: np.ndarray
+    """(4, 4) camera to world; Blender's cameras look along -z."""
+    half: float
+    """Tangent of half the angle that is to be seen at least."""
+    near: float
+    """What is nearer is not to be seen."""
+    away: float
+    """Distance of the middle of the place."""
+
+    def camera(self, width: int, height: int) -> Camera:
+        """As a camera of images of this size."""
+        focal = min(width, height) / (2 * self.half)
+        matrix = np.linalg.inv(self.pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        return Camera(matrix, focal, focal, width / 2, height / 2, width, height, near=self.near)
+
+
 def set_up(
     view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True, fast: bool = False
 ) -> LightOptions:
     """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
-    camera that sees all of them at the scene's resolution. Replaces those of an earlier call. ``fast``: light
-    for a preview.
+    camera that sees all of them at the scene's resolution, or a place from within. Replaces those of an
+    earlier call. ``fast``: light for a preview.
 
     Returns:
         The light.
@@ -50,7 +72,11 @@ def set_up(
     viewer = None
     if camera:
         width, height = view.render.resolution_x, view.render.resolution_y
-        seen = orbit(points, 1, elevation=15, azimuth=20, up=UP, width=width, height=height)[0]
+        within = view_from_within(objs)
+        if within is None:
+            seen = orbit(points, 1, elevation=15, azimuth=20, up=UP, width=width, height=height)[0]
+        else:
+            seen = within.camera(width, height)
         home = stage.collection("Cameras")
         away = float(np.linalg.norm(seen.center - bounds.center))
         view.camera = stage.add_camera(seen, "Camera", np.eye(3), 2 * away + 1000 * bounds.radius, home)
@@ -100,11 +126,9 @@ def frame_in_viewports(windows: Any, objs: list[Any]) -> None:
 def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
     """Moves the camera that Blender starts with, in a file that was not saved yet, until it sees ``objs``.
     Its direction stays."""
-    camera = scene.camera
+    camera = _start_camera(scene)
     points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
-    if bpy.data.filepath or camera is None or not len(points):
-        return
-    if camera.name != "Camera" or not np.allclose(camera.location, _START_CAMERA, atol=1e-3):
+    if camera is None or not len(points):
         return
     bounds, lens = scene_bounds(points), camera.data
     away = _ROOM * bounds.radius / np.sin(_narrowest_angle(scene, lens) / 2)
@@ -112,6 +136,61 @@ def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
     camera.location = (bounds.center + away * axis / np.linalg.norm(axis)).tolist()
     lens.clip_start = min(lens.clip_start, bounds.radius / 100)
     lens.clip_end = max(lens.clip_end, away + 100 * bounds.radius)
+
+
+def remember_view(obj: Any, view: Camera) -> None:
+    """Stores with the place ``obj`` a ``view`` of it from within, relative to the object's origin."""
+    half = max(view.width / view.fx, view.height / view.fy) / 2
+    obj[VIEW] = [*frame.camera_pose(view, np.eye(3)).ravel().tolist(), half, view.near or 0.0]
+
+
+def view_from_within(objs: list[Any]) -> View | None:
+    """The view that is stored with one of ``objs``, where that stands now; None of objects, which are seen
+    from around."""
+    for obj in objs:
+        stored = np.array(obj.get(VIEW, ()), np.float64)
+        if stored.shape != (18,) or not np.isfinite(stored).all() or stored[16] <= 0:
+            continue
+        pose = np.array(obj.matrix_world) @ stored[:16].reshape(4, 4)
+        scale = np.linalg.norm(pose[:3, :3], axis=0)
+        if scale.all():
+            pose[:3, :3] /= scale
+            away = float(np.linalg.norm(scene_bounds(meshes.world_points(obj)).center - pose[:3, 3]))
+            near = min(stored[17] * scale[0], away / 10) or away / 1000
+            return View(pose, float(stored[16]), near, away)
+    return None
+
+
+def look_from(view: View, windows: Any, scene: Any) -> None:
+    """Shows a place by ``view``, in the 3D views of ``windows`` and by the camera that Blender starts with,
+    in a file that was not saved yet."""
+    from mathutils import Matrix
+
+    pose, far = view.pose, 100 * view.away
+    for space in _views(windows):
+        seen = space.region_3d
+        seen.view_perspective = "PERSP"
+        seen.view_distance = view.away
+        seen.view_rotation = Matrix(pose[:3, :3].tolist()).to_quaternion()
+        seen.view_location = (pose[:3, 3] - view.away * pose[:3, 2]).tolist()
+        space.lens = min(max(36 * 9 / 16 / view.half, 1), 250)  # 72 mm for the width of about 16 : 9
+        space.clip_start, space.clip_end = min(space.clip_start, view.near), max(space.clip_end, far)
+    camera = _start_camera(scene)
+    if camera is None:
+        return
+    camera.matrix_world = Matrix(pose.tolist())
+    lens = camera.data
+    wider = np.tan(lens.angle / 2) / np.tan(_narrowest_angle(scene, lens) / 2)
+    lens.angle = 2 * float(np.arctan(wider * view.half))
+    lens.clip_start, lens.clip_end = min(lens.clip_start, view.near), max(lens.clip_end, far)
+
+
+def _start_camera(scene: Any) -> Any:
+    """The camera that Blender starts with, where it starts, in a file that was not saved yet; else None."""
+    camera = scene.camera
+    if bpy.data.filepath or camera is None or camera.name != "Camera":
+        return None
+    return camera if np.allclose(camera.location, _START_CAMERA, atol=1e-3) else None
 
 
 def _narrowest_angle(scene: Any, lens: Any) -> float:
