@@ -188,9 +188,9 @@ class CleanSplats(bpy.types.Operator):
         from meshsplats.conversion.cleaning import CleaningRules
 
         obj = context.object
-        rules = CleaningRules(
-            sparse=self.sparse or None, min_part=self.min_part or None, max_size=self.max_size
-        )
+        # Blender's numbers have single precision, and its defaults are to be those of the rules.
+        values = {name: round(getattr(self, name), 6) for name in ("sparse", "min_part", "max_size")}
+        rules = CleaningRules(**{name: value or None for name, value in values.items()})
         try:
             with waiting(context):
                 mesh, faces = cutting.floaters(obj, rules)

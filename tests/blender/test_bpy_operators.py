@@ -19,6 +19,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, load_gaussians, look_at, save_gaussians
 from meshsplats.blender.inside import baking, materials, objects, setting, stand_ins
+from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
 
@@ -99,6 +100,21 @@ def test_edits_of_splats_and_the_way_back(ball, tmp_path):
     red = np.flatnonzero(before.colors[:200, 1] < 0.4)
     assert np.ptp(found.colors[red], axis=1).max() < 1e-3
     np.testing.assert_allclose(found.opacities / before.opacities[:200], 0.5, atol=0.05)
+
+
+def test_cleaning_by_default_asks_what_surrounds_a_place(ball, monkeypatch):
+    """Numbers of operators have single precision: their defaults must still be those of the rules."""
+    asked = []
+
+    def floaters(mesh):
+        asked.append(len(mesh.splats))
+        return find(mesh)
+
+    monkeypatch.setattr("meshsplats.conversion.surroundings.floaters", floaters)
+    bpy.ops.object.meshsplats_clean(sparse=0.06)
+    assert asked == []
+    bpy.ops.object.meshsplats_clean()
+    assert asked == [200]
 
 
 def test_undo_takes_edits_back(ball):

@@ -184,12 +184,12 @@ def test_the_start_fills_the_budget():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", ["ball", "room"])
-def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
+@pytest.mark.parametrize(("scene", "other"), [("ball", 15), ("room", 13)])
+def test_a_photograph_with_a_wrong_camera_is_named(scene, other, request):
     """The others still give a mesh, and none of them is named, not even blurred ones."""
     dataset = request.getfixturevalue(scene)
     views = list(dataset.train)
-    views[7] = replace(views[7], source=views[15].source)
+    views[7] = replace(views[7], source=views[other].source)
     for i in (3, 11):
         sharp = views[i].load()
         views[i] = replace(views[i], source=replace(sharp, **{n: blurred(getattr(sharp, n)) for n in LAYERS}))
@@ -198,7 +198,7 @@ def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
     with pytest.warns(DataWarning) as said:
         mesh = train(Dataset(tuple(views)), train_config(steps=120, **size))
     *early, last = [str(warning.message) for warning in said]
-    assert any(line.startswith("the same photograph twice: 007 and 015.") for line in early)
+    assert any(line.startswith(f"the same photograph twice: 007 and 0{other}.") for line in early)
     assert last.startswith("1 of 19 photographs do not fit the others: 007.")
     assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
 
