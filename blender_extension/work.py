@@ -105,13 +105,13 @@ class Work:
         chain = read_chain(Path(path))
         files = tuple(str(level.path) for level in chain.levels)
         share = 1 / len(files)
-        levels = [self._prepared(file, index + i * share, share) for i, file in enumerate(files)]
+        levels = [self._prepared(file, index + i * share, share, look=i == 0) for i, file in enumerate(files)]
         sizes = tuple(level.screen_size for level in chain.levels)
         return Result(path, chain.name, tuple(p for p, _ in levels), files, sizes, levels[0][1])
 
-    def _prepared(self, path, begin, share):
-        """Arguments of ``objects.add``, and a view from within a place. Progress, in files, goes from
-        ``begin`` on by ``share``."""
+    def _prepared(self, path, begin, share, look=True):
+        """Arguments of ``objects.add`` and, with ``look``, a view from within a place. Progress, in files,
+        goes from ``begin`` on by ``share``."""
         from pathlib import Path
 
         from meshsplats.formats.sniff import identify
@@ -128,7 +128,7 @@ class Work:
             self._at(begin + 0.3 * share, "converting")
             mesh = self._converted(scene)
         view = None
-        if self.choices.get("frame_view"):
+        if look and self.choices.get("frame_view"):
             self._at(begin + 0.4 * share, "looking for a view")
             view = self._view(scene, path)
         return self._ready(mesh, begin, share), view
