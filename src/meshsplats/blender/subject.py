@@ -178,7 +178,6 @@ def lit_arrays(
     """
     from meshsplats.blender.linear import linear_colors
 
-    announce("colours")
     colors = linear_colors(mesh, cameras, steps=effort.steps, views=effort.fit_views, threads=threads)
     announce("normals")
     normals = shading_normals(mesh, cameras, views=effort.normal_views, threads=threads)
