@@ -141,17 +141,16 @@ $(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --force-reinstall --no-deps $(<D)/*.whl
 	@touch $@
 
-# Left out is what does not depend on the versions: what Chromium and Dawn draw and compile, the rules and documents of
-# this repository, what the core computes, to which all commands give arrays, whether bits, threads and memory are kept,
-# how files appear on full disks and after kills, and real scenes, which go through the same lines as small ones.
+# Left out is what does not depend on the versions: what Chromium and Dawn draw and compile, the rules of this
+# repository, what the core computes, to which all commands give arrays, and real scenes, which go through the same
+# lines as small ones.
 LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py controls.py docs_page.py exact.py screens.py \
-	shader_of_docs.py) webgpu/test_dawn.py test_benchmarks.py test_compare_commits.py test_house.py test_rooms.py files) \
+	shader_of_docs.py) webgpu/test_dawn.py test_benchmarks.py test_compare_commits.py test_house.py test_rooms.py) \
 	$(CORE_TESTS)
-LOWEST_TESTS_LEFT_OUT := same_bits or a_bit or threads or memory or of_the_documents
 
 test-lowest: $(LOWEST_VENV)/installed
 	MESHSPLATS_SHARED_DATA=left-out $(LOWEST_VENV)/bin/python -m pytest $(PARALLEL) --tier quick \
-	  $(LOWEST_LEFT_OUT:%=--ignore=%) -k 'not ($(LOWEST_TESTS_LEFT_OUT))'
+	  $(LOWEST_LEFT_OUT:%=--ignore=%)
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
 $(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')
