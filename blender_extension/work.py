@@ -140,8 +140,9 @@ class Work:
         from meshsplats.conversion.recovery import splats_of
         from meshsplats.viewpoints.showing import default_views
 
-        found = default_views(splats_of(scene) or scene, Path(path), 1)
-        return None if found is None else found[0][0]
+        cloud = splats_of(scene)
+        found = cloud and default_views(cloud, Path(path), 1)
+        return found[0][0] if found else None
 
     def _converted(self, cloud, up=None):
         from meshsplats.conversion import convert

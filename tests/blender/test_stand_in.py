@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,14 +45,10 @@ def test_places_are_lit_by_what_is_seen_from_within(monkeypatch):
 
     mesh = convert(ball_splats(300)[0])
     given, found = orbit(mesh, 3)[:1], orbit(mesh, 2)
-    kinds = iter(["place", "object"])
+    views = iter([(found, "a place"), None])
     monkeypatch.setattr(subject, "lit_arrays", arrays)
     monkeypatch.setattr(subject, "_stand_in_arrays", lambda mesh, lit, cameras, *_: ({"n": len(cameras)}, 0))
-    monkeypatch.setattr(
-        subject,
-        "find_cameras",
-        lambda cloud, *_, **__: SimpleNamespace(kind=next(kinds), cameras=found),
-    )
+    monkeypatch.setattr(subject, "default_views", lambda cloud, *_, **__: next(views))
     counts = [subject.lit_subject(part, given)[0]["n"] for part in (mesh, mesh)]
     assert counts == [3, 1]
     assert seen[0] == [*given, *found]

@@ -16,7 +16,7 @@ from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighte
 from meshsplats.conversion.normals import shading_normals, typical_spacing
 from meshsplats.conversion.recovery import splats_of
 from meshsplats.mesh import SplatMesh
-from meshsplats.viewpoints.finding import find_cameras, worth_a_look
+from meshsplats.viewpoints.showing import default_views
 
 _VIEWS = 24
 """Views that are looked for within a place."""
@@ -156,10 +156,8 @@ def _views_within(mesh: SplatMesh, threads: int | None) -> Sequence[Camera]:
     """Views from within a place, found in the splats of ``mesh``; none of an object, or without splats. From
     around it, one sees walls from behind, and the noise that no photograph saw."""
     cloud = splats_of(mesh)
-    if cloud is None or not worth_a_look(cloud):
-        return []
-    found = find_cameras(cloud, _VIEWS, threads=threads)
-    return [] if found.kind == "object" else found.cameras
+    views = cloud and default_views(cloud, None, _VIEWS, side=(400, 400), threads=threads)
+    return views[0] if views else []
 
 
 def lit_arrays(

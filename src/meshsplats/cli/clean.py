@@ -103,14 +103,14 @@ class Clean(Command):
         preview: Path,
         seconds: float,
     ) -> None:
-        counts = found.counts()
-        around = counts.pop("surroundings", None)
         places = left.means if isinstance(left, GaussianCloud) else left.vertices
         lower, upper = (
             [round(float(v), 4) for v in side + left.origin]
             for side in (places.min(axis=0), places.max(axis=0))
         )
         if self.json:
+            counts = found.counts()
+            around = counts.pop("surroundings", None)
             result = {
                 "input": shown_path(self.input),
                 "output": None if self.preview_only else str(self.output),

@@ -12,6 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import look_at
 from meshsplats.conversion.cleaning import FLOATERS, Findings, find
 from meshsplats.conversion.recovery import splats_of
 from meshsplats.gaussians import GaussianCloud
@@ -54,11 +55,8 @@ def floaters(
     if found.kept.all():
         return found
     cloud = splats_of(scene)
-    if cloud is None:
-        return found
-    given: list[Camera] | None = [] if source is None else None
-    views = default_views(cloud, source or Path(), PLACES, side=(480, 480), given=given, threads=threads)
-    if views is None:
+    views = cloud and default_views(cloud, source, PLACES, side=(480, 480), threads=threads)
+    if not views:
         return found
     return without_surroundings(scene, replace(found, camera=views[0][0]), views[0], threads=threads)
 
@@ -126,14 +124,10 @@ def _as_mesh(
 
 def _panorama(camera: Camera) -> Iterator[Camera]:
     """The six views of a cube around the place of ``camera``."""
-    axes = np.eye(3)
-    lens = replace(camera, fx=SIDE / 2, fy=SIDE / 2, cx=SIDE / 2, cy=SIDE / 2, width=SIDE, height=SIDE)
-    for right, down, ahead in ((0, 1, 2), (2, 1, -1), (-1, 1, -3), (-3, 1, 0), (0, -3, 1), (0, 2, -2)):
-        turned = [axes[i] if i >= 0 else -axes[~i] for i in (right, down, ahead)]
-        rotation = np.array(turned) @ camera.world_to_camera[:3, :3]
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ camera.center
-        yield replace(lens, world_to_camera=matrix)
+    axes = camera.world_to_camera[:3, :3]
+    for gaze, up in zip((*axes, *-axes), (*axes[[1, 2, 0]], *axes[[1, 2, 0]]), strict=True):
+        there = camera.center + gaze
+        yield look_at(camera.center, there, up=up, width=SIDE, height=SIDE, fov=90, near=camera.near)
 
 
 def _behind(depth: np.ndarray) -> np.ndarray:

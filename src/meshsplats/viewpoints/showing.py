@@ -25,12 +25,15 @@ from meshsplats.viewpoints.kind import kind_from_outside
 from meshsplats.viewpoints.walking import keys_of, walk
 
 
-def opening_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
-    """The view with which the splats ``source`` are to open, relative to ``origin``; None if none is given.
+def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
+    """The view with which the splats ``source`` are to open, relative to ``origin``; None if none is given,
+    or if there is no file or folder of them.
 
     It is the first camera inside a glTF file, or the start camera of SuperSplat's viewer: that of a
     ``settings.json`` in the folder, which has no other splats. A DataWarning says where it cannot be read.
     """
+    if source is None:
+        return None
     folder = source if source.is_dir() else source.absolute().parent
     path = folder / NAME
     try:
@@ -47,7 +50,7 @@ def opening_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0
 
 
 def opened_with(
-    cameras: Sequence[Camera], source: Path, origin: np.ndarray, side: tuple[int, int]
+    cameras: Sequence[Camera], source: Path | None, origin: np.ndarray, side: tuple[int, int]
 ) -> list[Camera]:
     """As many cameras, beginning with ``opening_beside`` where there is one, in images of ``side`` pixels."""
     opening = opening_beside(source, origin)
@@ -57,7 +60,7 @@ def opened_with(
 
 def default_views(
     scene: GaussianCloud | SplatMesh,
-    source: Path,
+    source: Path | None,
     count: int,
     *,
     side: tuple[int, int] = (800, 800),
@@ -73,7 +76,7 @@ def default_views(
     (``opening_beside``) is the first of these, and of an object, too, where one view is asked for.
 
     Args:
-        source: the file or folder of the splats.
+        source: the file or folder of the splats; None: they have none that could give cameras.
         side: width and height of the images, pixels.
         up: (3,) direction, where the user names it.
         film: the views are on a smooth round.
@@ -86,7 +89,8 @@ def default_views(
         return [_in_shape(opening, side)], "seen as the start camera beside or inside the file does"
     if not worth_a_look(scene):
         return None
-    given = (cameras_beside(source, scene.origin) or []) if given is None else given
+    if given is None and source is not None:
+        given = cameras_beside(source, scene.origin)
     if given:
         toward = guess_up(scene, given) if up is None else unit_up(up)
         if kind_from_outside(scene, toward, threads)[0] == "object":

@@ -32,6 +32,11 @@ def camera_pose(camera: Camera, rotation: np.ndarray) -> np.ndarray:
     return pose
 
 
+def world_to_camera(pose: np.ndarray) -> np.ndarray:
+    """(4, 4) float64 of the camera that has this ``camera_pose``."""
+    return np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
 def lens(camera: Camera, sensor_width: float = 36.0) -> dict[str, Any]:
     """Blender's settings for the camera's lens, sensor fit HORIZONTAL: ``lens`` in mm, ``shift_x``,
     ``shift_y``, ``pixel_aspect_x``, ``pixel_aspect_y`` (these two belong to the scene)."""

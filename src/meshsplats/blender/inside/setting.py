@@ -42,7 +42,7 @@ class View(NamedTuple):
     def camera(self, width: int, height: int) -> Camera:
         """As a camera of images of this size."""
         focal = min(width, height) / (2 * self.half)
-        matrix = np.linalg.inv(self.pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        matrix = frame.world_to_camera(self.pose)
         return Camera(matrix, focal, focal, width / 2, height / 2, width, height, near=self.near)
 
 
@@ -59,7 +59,7 @@ def set_up(
     Raises:
         ValueError: ``objs`` have no visible vertices.
     """
-    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
+    points = _points(objs)
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
     objects.renew_light(view, objs, fast=fast)
@@ -109,7 +109,7 @@ def hide_start_scene(scene: Any) -> list[str]:
 
 def frame_in_viewports(windows: Any, objs: list[Any]) -> None:
     """Turns the 3D views of ``windows`` to ``objs``, from the direction that they have."""
-    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
+    points = _points(objs)
     if not len(points):
         return
     bounds = scene_bounds(points)
@@ -127,7 +127,7 @@ def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
     """Moves the camera that Blender starts with, in a file that was not saved yet, until it sees ``objs``.
     Its direction stays."""
     camera = _start_camera(scene)
-    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
+    points = _points(objs)
     if camera is None or not len(points):
         return
     bounds, lens = scene_bounds(points), camera.data
@@ -208,6 +208,11 @@ def show_colors(windows: Any, shading: str) -> None:
         if space.shading.type in lesser:
             with suppress(TypeError):  # the engine Workbench has no Material Preview
                 space.shading.type = shading
+
+
+def _points(objs: list[Any]) -> np.ndarray:
+    """(n, 3) vertices of ``objs`` in Blender's world."""
+    return np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
 
 
 def _views(windows: Any) -> list[Any]:
