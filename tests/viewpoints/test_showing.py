@@ -80,6 +80,15 @@ def test_cameras_of_a_model_come_before_found_ones(kind, tmp_path):
     assert heights(given) == {5.0}
 
 
+def test_splats_without_a_file_have_no_cameras_of_the_working_directory(kind, tmp_path, monkeypatch):
+    (tmp_path / "settings.json").write_text(json.dumps(START))
+    monkeypatch.chdir(model(tmp_path))
+    assert heights(default_views(splats(), tmp_path, 4)[0]) == {1.0}
+    for count in (1, 4):
+        assert heights(default_views(splats(), None, count)[0]) == {2.0}
+    assert opening_beside(None) is None
+
+
 def test_objects_and_meshes_are_seen_from_all_around(kind, tmp_path):
     kind[0] = "object"
     assert default_views(splats(), tmp_path, 4) is None
