@@ -18,7 +18,11 @@ from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras, first_impression, varied
+from meshsplats.viewpoints.kind import fineness_outside
 from meshsplats.viewpoints.sample import AllSplats, Sample
+from meshsplats.viewpoints.search import find_places
+from meshsplats.viewpoints.thinning import ByPlace, probabilities, sizes_of
+from meshsplats.viewpoints.upright import find_upright, height_over_width
 from meshsplats.viewpoints.views import Checked, Chooser
 
 HALF = np.array([2.0, 1.3, 3.0])
@@ -193,11 +197,11 @@ def test_a_first_impression_of_an_object_and_of_nothing():
     assert first_impression(replace(room(), scales=np.full((28_000, 3), 40.0))) is None  # takes long
 
 
-def test_faces_of_a_panorama_leave_out_what_they_do_not_show():
+def test_faces_of_a_panorama_leave_out_what_they_do_not_show(monkeypatch):
     sample = Sample(room(3000, 500), np.array([0.0, -1, 0]), 1)
     place = np.array([0.4, -0.2, 0.9])
     shares, alpha, depth = sample.panorama(place)
-    sample.reach = np.full_like(sample.reach, np.inf)
+    monkeypatch.setattr("meshsplats.viewpoints.sample.REACH", np.inf)
     for mine, whole in zip((shares, alpha, depth), sample.panorama(place), strict=True):
         assert (np.isfinite(mine) == np.isfinite(whole)).mean() > 0.999
         both = np.isfinite(mine) & np.isfinite(whole)
@@ -215,6 +219,82 @@ def test_some_of_many_splats_show_what_all_do(limit, count, monkeypatch):
     assert np.abs(few_alpha - alpha).mean() < 0.04
     assert np.abs(few_angle - angle).mean() < 0.1
     assert np.abs(few_spread - spread).mean() < 0.05
+
+
+def test_of_many_splats_a_place_shows_those_that_fill_its_panorama():
+    # Of 120,000 splats of walls and 8000 large ones around them, 3000.
+    cloud = room(120_000, 8000)
+    cloud = replace(cloud, scales=np.where(cloud.scales < 0.05, cloud.scales * np.float32(0.4), cloud.scales))
+    place, up = np.array([0.3, 0.1, -0.5]), np.array([0.0, -1, 0])
+    depth = Sample(cloud, up, 2).panorama(place)[2]
+    few = Sample(cloud, up, 2, 3000)
+    assert few.by_place is not None
+    assert np.median(np.abs(np.log(few.panorama(place)[2] / depth))) < 0.12
+    few.by_place = None  # any are as likely: the noise comes through the walls
+    assert np.median(np.abs(np.log(few.panorama(place)[2] / depth))) > 0.25
+
+
+def test_splats_that_a_place_shows_cover_what_all_do():
+    cloud = room(60_000, 3000)
+    by_place = ByPlace(cloud, 1500)
+    assert len(by_place.pool) == len(cloud)  # fewer than a pool has
+    place = np.array([0.2, -0.3, 1.0])
+    thin, size = by_place.seen_from(place, 0.01)
+    assert 1200 < len(thin) < 1900
+    assert (sizes_of(thin.scales) >= size * (1 - 1e-6)).all()
+    assert (thin.scales.min(axis=1) <= cloud.scales.max()).all()
+
+    def solid_angle(splats: GaussianCloud) -> float:
+        away = np.linalg.norm(splats.means - place, axis=1)
+        return float((sizes_of(splats.scales).astype(float) ** 2 * splats.opacities / away**2).sum())
+
+    assert solid_angle(thin) == pytest.approx(solid_angle(cloud), rel=0.1)
+
+
+def test_probabilities_have_the_sum_that_is_asked_for():
+    value = np.random.default_rng(0).exponential(size=20_000) ** 3
+    likely = probabilities(value, 3000)
+    assert likely.sum() == pytest.approx(3000, rel=0.1)
+    assert likely.max() <= 1
+    assert likely.min() > 0
+    between = (likely < 1) & (likely > likely.min())
+    assert np.ptp(likely[between] / value[between]) < 1e-12 * likely.max() / value[between].min()
+    assert (probabilities(value, 20_000) == 1).all()
+
+
+def test_the_noise_around_a_capture_of_many_splats_is_coarse(monkeypatch):
+    # Four splats of half the size stand for one: what is fine against the splats of the scene stays so.
+    cloud = room(3000, 4000)
+    quarters = GaussianCloud.joined([cloud] * 4)
+    quarters = replace(quarters, scales=quarters.scales / 2)
+    up = np.array([0.0, -1, 0])
+    monkeypatch.setattr("meshsplats.viewpoints.kind.USUAL", 1000)
+    unscaled = fineness_outside(quarters, up)
+    monkeypatch.setattr("meshsplats.viewpoints.kind.MANY", len(cloud))
+    assert fineness_outside(quarters, up) == pytest.approx(fineness_outside(cloud, up), abs=0.02)
+    assert unscaled > fineness_outside(quarters, up) + 0.1
+
+
+def test_a_floor_is_told_from_a_wall_by_the_width_of_what_lies_on_it():
+    points = np.random.default_rng(2).uniform(-1, 1, (2000, 3)) * [6, 5, 1]
+    assert height_over_width(points, np.array([0.0, 0, 1])) == pytest.approx(1 / 5.5, rel=0.1)
+    assert height_over_width(points, np.array([1.0, 0, 0])) == pytest.approx(2, rel=0.1)
+
+
+def test_a_wall_that_fills_more_of_the_images_than_the_floor_is_no_floor(monkeypatch):
+    # A low hall; z is up, against the default.
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    low = room(6000, 500)
+    hall = moved(replace(low, means=low.means * np.float32([1, 0.5, 1])), 1, turn, np.zeros(3))
+    sample = Sample(hall, np.array([0.0, -1, 0]), 2)
+    places = find_places(sample, (12, 8, 6))
+    wall, floor = np.array([0.0, -1, 0]), np.array([0.0, 0, 1])
+    for shares, up, sure in (((0.14, 0.12), floor, 0.5), ((0.3, 0.05), wall, 1)):
+        planes = list(zip(shares, (wall, floor), strict=True))
+        monkeypatch.setattr("meshsplats.viewpoints.upright._planes", lambda *a, planes=planes: planes)
+        found = find_upright(sample, places, np.array([0.0, -1, 0]))
+        assert abs(found.up @ up) > 0.999
+        assert found.confidence == pytest.approx(sure)
 
 
 def test_what_is_kept_of_many_splats_is_no_more_than_views_need(monkeypatch):

@@ -17,7 +17,10 @@ Kind = Literal["object", "ring", "place", "aerial"]
 FEWEST = 1000
 """Scenes of fewer splats are objects: there is nothing to find."""
 USUAL = 30_000
-"""Splats of scenes that are coarser because they have fewer count as if there were so many."""
+"""Splats of scenes that are coarser because they have fewer count as if there were so many..."""
+MANY = 400_000
+"""...and of scenes that are finer because they have more than these, as if there were so few: from afar, even
+the noise around a capture of ten million looks fine."""
 OUTSIDE_VIEWS = 10
 OUTSIDE_SIDE = 48
 OUTSIDE_SPLATS = 400_000
@@ -38,7 +41,7 @@ MOST_SURE = 0.45
 
 def fineness_outside(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> float:
     """Share of fine splats in what the dome around the scene shows, 0 to 1."""
-    coarse = COARSE * max(1.0, (USUAL / len(cloud)) ** 0.5)
+    coarse = COARSE * (min(max(len(cloud), USUAL), MANY) / len(cloud)) ** 0.5
     splats = AllSplats(subsample_of(cloud), threads)
     fine = []
     for camera in outside_cameras(cloud, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE):

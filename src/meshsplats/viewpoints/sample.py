@@ -17,13 +17,15 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.rendering.api import Rendering, render_splats
+from meshsplats.viewpoints.thinning import ByPlace, largest, sizes_of
 
 SAMPLE = 50_000
 """Number of splats that panoramas show."""
 SMALL_SAMPLE = 32_000
 """The same for a first impression."""
 WIDEST = 5.0
-"""Largest factor by which the splats of a sample are widened to close surfaces again."""
+"""Largest factor by which the splats of a sample are widened to close surfaces again. Where more is needed,
+panoramas choose the splats that they show anew for each place."""
 SIDE = 24
 """Pixels along the edge of a panorama's cube."""
 SHARP_SIDE = 300
@@ -59,13 +61,6 @@ def fibonacci(count: int) -> np.ndarray:
     return np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
 
 
-def sizes_of(scales: np.ndarray) -> np.ndarray:
-    """(n,) float32 sizes of splats: the geometric mean of their two larger standard deviations (n, 3)."""
-    largest = scales.max(axis=1)
-    middle = scales.sum(axis=1) - largest - scales.min(axis=1)
-    return np.sqrt(np.maximum(middle, 0) * largest) + np.finfo(np.float32).tiny
-
-
 def coded(values: np.ndarray) -> np.ndarray:
     """(n, 1, 3) harmonics that show ``values`` (n, 3), each from 0 to 1, as colours."""
     return ((values - 0.5) / SH_C0)[:, None].astype(np.float32)
@@ -84,7 +79,7 @@ class AllSplats:
         self.cloud = cloud if step == 1 else _every(cloud, step)
         self.threads, self.wider = threads, float(step) ** 0.5
         self.sizes = sizes_of(self.cloud.scales)
-        self.reach = REACH * self.wider * self.cloud.scales.max(axis=1)
+        self.reach = REACH * self.wider * largest(self.cloud.scales)
 
     def look(self, camera: Camera, sharp_side: int = CHECK_SIDE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What ``camera`` sees.
@@ -148,9 +143,9 @@ class Sample:
             thin = cloud.take(np.sort(np.random.default_rng(0).choice(n, most, replace=False)))
             wider = min((n / most) ** 0.5, WIDEST)
         self.thin = thin = replace(thin, scales=thin.scales * np.float32(wider), sh=thin.sh[:, :1])
-        self.reach = REACH * thin.scales.max(axis=1)
         self.means = thin.means.astype(np.float64)
         self.size = sizes_of(thin.scales).astype(np.float64) / wider
+        self.by_place = None if n <= most * WIDEST**2 else ByPlace(cloud, most)
         self.normals = _normals(thin)
         self.center = np.median(self.means, axis=0)
         self.radius = float(np.median(np.linalg.norm(self.means - self.center, axis=1))) or 1.0
@@ -192,11 +187,16 @@ class Sample:
             (DIRECTIONS, bins) shares of the view that opaque pixels of an angle take, (DIRECTIONS,) mean
             alpha, and (6 * SIDE * SIDE,) the distance of each pixel along ``rays``, inf where it is empty.
         """
-        apart = (self.means - place) @ self.axes.T
+        thin, means, size = self.thin, self.means, self.size
+        if self.by_place is not None:
+            thin, size = self.by_place.seen_from(place, self.near)
+            means = thin.means.astype(np.float64)
+        apart = (means - place) @ self.axes.T
         away = np.linalg.norm(apart, axis=1) + 1e-9 * self.radius
-        angle = angle_as_color(self.size / away)
+        angle = angle_as_color(size / away)
         shown = coded(np.stack([angle, np.clip(self.near / away, 0, 1), angle], axis=1))
-        drawn = [self._drawn(place, k, apart, shown) for k in range(6)]
+        reach = REACH * largest(thin.scales)
+        drawn = [self._drawn(thin, reach, place, k, apart, shown) for k in range(6)]
         color = np.concatenate([image.color.reshape(-1, 3) for image in drawn]).astype(np.float64)
         alpha = np.concatenate([image.alpha.ravel() for image in drawn]).astype(np.float64)
         solid = np.round(np.clip((alpha - 0.7) / 0.25, 0, 1) * LEVELS)  # surfaces have no holes, noise has
@@ -211,17 +211,24 @@ class Sample:
         seen = (self.cone @ np.round(alpha * LEVELS)) / scale[:, 0]
         return (self.cone @ shares) / scale, seen, depth
 
-    def _drawn(self, place: np.ndarray, k: int, apart: np.ndarray, shown: np.ndarray) -> Rendering:
-        """Face ``k`` of the panorama from ``place``: of the splats that reach into it.
+    def _drawn(
+        self,
+        thin: GaussianCloud,
+        reach: np.ndarray,
+        place: np.ndarray,
+        k: int,
+        apart: np.ndarray,
+        shown: np.ndarray,
+    ) -> Rendering:
+        """Face ``k`` of the panorama from ``place``: of the splats ``thin`` that ``reach`` (n,) into it.
 
         Args:
             apart: (n, 3) of the splats from there, along ``axes``.
             shown: (n, 1, 3) their harmonics.
         """
         ahead = apart[:, k % 3] if k < 3 else -apart[:, k % 3]
-        beside = np.abs(np.delete(apart, k % 3, axis=1)).max(axis=1)
-        rows = np.flatnonzero((ahead > 0) & (beside < ahead + self.reach))
-        thin = self.thin
+        beside = np.maximum(np.abs(apart[:, (k + 1) % 3]), np.abs(apart[:, (k + 2) % 3]))
+        rows = np.flatnonzero((ahead > 0) & (beside < ahead + reach))
         cloud = GaussianCloud(
             np.take(thin.means, rows, axis=0),
             np.take(thin.quaternions, rows, axis=0),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from meshsplats._geometry import level_axes
 from meshsplats.viewpoints.sample import COARSE, Sample, fibonacci
 from meshsplats.viewpoints.search import Places
 
@@ -17,8 +18,12 @@ PLANE = 0.96
 """Cosine between a plane's normal and those of its splats, at least."""
 FLOOR, SURE = 0.1, 0.2
 """Shares of the picture with one normal from which on it is a floor, perhaps and surely."""
+LYING = 0.4
+"""Greatest height of what is seen, as a share of its width, above a plane that is a floor and not a wall."""
 LEVEL = 0.3
 """Greatest ratio of the two smaller second moments of the directions of gaze that tells what is level."""
+KNOWN = 0.5
+"""How sure it is at least which way is up where another direction than the default is believed."""
 LEANS = 0.8
 """Least cosine between the normal of a plane and the axis of those directions that it makes exact."""
 SEEN_FROM = 24
@@ -47,9 +52,15 @@ def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright
     gaze = np.einsum("kd,dj->j", good, sample.gaze, optimize=False) / good.sum()
     peaks = _planes(sample.normals[flat], area[flat], sample.axes)
     up, confidence = default, 0.0
-    if peaks and peaks[0][0] > FLOOR:
-        share, up = peaks[0]
+    floors = [(share, normal) for share, normal in peaks if share > FLOOR]
+    if floors:
+        seen = sample.means[area > np.median(area)]
+        heights = [max(height_over_width(seen, normal), LYING) for _, normal in floors]
+        k = int(np.argmax([share / height for (share, _), height in zip(floors, heights, strict=True)]))
+        share, up = floors[k]
         confidence = float(np.clip((share - FLOOR) / (SURE - FLOOR), 0, 1))
+        if heights[k] == LYING:
+            confidence = max(confidence, KNOWN)
     else:
         moments = np.einsum("kd,di,dj->ij", good, sample.gaze, sample.gaze, optimize=False) / good.sum()
         values, axes = np.linalg.eigh(moments)
@@ -60,11 +71,20 @@ def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright
     if confidence > 0:
         up = up * _sign(up, gaze, default, confidence)
         agrees = float(up @ default)
-        if agrees < -0.2 or (agrees < 0.3 and confidence < 0.5):  # a wall, likely
+        if agrees < -0.2 or (agrees < 0.3 and confidence < KNOWN):  # a wall, likely
             up, confidence = default, 0.0
     height = sample.means @ up
     facing = area * (np.abs(sample.normals @ up) > 0.9)
     return Upright(up, _ground(height, facing if facing.any() else area), confidence)
+
+
+def height_over_width(points: np.ndarray, up: np.ndarray) -> float:
+    """Height of most of ``points`` (n, 3) along ``up``, as a share of their mean width across it."""
+    spans = []
+    for axis in (up, *level_axes(up)):
+        low, high = np.quantile(points @ axis, [0.1, 0.9])
+        spans.append(high - low)
+    return float(spans[0] / max((spans[1] + spans[2]) / 2, 1e-12 * max(spans[0], 1e-12)))
 
 
 def _sign(axis: np.ndarray, gaze: np.ndarray, default: np.ndarray, confidence: float) -> float:
