@@ -116,6 +116,42 @@ def test_fewer_views_by_one_thread_are_the_first_of_more_to_the_bit(found):
 
 
 @pytest.mark.slow
+def test_a_scene_is_searched_once_for_views_of_all_sizes(monkeypatch):
+    searches = []
+
+    def places(*arguments):
+        searches.append(arguments)
+        return find_places(*arguments, (12, 8, 6))
+
+    monkeypatch.setattr("meshsplats.viewpoints.finding.find_places", places)
+    cloud = room(3000, 800)
+    three = find_cameras(cloud, 3, width=320, height=200)
+    two = find_cameras(cloud, 2, width=64, height=40)
+    assert len(searches) == 1
+    for small, large in zip(two.cameras, three.cameras, strict=False):
+        assert small.fx == pytest.approx(large.fx / 5)
+        assert np.array_equal(small.world_to_camera, large.world_to_camera)
+    fresh = find_cameras(cloud.take(np.arange(len(cloud))), 2, width=64, height=40)
+    assert len(searches) == 2  # other splats
+    for again, small in zip(fresh.cameras, two.cameras, strict=True):
+        assert again.fx == small.fx
+        assert np.array_equal(again.world_to_camera, small.world_to_camera)
+    assert fresh.extent == two.extent
+    find_cameras(cloud, 2, up=(0, -1, 0.01))
+    assert len(searches) == 3  # another up
+    find_cameras(cloud, 2)
+    cloud.means[:, 0] *= 2  # changed in place
+    find_cameras(cloud, 2)
+    assert len(searches) == 5
+    monkeypatch.setattr("meshsplats.viewpoints.finding.kind_from_outside", lambda *a: ("object", 1.0))
+    ball = room(2000, 100)
+    within = find_cameras(ball, 1, anywhere=True).cameras[0]
+    around = find_cameras(ball, 1).cameras[0]
+    assert len(searches) == 6  # whose views are not those of the object that it is taken for
+    assert np.linalg.norm(around.center - within.center) > 0.1
+
+
+@pytest.mark.slow
 def test_cameras_move_with_the_scene(found):
     # A quarter turn around the vertical (the default of up stays) and a power of two round nothing.
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])

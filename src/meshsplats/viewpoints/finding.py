@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from hashlib import blake2b
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -24,10 +26,12 @@ from meshsplats.viewpoints.kind import Kind, kind_from_inside, kind_from_outside
 from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
 from meshsplats.viewpoints.upright import find_upright
-from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, choose_views
+from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, Checked, choose_views
 
 MOST = 96
 """Views that are looked for, each checked with all splats; more are variations of these."""
+FINGERPRINT = 20_000
+"""Number of splats, at most, by which a scene is known again."""
 SHIFT = 0.1
 """Greatest shift of a variation, as a share of the mean depth of the view."""
 TURN = 8.0
@@ -74,6 +78,25 @@ class FoundCameras:
         return f"{what} ({sure}); up {x} {y} {z} ({told}); views {self.extent:.3g} units deep"
 
 
+@dataclass(frozen=True)
+class _Search:
+    """What a search within a scene found, for images of any size and any smaller number of views."""
+
+    key: tuple[bytes, bytes | None]
+    """Of the splats as they were, and of a given up."""
+    wanted: int
+    """Number of views that were looked for."""
+    is_place: bool
+    """Whether they are what is shown unless views are looked for anywhere."""
+    scene: FoundCameras
+    views: list[tuple[Checked, int]]
+    """And the numbers of their lenses."""
+
+
+_searched: WeakKeyDictionary[GaussianCloud, _Search] = WeakKeyDictionary()
+"""The last search within each scene that is in use: commands ask for views of several sizes and numbers."""
+
+
 def find_cameras(
     cloud: GaussianCloud,
     count: int = 24,
@@ -110,16 +133,21 @@ def find_cameras(
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     given, first_up = _told_up(cloud, up)
-    kind, confidence = kind_from_outside(cloud, first_up, threads)
-    if kind == "object" and not anywhere:
-        return _around(cloud, confidence, given, count, width, height)
-    sample = Sample(cloud, first_up, threads)
-    places = find_places(sample)
-    scene = _within(sample, places, kind, confidence, given)
-    views = choose_views(sample, places, scene.up, min(count, MOST), width, height)
-    extent = float(np.median([_depth(camera) for camera in views]))
-    cameras = [replace(camera, name=f"view_{i:04d}") for i, camera in enumerate(varied(views, count))]
-    return replace(scene, extent=extent, cameras=tuple(cameras))
+    key, wanted = (_fingerprint(cloud), None if given is None else given.tobytes()), min(count, MOST)
+    found = _searched.get(cloud)
+    if found is None or found.key != key or found.wanted < wanted or not (anywhere or found.is_place):
+        kind, confidence = kind_from_outside(cloud, first_up, threads)
+        if kind == "object" and not anywhere:
+            return _around(cloud, confidence, given, count, width, height)
+        sample = Sample(cloud, first_up, threads)
+        places = find_places(sample)
+        scene = _within(sample, places, kind, confidence, given)
+        views = choose_views(sample, places, scene.up, wanted)
+        found = _searched[cloud] = _Search(key, wanted, kind != "object", scene, views)
+    shown = [view.with_lens(lens, width, height) for view, lens in found.views[:count]]
+    extent = float(np.median([_depth(camera) for camera in shown]))
+    cameras = [replace(camera, name=f"view_{i:04d}") for i, camera in enumerate(varied(shown, count))]
+    return replace(found.scene, extent=extent, cameras=tuple(cameras))
 
 
 def first_impression(
@@ -138,6 +166,15 @@ def first_impression(
         return replace(_around(cloud, confidence, given, 1, 400, 400), cameras=())
     sample = Sample(cloud, first_up, threads, SMALL_SAMPLE)
     return _within(sample, find_places(sample, FEW), kind, confidence, given)
+
+
+def _fingerprint(cloud: GaussianCloud) -> bytes:
+    """Digest of some of the splats: those of a cloud that was changed in place have another."""
+    step = -(-len(cloud) // FINGERPRINT)
+    digest = blake2b(len(cloud).to_bytes(8, "little"), digest_size=16)
+    for values in (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities):
+        digest.update(np.ascontiguousarray(values[::step]).tobytes())
+    return digest.digest()
 
 
 def worth_a_look(cloud: GaussianCloud) -> bool:

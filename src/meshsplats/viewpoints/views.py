@@ -226,22 +226,13 @@ class Chooser:
         return None
 
 
-def choose_views(
-    sample: Sample, places: Places, up: np.ndarray, count: int, width: int, height: int
-) -> list[Camera]:
-    """Up to ``count`` cameras, the opening view first."""
+def choose_views(sample: Sample, places: Places, up: np.ndarray, count: int) -> list[tuple[Checked, int]]:
+    """Up to ``count`` views, the opening one first, each with the number of its lens."""
     chooser = Chooser(sample, places, up)
     limit = chooser.fog_limit()
-    chosen = chooser.in_order(chooser.opening(limit), count, limit)
-    if not chosen:  # none is good: the best there are
-        return [
-            chooser.checked(k).with_lens(len(chooser.checked(k).focal) - 1, width, height)
-            for k in chooser.in_order(None, min(count, POOL), np.inf)
-        ]
-    cameras = []
-    for k in chosen:
-        found = chooser.checked(k)
-        lens = found.widest(limit)
-        assert lens is not None
-        cameras.append(found.with_lens(lens, width, height))
-    return cameras
+    chosen = [chooser.checked(k) for k in chooser.in_order(chooser.opening(limit), count, limit)]
+    if not chosen:  # none is good: the narrowest of the best there are
+        best = [chooser.checked(k) for k in chooser.in_order(None, min(count, POOL), np.inf)]
+        return [(view, len(view.focal) - 1) for view in best]
+    lenses = [view.widest(limit) for view in chosen]
+    return [(view, lens) for view, lens in zip(chosen, lenses, strict=True) if lens is not None]
