@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,10 +10,10 @@ import tyro
 
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import check_mesh_suffix, plural, size_of, written
+from meshsplats.cli.common import plural, size_of, written
 from meshsplats.cli.images import ViewOptions
 from meshsplats.cli.messages import say
-from meshsplats.formats.outputs import check_outputs
+from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 
 
 @dataclass(frozen=True)
@@ -73,20 +72,17 @@ class Bake(Command):
         baked = bake_filter(mesh, cameras, filter_px2=px2)
         save_mesh(written(baked, self.origin), self.output, **alpha_for_viewers(baked, self.output))
         seconds = time.perf_counter() - start
-        if self.json:
-            result = {
-                "mesh": str(self.output),
-                "triangles": len(baked.faces),
-                "filter_px2": px2,
-                "colors_of_degree": degree,
-                "views": len(cameras),
-                "seconds": round(seconds, 3),
-            }
-            print(json.dumps(result, indent=1))
-            return
+        result = {
+            "mesh": str(self.output),
+            "triangles": len(baked.faces),
+            "filter_px2": px2,
+            "colors_of_degree": degree,
+            "views": len(cameras),
+            "seconds": round(seconds, 3),
+        }
         views = f"{plural(len(cameras), 'view')} of {cameras[0].width} x {cameras[0].height}"
         what = " and ".join(
             [f"a filter of {px2:g} px^2"] * (px2 > 0) + [f"colours of degree {degree}"] * (degree > 0)
         )
-        print(f"{self.output} ({plural(len(baked.faces), 'triangle')}, {size_of(self.output)}):")
-        print(f"{what} for {views}, in {seconds:.1f} s")
+        made = f"{self.output} ({plural(len(baked.faces), 'triangle')}, {size_of(self.output)}):"
+        self.finish(result, made, f"{what} for {views}, in {seconds:.1f} s")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from meshsplats._words import parse_color
 from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
 from meshsplats.blender.options import FAST_SAMPLES, FAST_SPLATS, LIGHTS, LightOptions, SceneOptions
 from meshsplats.blender.plan import Lines, in_words, where
@@ -19,23 +20,17 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import (
-    PartOptions,
-    SplatOptions,
-    load_scene,
-    open_tileset,
-    parse_color,
-    plural,
-    size_of,
-)
-from meshsplats.cli.images import EXCLUSIVE_VIEWS, ViewOptions
+from meshsplats.cli.common import PartOptions, SplatOptions, plural, size_of
+from meshsplats.cli.images import ViewOptions
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.progress import InBar, terminal_bar
 from meshsplats.cli.records import write_configuration
-from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs
-from meshsplats.frames import view_names
+from meshsplats.conversion.cleaning import cropped
+from meshsplats.datasets.scene_views import WAYS_OF_VIEWS
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.tiles.source import open_tileset
 
 if TYPE_CHECKING:
     from meshsplats.blender import Progress
@@ -77,7 +72,7 @@ class Blender(Command):
         *("engine", "samples", "orbit", "cameras", "azimuth", "elevation", "distance"),
         *("width", "background", "transparent", "executable", "json", "force"),
     )
-    EXCLUSIVE = (*EXCLUSIVE_VIEWS, ("background", "transparent"))
+    EXCLUSIVE = (*WAYS_OF_VIEWS, ("background", "transparent"))
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
@@ -132,13 +127,13 @@ class Blender(Command):
         chain = self._chain(suffix)
         command(self.executable)
         start = time.perf_counter()
-        tileset = open_tileset(self.input, self.part, self.max_error)
+        tileset = open_tileset(self.input, crop=self.part.crop, max_error=self.max_error)
         files = [level.path for level in chain.levels] if chain else [self.input]
         scene: GaussianCloud | SplatMesh
         if tileset:  # the coarsest tile says where it is
             scene, coarser = replace(tileset.root.load(), origin=tileset.origin), []
         else:
-            scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
+            scene, *coarser = (cropped(self.reading.load_scene(file), self.part.crop) for file in files)
             coarser = [level.relative_to(scene.origin) for level in coarser]
         count = 1 if suffix else 60
         cameras = self._views().make(scene, self.input, count=count, side=800, film=not suffix, say=say)

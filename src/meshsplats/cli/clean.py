@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 from dataclasses import dataclass, field
@@ -13,18 +12,17 @@ import tyro
 from meshsplats._files.atomic import together
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import (
-    SplatOptions,
-    check_mesh_suffix,
-    check_splat_endings,
-    load_scene,
-    size_of,
-    written,
-)
+from meshsplats.cli.common import SplatOptions, named, written
 from meshsplats.cli.messages import shown_path
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove, save_strip
 from meshsplats.errors import StraysWarning
-from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
+from meshsplats.formats.outputs import (
+    PREVIEW,
+    beside,
+    check_mesh_suffix,
+    check_outputs,
+    check_splat_endings,
+)
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -33,7 +31,6 @@ from meshsplats.mesh import SplatMesh
 @as_cli_options(
     "Rules: splats with any of these properties are removed."
     f" Default: --max-size {FLOATERS.max_size:g} --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
-    metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
 )
 class RuleOptions(CleaningRules):
     pass
@@ -73,7 +70,7 @@ class Clean(Command):
         check_outputs(outputs, self.force, inputs=[self.input])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", StraysWarning)  # which names this command
-            scene = load_scene(self.input, self.reading)
+            scene = self.reading.load_scene(self.input)
         if isinstance(scene, GaussianCloud):
             check_splat_endings(written_ending(self.output.name))
         else:
@@ -108,25 +105,20 @@ class Clean(Command):
             [round(float(v), 4) for v in side + left.origin]
             for side in (places.min(axis=0), places.max(axis=0))
         )
-        if self.json:
-            counts = found.counts()
-            around = counts.pop("surroundings", None)
-            result = {
-                "input": shown_path(self.input),
-                "output": None if self.preview_only else str(self.output),
-                "preview": str(preview),
-                "splats": len(found.opacities),
-                "kept": int(found.kept.sum()),
-                "removed": counts,
-                "surroundings": around,
-                "lower": lower,
-                "upper": upper,
-                "seconds": round(seconds, 3),
-            }
-            print(json.dumps(result))
-            return
-        print(*found.in_words(rules), sep="\n")
-        print(f"kept: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
-        if not self.preview_only:
-            print(f"{self.output} ({size_of(self.output)})")
-        print(f"preview, before | removed, in red | after: {preview}")
+        counts, kept = found.counts(), int(found.kept.sum())
+        around = counts.pop("surroundings", None)
+        result = {
+            "input": shown_path(self.input),
+            "output": None if self.preview_only else str(self.output),
+            "preview": str(preview),
+            "splats": len(found.opacities),
+            "kept": kept,
+            "removed": counts,
+            "surroundings": around,
+            "lower": lower,
+            "upper": upper,
+            "seconds": round(seconds, 3),
+        }
+        lines = [*found.in_words(rules), f"kept: {kept:,} splats, from {lower} to {upper}"]
+        lines += [] if self.preview_only else [named(self.output)]
+        self.finish(result, *lines, f"preview, before | removed, in red | after: {preview}", indent=None)

@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._words import optional_up
 from meshsplats.camera import Camera
 from meshsplats.cli.common import (
     again,
     alpha_in_words,
-    check_mesh_suffix,
     draw_preview,
-    optional_up,
     plural,
     say_origin,
     size_of,
@@ -45,7 +44,7 @@ from meshsplats.cli.records import changes_since, write_configuration
 from meshsplats.errors import DataWarning
 from meshsplats.file_conversion import Callbacks, Converter, seen_from
 from meshsplats.formats.mesh_formats import mesh_format_to_write
-from meshsplats.formats.outputs import CONFIGURATION, beside, means_splats
+from meshsplats.formats.outputs import CONFIGURATION, beside, check_mesh_suffix, means_splats
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.gaussians import GaussianCloud

@@ -10,18 +10,19 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from meshsplats._options import changed
+from meshsplats._words import optional_up
 from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
-from meshsplats.cli.common import SplatOptions, check_data, check_splat_endings, optional_up
+from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import UsageError
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.options import PRESETS
-from meshsplats.datasets.scene_views import cameras_named
+from meshsplats.datasets.scene_views import cameras_named, check_photographs
 from meshsplats.evaluation.mesh_files import GLB_ALPHA, MeshFileOptions
 from meshsplats.file_conversion import Product
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.formats.outputs import Ending, check_outputs, splat_options
+from meshsplats.formats.outputs import Ending, check_outputs, check_splat_endings, splat_options
 from meshsplats.formats.scenes import SUFFIXES as SCENE_SUFFIXES
 from meshsplats.formats.sniff import identify
 from meshsplats.jobs import Job, sources
@@ -152,7 +153,7 @@ class ConvertCommand(Command):
             raise UsageError("--alpha ordered goes with neither --lit nor --compression")
         if files.nodes is not None:
             check_nodes(files.nodes)
-        check_data(self.data, self.missing, self.cameras)
+        check_photographs(self.data, self.missing, self.cameras)
         self.options_for(sources(self.input))  # checks the values before the work
 
     def resolved(self) -> dict[str, Any]:

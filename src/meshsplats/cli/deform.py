@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +11,10 @@ import tyro
 
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import check_mesh_suffix, placed, plural, say_origin, size_of, track
+from meshsplats.cli.common import plural, say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
 from meshsplats.formats.mesh_formats import keeps
-from meshsplats.formats.outputs import check_outputs
+from meshsplats.formats.outputs import check_mesh_suffix, check_outputs, placed
 from meshsplats.mesh import SplatMesh
 
 
@@ -66,16 +65,13 @@ class Deform(Command):
         for base, target in track(list(zip(bases, targets, strict=True)), "moving", len(targets)):
             _save(placed(prior.pose(base.vertices, lift=lift), self.origin), target)
         seconds = time.perf_counter() - start
-        if self.json:
-            files = [str(target) for target in targets]
-            print(
-                json.dumps({"files": files, "triangles": len(prior.mesh.faces), "seconds": round(seconds, 3)})
-            )
-            return
+        files, count = [str(target) for target in targets], len(prior.mesh.faces)
         more = f" to {targets[-1]}" if len(targets) > 1 else ""
-        print(
-            f"{targets[0]}{more} ({plural(len(prior.mesh.faces), 'triangle')}, {size_of(targets[0])}):"
-            f" {plural(len(targets), 'pose')} in {seconds:.2f} s"
+        made = f"{targets[0]}{more} ({plural(count, 'triangle')}, {size_of(targets[0])}):"
+        self.finish(
+            {"files": files, "triangles": count, "seconds": round(seconds, 3)},
+            f"{made} {plural(len(targets), 'pose')} in {seconds:.2f} s",
+            indent=None,
         )
 
     def targets(self) -> list[Path]:

@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,23 +14,15 @@ import numpy as np
 import tyro
 
 from meshsplats._origin import shared_origin
+from meshsplats._words import optional_color, parse_color
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    ClusterOptions,
-    SplatOptions,
-    check_data,
-    load_scene,
-    optional_color,
-    parse_color,
-    print_table,
-    track,
-)
-from meshsplats.cli.images import OrderOfBlending
+from meshsplats.cli.common import ClusterOptions, SplatOptions, print_table, track
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.scene_views import check_photographs
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import FileFormatError
@@ -50,8 +41,7 @@ from meshsplats.evaluation.results import (
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names, score_table
 from meshsplats.finetuning.targets import Targets
-from meshsplats.formats.outputs import CONFIGURATION, check_outputs
-from meshsplats.frames import view_names
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs, view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -104,7 +94,7 @@ class Evaluate(Command):
     samples: option.Count = None
     """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
     with --look splats."""
-    order: OrderOfBlending = None
+    order: option.OrderOfBlending = None
     """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
     centres. Default: that of each mesh."""
     background: option.Text = None
@@ -198,14 +188,14 @@ class Evaluate(Command):
                 raise UsageError(f"{flag(name)} has no effect with --data")
         if self.data is None and self.downscale is not None:
             raise UsageError("--downscale has no effect without --data")
-        check_data(self.data, self.missing, masks=self.masks)
+        check_photographs(self.data, self.missing, masks=self.masks)
 
     def _check_outputs(self, folder: Path) -> None:
         names = (RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION)
         check_outputs([folder / name for name in names], self.force, folder)
 
     def _load_mesh(self, path: Path) -> SplatMesh:
-        found = load_scene(path, self.reading)
+        found = self.reading.load_scene(path)
         if not isinstance(found, SplatMesh):
             raise FileFormatError(
                 f"{path}: splats, not a mesh; give them with --splats, or convert them first"
@@ -304,7 +294,7 @@ class Evaluate(Command):
                 benchmark,
                 folder,
                 self.data,
-                partial(load_scene, reading=self.reading),
+                self.reading.load_scene,
                 prepare=convert_scene if self.tune is None else task._tuned_candidates,
                 score=task._score_scene,
                 background=None if self.background is None else parse_color(self.background),

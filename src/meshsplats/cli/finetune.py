@@ -14,7 +14,7 @@ import tyro
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import ClusterOptions, SplatOptions, again, check_mesh_suffix, load_scene, plural
+from meshsplats.cli.common import ClusterOptions, SplatOptions, again, plural
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.training import (
     Plan,
@@ -35,6 +35,7 @@ from meshsplats.finetuning.initial import for_photographs, starts_with_filter
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import takes
+from meshsplats.formats.outputs import check_mesh_suffix
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -169,7 +170,7 @@ class Finetune(TrainingCommand):
         return options if paper else for_photographs(options, cloud, dataset.train, self.threads)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
-        scene = load_scene(self.input, self.reading)
+        scene = self.reading.load_scene(self.input)
         if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
             # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
             scene = choose_splats(scene, crop=self.conversion.crop)

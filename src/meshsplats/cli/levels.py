@@ -13,17 +13,18 @@ from typing import Any, Literal
 
 import tyro
 
+from meshsplats._words import optional_up
 from meshsplats.chains import TABLE, ChainOptions, begin_folder, check_folder, make_chain, partial_folder
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import SplatOptions, optional_up, placed, say_origin, size_of
+from meshsplats.cli.common import SplatOptions, say_origin, size_of
 from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.formats.outputs import CONFIGURATION, recorded_options
+from meshsplats.formats.outputs import CONFIGURATION, placed, recorded_options
 from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words

@@ -20,6 +20,9 @@ Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
 ]
+OrderOfBlending = Annotated[
+    Literal["fragment", "splat"] | None, tyro.conf.arg(metavar="{fragment,splat}", help_behavior_hint="")
+]
 LookOfSplats = Annotated[
     Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
 ]

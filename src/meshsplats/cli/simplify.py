@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,19 +12,12 @@ from meshsplats._files.atomic import together
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    SplatOptions,
-    check_data,
-    check_splat_endings,
-    draw_preview,
-    size_of,
-    written,
-)
+from meshsplats.cli.common import SplatOptions, draw_preview, named, written
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
-from meshsplats.datasets.scene_views import cameras_named
+from meshsplats.datasets.scene_views import cameras_named, check_photographs
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
+from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, check_splat_endings
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import written_ending
 
@@ -88,21 +80,17 @@ class Simplify(Command):
             write_configuration(config, "simplify", self)
             if not self.no_preview:
                 draw_preview(kept, preview)
-        if self.json:
-            result = {
-                "splats": str(self.output),
-                "preview": None if self.no_preview else str(preview),
-                "read": len(cloud),
-                "written": len(kept),
-                "bytes": self.output.stat().st_size,
-                "seconds": round(seconds, 4),
-            }
-            print(json.dumps(result, indent=1))
-            return
-        print(f"{len(cloud):,} splats -> {len(kept):,} ({len(kept) / len(cloud):.1%}) in {seconds:.2f} s")
-        print(f"{self.output} ({size_of(self.output)})")
-        if not self.no_preview:
-            print(f"preview: {preview}")
+        result = {
+            "splats": str(self.output),
+            "preview": None if self.no_preview else str(preview),
+            "read": len(cloud),
+            "written": len(kept),
+            "bytes": self.output.stat().st_size,
+            "seconds": round(seconds, 4),
+        }
+        made = f"{len(cloud):,} splats -> {len(kept):,} ({len(kept) / len(cloud):.1%}) in {seconds:.2f} s"
+        more = [] if self.no_preview else [f"preview: {preview}"]
+        self.finish(result, made, named(self.output), *more)
 
     def _check(self) -> None:
         """UsageError for options that contradict each other or are out of range."""
@@ -113,4 +101,4 @@ class Simplify(Command):
             raise UsageError(f"--count must be at least 1, got {self.count}")
         if self.share is not None and not 0 < self.share <= 1:
             raise UsageError(f"--share must be above 0 and at most 1, got {self.share}")
-        check_data(self.data, self.missing, self.cameras)
+        check_photographs(self.data, self.missing, self.cameras)

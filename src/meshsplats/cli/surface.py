@@ -14,10 +14,11 @@ import tyro
 from meshsplats._files.atomic import together
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import SplatOptions, check_data, load_scene, size_of, written
+from meshsplats.cli.common import SplatOptions, size_of, written
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
+from meshsplats.datasets.scene_views import check_photographs
 from meshsplats.formats import base_meshes as files
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
 from meshsplats.mesh import SplatMesh
@@ -93,7 +94,7 @@ class Surface(Command):
         more = [p for m in meshes for p in files.companions(m, self.image) if options.texture and textured]
         outputs = [*meshes, *more, config, *([] if self.no_preview else [preview])]
         check_outputs(outputs, self.force, inputs=[self.input])
-        scene = load_scene(self.input, self.reading)
+        scene = self.reading.load_scene(self.input)
         origin = scene.origin
         data = None
         if self.data is not None:
@@ -150,7 +151,7 @@ class Surface(Command):
         files.check_writing(self.output, unlit=self.unlit, image=self.image, collision=self.collision)
         if suffix in files.PRINTED and self.surface.shape in ("open", "floor"):
             raise UsageError(f"{suffix} is for printing, which wants a solid: --shape closed")
-        check_data(self.data, self.missing, self.cameras, self.masks)
+        check_photographs(self.data, self.missing, self.cameras, self.masks)
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise UsageError(f"--scale must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from meshsplats._words import parse_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import ClusterOptions, SplatOptions, alpha_in_words, parse_up, say_origin
+from meshsplats.cli.common import ClusterOptions, SplatOptions, alpha_in_words, say_origin
 from meshsplats.cli.messages import Terminated, UsageError, say
 from meshsplats.cli.progress import terminal_bar
 from meshsplats.cli.records import write_configuration

@@ -10,7 +10,7 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cli import option
-from meshsplats.cli.common import again, check_mesh_suffix, check_splat_endings, placed, say_origin
+from meshsplats.cli.common import again, say_origin
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.training import Plan, Trained, TrainingCommand, tuning_options
@@ -22,7 +22,7 @@ from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
-from meshsplats.formats.outputs import check_outputs
+from meshsplats.formats.outputs import check_mesh_suffix, check_outputs, check_splat_endings, placed
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.training.as_splats import FITTED_SHARE
 from meshsplats.training.config import TrainConfig, train_config

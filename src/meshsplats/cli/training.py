@@ -14,10 +14,11 @@ import tyro
 
 from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together
+from meshsplats._words import optional_color
 from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
-from meshsplats.cli.common import draw_preview, optional_color, plural, size_of, written
+from meshsplats.cli.common import draw_preview, plural, size_of, written
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import configuration, write_configuration

@@ -11,23 +11,18 @@ import numpy as np
 import tyro
 
 from meshsplats._files.atomic import in_words
+from meshsplats._words import optional_color, optional_up
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    PartOptions,
-    SplatOptions,
-    check_data,
-    load_scene,
-    optional_color,
-    optional_up,
-    size_of,
-)
+from meshsplats.cli.common import PartOptions, SplatOptions, size_of
 from meshsplats.cli.images import views_of_a_place
 from meshsplats.cli.messages import UsageError, say, shown_path
 from meshsplats.cli.records import write_configuration
+from meshsplats.conversion.cleaning import cropped
+from meshsplats.datasets.scene_views import check_photographs
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.formats.base_meshes import load_base
@@ -119,7 +114,7 @@ class View(Command):
             raise UsageError("--no-open has no effect with -o, which opens nothing")
         if self.output is None and self.force:
             raise UsageError("--force has no effect without -o")
-        check_data(self.data, self.missing)
+        check_photographs(self.data, self.missing)
         for first, second in self.EXCLUSIVE:
             if getattr(self, first) and getattr(self, second):
                 raise UsageError(f"give --{first} or --{second.replace('_', '-')}, not both")
@@ -132,13 +127,13 @@ class View(Command):
         optional_up(self.up)
 
     def _scene(self) -> GaussianCloud | SplatMesh | BaseMesh:
-        scene = content.surface_or(lambda path: load_scene(path, self.reading, up=self.up), self.input)
+        scene = content.surface_or(lambda path: self.reading.load_scene(path, up=self.up), self.input)
         if isinstance(scene, BaseMesh):
             if self.surface is not None or self.part.crop is not None:
                 given = "--crop" if self.surface is None else "--surface"
                 raise UsageError(f"{shown_path(self.input)} is a textured surface: {given} has no effect")
         else:
-            scene = self.part.of(scene)
+            scene = cropped(scene, self.part.crop)
         if not isinstance(scene, GaussianCloud):
             if self.max_triangles is not None or self.whole:
                 given = "--whole" if self.whole else "--max-triangles"
@@ -161,7 +156,7 @@ class View(Command):
             advice = "fine-tune it with --max-triangles, or make 'meshsplats tiles'"
             splats = None
             if self.splats is not None:
-                splats = self.part.of(self.reading.load(self.splats, scene.origin))
+                splats = cropped(self.reading.load(self.splats, scene.origin), self.part.crop)
             if isinstance(scene, BaseMesh):
                 return Content(None, splats, surface=scene)
             return replace(content.content_of_mesh(scene, splats), surface=beside)
