@@ -200,10 +200,13 @@ def as_cli_options(
     def made(group: type[T]) -> type[T]:
         parts: list[tuple[str, Any, Any]] = []
         known, hints = reachable(group), get_type_hints(group)
+        marked = get_type_hints(group, include_extras=True)
         for name, setting in settings(group).items():
             start: Any = None if presets else setting.default
             hint: Any = hints[name] | None if presets and not is_dataclass(hints[name]) else hints[name]
-            if name in without or name not in known:
+            if name in vars(group):  # declared again, for the command line
+                hint = marked[name]
+            elif name in without or name not in known:
                 hint = tyro.conf.Suppress[object]
             elif setting.advanced:
                 hint = Annotated[hint, tyro.conf.Fixed]
