@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,20 +148,6 @@ def draw_preview(
     if not save_preview(scene, path, camera, **how):
         count = layers(scene, camera or preview_camera(scene))
         say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
-
-
-def alpha_in_words(record: Mapping[str, Any] | None) -> str | None:
-    """The line about a choice of the alpha mode, from its record; None where nothing was measured."""
-    if record is None or record["blend"] is None:
-        return None
-    modes = {"blend": "blend", "mask": f"mask with cutoff {record['cutoff']:g}"}
-    taken = record["alpha"]
-    other = "mask" if taken == "blend" else "blend"
-    sorting = "" if taken == "blend" else " (--alpha blend for ray tracers and Blender's own importer)"
-    return (
-        f"alpha: {modes[taken]}, {record[taken]:.1f} dB from the sorted image in viewers that do not sort;"
-        f" {modes[other]}: {record[other]:.1f} dB{sorting}"
-    )
 
 
 def named(path: Path) -> str:

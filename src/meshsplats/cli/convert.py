@@ -20,7 +20,6 @@ from meshsplats.cli.arguments import Command, Flat, as_cli_options, of_presets, 
 from meshsplats.cli.common import (
     SplatOptions,
     again,
-    alpha_in_words,
     draw_preview,
     named,
     plural,
@@ -48,6 +47,7 @@ from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.options import PRESETS
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.mesh_files import MeshFileOptions
+from meshsplats.evaluation.viewers import AlphaChoice
 from meshsplats.file_conversion import Callbacks, Converter, Product, seen_from
 from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats
 from meshsplats.formats.sniff import identify
@@ -96,9 +96,7 @@ class Convert(Command):
     EXCLUSIVE = (("cameras", "data"),)
     CONFIGURABLE = True
 
-    input: tyro.conf.Positional[
-        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
-    ]
+    input: tyro.conf.Positional[option.Inputs]
     """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
     input."""
     output: option.Output
@@ -248,7 +246,7 @@ class Convert(Command):
             words["solve order"] = "solved the order"
             times = [f"{words[name]} {value:.2f} s" for name, value in result["seconds"].items() if value]
             lines = [_counts(result), f"{made}: {', '.join(times)}"]
-            if line := alpha_in_words(result.get("alpha")):
+            if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
                     lines.append(f"better there: {self._for_depth_buffers()}")
