@@ -1,8 +1,8 @@
-"""Trainings of mesh priors on files: how splats are laid on a base, and what the base is trained on."""
+"""Mesh priors of files: how splats are laid on a base, what they are trained on, and their poses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,8 +21,11 @@ from meshsplats.finetuning.setup import Display
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.bind import LAYERS, Source, bind
+from meshsplats.prior.model import load_prior
 from meshsplats.prior.training import train_prior
 
 
@@ -129,3 +132,54 @@ class PriorTraining:
 def _grey_mesh(base: BaseMesh) -> SplatMesh:
     grey = np.full((len(base.vertices), 4), 0.5, np.float32)
     return SplatMesh(base.vertices, base.faces, grey, up=base.up, origin=base.origin)
+
+
+def pose_files(output: Path, count: int) -> list[Path]:
+    """The files of so many poses: ``output``, or numbered ones beside it, ``edited_0001.glb`` and so on."""
+    if count == 1:
+        return [output]
+    width = max(4, len(str(count)))
+    return [output.with_name(f"{output.stem}_{i:0{width}d}{output.suffix}") for i in range(1, count + 1)]
+
+
+def posed_files(
+    source: Path,
+    bases: Sequence[Path],
+    output: Path,
+    *,
+    lift: float | None = None,
+    place: Callable[[SplatMesh], SplatMesh] = lambda mesh: mesh,
+    force: bool = False,
+) -> Iterator[tuple[Path, SplatMesh]]:
+    """Writes the splats of the prior in the file ``source`` on each of the edited ``bases``, to
+    ``pose_files(output, len(bases))``.
+
+    Args:
+        lift: distance between layers, scene units. By default that of the prior; for coplanar layers 0 in
+            .npz, and ``MeshPrior.export_lift`` in other formats.
+        place: makes of a mesh the one that is written.
+        force: replace files that are there.
+
+    Yields:
+        Each file, when it is written, with its mesh.
+
+    Raises, before anything is written, what ``check_outputs`` raises, and ValueError for a base with another
+    number of vertices or other triangles.
+    """
+    check_mesh_suffix(output)
+    targets = pose_files(output, len(bases))
+    check_outputs(targets, force, inputs=[source, *bases])
+    prior = load_prior(source)
+    loaded = [load_base(path, textures=False, origin=prior.mesh.origin) for path in bases]
+    for path, base in zip(bases, loaded, strict=True):
+        try:
+            prior.check_topology(base)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    if lift is None and output.suffix.lower() != ".npz" and not prior.lift:
+        lift = prior.export_lift
+    for base, target in zip(loaded, targets, strict=True):
+        mesh = place(prior.pose(base.vertices, lift=lift))
+        # Formats without a place for the binding would warn of it.
+        save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)
+        yield target, mesh
