@@ -21,7 +21,6 @@ from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.messages import flag, one_line, say
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
-from meshsplats.formats.outputs import placed
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -68,6 +67,8 @@ class ClusterOptions:
 
 def written(scene: Placed, origin: option.Origin) -> Placed:
     """``placed``; also says where the file will stand in the world."""
+    from meshsplats.formats.outputs import placed
+
     say_origin(scene.origin, origin, splats=isinstance(scene, GaussianCloud))
     return placed(scene, origin)
 
