@@ -22,7 +22,7 @@ from meshsplats.conversion.cleaning import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews, check_photographs
 from meshsplats.edits import BakingOptions, Callbacks, SimplifyOptions, bake_file, clean_file, simplify_file
-from meshsplats.errors import OptionsError
+from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.evaluation.comparison_files import ComparisonOptions, save_comparison
 from meshsplats.file_conversion import Product
 from meshsplats.finetuning.file_tuning import FileTuning, StartOptions
@@ -57,6 +57,8 @@ def test_errors_name_options_as_python_and_as_commands_do():
     error = OptionsError("``as_splats`` has no effect with ``mesh``")
     assert str(error) == "as_splats has no effect with mesh"
     assert error.spelled(str.upper) == "AS_SPLATS has no effect with MESH"
+    with pytest.raises(OptionValueError, match=r"^fidelity must be a number of views, at least 1, got 0$"):
+        Product(fidelity=0).check(["glb"], [], Path("a.glb"))
 
 
 def test_help_may_stand_in_a_mark():
@@ -78,7 +80,7 @@ def test_reading_tells_what_headers_say(files):
     assert len(Telling().load(files / "a.ply")) == 40
     assert told == ["up: z, from the file's header", "kernel: antialiased, from the file"]
     told.clear()
-    Telling(kernel="3dgs").load(files / "a.ply", up="y")
+    Telling(kernel="antialiased").load(files / "a.ply", up="y")
     assert told == []
     assert isinstance(SceneReading().load_scene(files / "m.npz"), ms.SplatMesh)
     with pytest.raises(OptionsError, match="holds no splats: kernel, time would"):
@@ -143,7 +145,7 @@ def test_photographs_have_options_of_their_own():
         check_photographs(Path("d"), "few", Path("c"))
     with pytest.raises(OptionsError, match="masks has no effect without data"):
         check_photographs(None, "few", masks="subject")
-    with pytest.raises(ValueError, match="--cache must be a number of gigabytes"):
+    with pytest.raises(ValueError, match=r"^cache must be a number of gigabytes"):
         PhotographOptions(cache=-1.0).check()
 
 
@@ -152,13 +154,14 @@ def test_a_comparison_is_a_folder(files):
     made = save_comparison(files / "s.ply", files / "m.npz", files / "out", options)
     saved = json.loads((files / "out" / "results.json").read_text())
     assert saved == made.result
+    assert [view.name for view in made.scores.views] == ["view_0000", "view_0001"]
     assert saved["splats"] == 40
     assert saved["mean"]["psnr"] == made.scores.psnr > 25
     assert (files / "out" / "view_0001.png").is_file()
     box = replace(options, part=PartOfScene(crop=(-1, -1, -1, 1, 1, 1)))
     part = save_comparison(files / "s.ply", files / "m.npz", files / "part", box)
     assert part.result["splats"] < 40
-    with pytest.raises(ms.FileFormatError, match="not a mesh"):
+    with pytest.raises(ms.FileFormatError, match="not a mesh; give splats first"):
         save_comparison(files / "s.ply", files / "s.ply", files / "none", options)
 
 
@@ -215,7 +218,7 @@ def test_splats_of_a_file_are_merged(files):
     assert SimplifyOptions(count=3).wanted(40) == 3
     with pytest.raises(OptionsError, match="give count or share, one of them"):
         SimplifyOptions(count=3, share=0.5).check()
-    with pytest.raises(ms.FileFormatError, match="not splats"):
+    with pytest.raises(ms.FileFormatError, match="simplify needs a splat file"):
         simplify_file(files / "m.npz", files / "no.ply", SimplifyOptions(count=1))
 
 

@@ -19,7 +19,7 @@ from meshsplats.conversion.surroundings import floaters
 from meshsplats.datasets.image_files import Missing
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import SceneViews, cameras_named, check_photographs
-from meshsplats.errors import FileFormatError, OptionsError, StraysWarning
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, StraysWarning
 from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
@@ -263,11 +263,11 @@ def bake_file(
     px2 = mesh.filter_px2 if options.filter_px2 is None else options.filter_px2
     degree = mesh.sh_degree if options.colors else 0
     if options.colors and not degree:
-        raise ValueError(f"{source}: its colours are the same from everywhere: leave out --colors")
+        raise OptionValueError(f"{source}: its colours are the same from everywhere: leave out ``colors``")
     if not (px2 or degree):
-        more = "; --colors bakes its colours" if mesh.sh_degree else ""
-        raise ValueError(
-            f"{source}: the mesh has no filter, there is nothing to bake; --filter-px2 gives it one{more}"
+        more = "; ``colors`` bakes its colours" if mesh.sh_degree else ""
+        raise OptionValueError(
+            f"{source}: the mesh has no filter, there is nothing to bake; ``filter_px2`` gives it one{more}"
         )
     cameras = options.views.make(mesh, source, count=FRAMING_VIEWS, side=FRAMING_PIXELS, say=say)
     if degree:  # with the filter, which shows how much of each vertex a view sees

@@ -14,9 +14,9 @@ class OverwritingError(ValueError):
     """An output would replace a file that is read, or another output."""
 
 
-class OptionsError(ValueError):
-    """Options that contradict each other or have no effect. Names of options stand in double backquotes in
-    the message, so that programs can show them in their own way, as flags of a command line say."""
+class OptionValueError(ValueError):
+    """A value of an option that is out of range. Names of options stand in double backquotes in the message,
+    so that programs can show them in their own way, as flags of a command line say."""
 
     def __str__(self) -> str:
         return self.spelled(str)
@@ -24,6 +24,10 @@ class OptionsError(ValueError):
     def spelled(self, how: Callable[[str], str]) -> str:
         """The message with the names of options as ``how`` shows them."""
         return re.sub("``(.+?)``", lambda match: how(match[1]), super().__str__())
+
+
+class OptionsError(OptionValueError):
+    """Options that contradict each other or have no effect."""
 
 
 class MissingDependencyError(ImportError):

@@ -25,7 +25,7 @@ from meshsplats.conversion.streaming import convert_blocks, refuse_whole
 from meshsplats.datasets.image_files import Missing
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import cameras_named, check_photographs
-from meshsplats.errors import FileFormatError, OptionsError
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
 from meshsplats.evaluation.comparison import fidelity
 from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.formats.gaussians import save_gaussian_blocks, save_gaussians
@@ -137,9 +137,9 @@ class Product:
             OverwritingError: ``output`` is a mesh that goes into it.
         """
         if self.fidelity is not None and self.fidelity < 1:
-            raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
+            raise OptionValueError(f"``fidelity`` must be a number of views, at least 1, got {self.fidelity}")
         if self.scale is not None and not 0 < self.scale < float("inf"):
-            raise ValueError(f"--scale must be a number above 0, got {self.scale}")
+            raise OptionValueError(f"``scale`` must be a number above 0, got {self.scale}")
         optional_up(self.up)
         if self.stream:
             self._check_stream(kinds, inputs)

@@ -23,7 +23,7 @@ from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import check_photographs
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
-from meshsplats.errors import FileFormatError, OptionsError
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.benchmarks import BENCHMARKS, Candidates, convert_scene, run_benchmark
 from meshsplats.evaluation.lpips import load_lpips
@@ -109,7 +109,7 @@ class ScoringOptions:
         range. ``meshes``: what is scored; with ``protocol``, the folder of the scenes."""
         optional_color(self.background)
         if self.amplify <= 0 or self.strips < 0:
-            raise ValueError("--amplify must be positive and --strips >= 0")
+            raise OptionValueError("``amplify`` must be positive and ``strips`` >= 0")
         if self.protocol is not None:
             if self.data is None or len(meshes) != 1:
                 raise OptionsError(

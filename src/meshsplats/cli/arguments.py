@@ -19,7 +19,7 @@ from meshsplats import _toml as toml
 from meshsplats._option_values import converted, from_text, short
 from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say
-from meshsplats.errors import OptionsError
+from meshsplats.errors import OptionsError, OptionValueError
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
@@ -166,11 +166,14 @@ def spelled(command: type, name: str) -> str:
 
 @contextmanager
 def usage_errors(command: type) -> Iterator[None]:
-    """Within the block, an OptionsError of the library becomes a UsageError with the flags of ``command``."""
+    """Within the block, an OptionsError of the library becomes a UsageError, and errors of values have the
+    flags of ``command``."""
     try:
         yield
     except OptionsError as error:
         raise UsageError(error.spelled(partial(spelled, command))) from None
+    except OptionValueError as error:
+        raise ValueError(error.spelled(partial(spelled, command))) from None
 
 
 def as_cli_options(

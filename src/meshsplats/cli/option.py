@@ -15,7 +15,6 @@ Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
 Threads = Annotated[
     int | None,
@@ -34,16 +33,6 @@ Origin = Annotated[
         help="Georeferenced scenes. keep: the result stands where the input does; local: without its origin;"
         " X Y Z: coordinates are relative to this point of the world, which several scenes can share.",
     ),
-]
-
-Missing = Annotated[
-    Literal["few", "error", "skip"],
-    tyro.conf.arg(help="With --data: missing images are left out; few: if fewer than half are missing."),
-]
-
-MeaningOfMasks = Annotated[
-    Literal["count", "subject"],
-    tyro.conf.arg(help="With --data: only pixels inside of masks count, or masks cut out a subject."),
 ]
 
 

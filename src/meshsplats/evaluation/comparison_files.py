@@ -17,7 +17,7 @@ from meshsplats.conversion.cleaning import cropped
 from meshsplats.conversion.options import Preset
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import FileFormatError, OptionValueError
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.comparison import Comparison, compare_views
 from meshsplats.formats.meshes import load_mesh
@@ -54,7 +54,7 @@ class ComparisonOptions:
         """OptionsError for options that contradict each other or have no effect, ValueError for values out of
         range, DeviceError or MissingDependencyError for a device that is not there."""
         if not self.amplify > 0:
-            raise ValueError(f"--amplify must be positive, got {self.amplify}")
+            raise OptionValueError(f"``amplify`` must be positive, got {self.amplify}")
         _ = self.draw.color  # which is checked
         self.views.check()
         self.draw.check_device()

@@ -16,7 +16,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset
-from meshsplats.errors import OptionsError
+from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import FEWEST_VIEWS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -27,9 +27,9 @@ PLACING = ("placement", "distance", "up")
 
 
 def check_cache(gigabytes: float) -> None:
-    """ValueError for what is no size of a cache."""
+    """OptionValueError for what is no size of a cache."""
     if not gigabytes >= 0:
-        raise ValueError(f"--cache must be a number of gigabytes, >= 0, got {gigabytes}")
+        raise OptionValueError(f"``cache`` must be a number of gigabytes, >= 0, got {gigabytes}")
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Targets:
         return self.look or ("area" if preset == "default" else "splats")
 
     def check(self) -> None:
-        """OptionsError for options without effect, ValueError for values out of range."""
+        """OptionsError for options without effect, OptionValueError for values out of range."""
         idle = ("views", "held_out", "width", *PLACING, "below", "cameras", "look", "sh_degree")
         of_data = ("downscale", "test_every", "missing", "masks")
         names, source = (idle, "``data``") if self.data is not None else (of_data, "splats")

@@ -17,7 +17,7 @@ from meshsplats.conversion.cleaning import cropped
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.datasets.views import Dataset
-from meshsplats.errors import DataWarning, OptionsError
+from meshsplats.errors import DataWarning, OptionsError, OptionValueError
 from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, view_names
 from meshsplats.gaussians import GaussianCloud
@@ -198,7 +198,7 @@ class ImageRun:
 
     def _check_scene(self, scene: GaussianCloud | SplatMesh) -> None:
         if isinstance(scene, SplatMesh) and self.options.as_splats:
-            raise ValueError(f"{self.source} is a mesh: --as-splats needs a splat file")
+            raise OptionValueError(f"{self.source} is a mesh: ``as_splats`` needs a splat file")
         if self.options.draw.sh_degree is not None and not self.options.as_splats:
             raise OptionsError(
                 "``sh_degree`` is for splats: a mesh has one colour per vertex; add ``as_splats``"
