@@ -16,9 +16,8 @@ from meshsplats.conversion import bake_filter, simplify
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove, save_strip
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
 from meshsplats.conversion.surroundings import floaters
-from meshsplats.datasets.image_files import Missing
 from meshsplats.datasets.scene_files import SceneReading
-from meshsplats.datasets.scene_views import SceneViews, cameras_named, check_photographs
+from meshsplats.datasets.scene_views import MissingOfData, SceneViews, cameras_named, check_photographs
 from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, StraysWarning
 from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.formats.gaussians import save_gaussians
@@ -124,8 +123,7 @@ class SimplifyOptions:
     model folder, else images of 1000 pixels that hold the subject."""
     data: Path | None = None
     """Data set of photographs, in place of ``cameras``: the cameras of its training views."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     no_preview: bool = False
     """Write no preview."""
 

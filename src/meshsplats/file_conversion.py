@@ -22,9 +22,8 @@ from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.options import Preset
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks, refuse_whole
-from meshsplats.datasets.image_files import Missing
 from meshsplats.datasets.scene_files import SceneReading
-from meshsplats.datasets.scene_views import cameras_named, check_photographs
+from meshsplats.datasets.scene_views import MissingOfData, cameras_named, check_photographs
 from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
 from meshsplats.evaluation.comparison import fidelity
 from meshsplats.evaluation.mesh_files import MeshFileOptions
@@ -66,8 +65,7 @@ class Product:
     folder that has one. Default: those of the input if it is a model folder, else none."""
     data: Path | None = None
     """Data set of photographs, in place of ``cameras``: the cameras of its training views."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     up: str | None = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
     file, else -y."""

@@ -8,19 +8,17 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._options import Help
 from meshsplats._origin import shared_origin
 from meshsplats._words import optional_color
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Workers
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.datasets.scene_files import SceneReading
-from meshsplats.datasets.scene_views import check_photographs
+from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, check_photographs
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
@@ -89,11 +87,8 @@ class ScoringOptions:
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
-    masks: Annotated[
-        Masks, Help("With ``data``: only pixels inside of masks count, or masks cut out a subject.")
-    ] = "count"
+    missing: MissingOfData = "few"
+    masks: MasksOfData = "count"
     protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
     """Score all scenes of a benchmark as in the paper's Table 1."""
     tune: Literal["default", "paper"] | None = None

@@ -85,6 +85,7 @@ class PictureOptions:
 
     @property
     def is_lit(self) -> bool:
+        """Whether lights shine on the splats."""
         return self.lit or self.fast or self.lights is not None
 
     def named_light(self) -> LightOptions:

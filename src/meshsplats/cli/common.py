@@ -1,4 +1,4 @@
-"""Shared by the commands: input by content, output that is not overwritten, cameras and rendering options."""
+"""Shared by the commands: groups of options, where outputs stand, tables and previews."""
 
 from __future__ import annotations
 

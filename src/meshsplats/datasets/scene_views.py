@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from meshsplats._options import Range, changed, check_options
+from meshsplats._options import Help, Range, changed, check_options
 from meshsplats._words import parse_up
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
@@ -24,6 +24,14 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 Origin = Sequence[float] | np.ndarray
+MissingOfData = Annotated[
+    Missing, Help("With ``data``: missing images are left out; few: if fewer than half are missing.")
+]
+"""An option of whatever has an option ``data``, a data set of photographs."""
+MasksOfData = Annotated[
+    Masks, Help("With ``data``: only pixels inside of masks count, or masks cut out a subject.")
+]
+"""Another."""
 WAYS_OF_VIEWS = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
 """Options of views of which one may be given."""
 
@@ -71,8 +79,7 @@ class SceneViews:
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
     """With ``data``: factor by which images are smaller than the photographs."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     elevation: float | None = None
     """Degrees above the horizon. Default: 15; 0 with ``look_around``."""
     azimuth: float = 0.0

@@ -75,6 +75,7 @@ class FileTuning:
 
     @property
     def files(self) -> RunFiles:
+        """The files of the run."""
         return RunFiles(self.output, self.begin.cell_splats is not None)
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:

@@ -13,7 +13,8 @@ from meshsplats._words import parse_up
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
+from meshsplats.datasets.image_files import Masks
+from meshsplats.datasets.scene_views import MissingOfData
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import OptionsError, OptionValueError
@@ -42,8 +43,7 @@ class Targets:
     """With ``data``: factor by which images are smaller than photographs. Default: by the minutes."""
     test_every: int = 8
     """With ``data``: every n-th view is held out, if the data set has no split; 0: none."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     masks: Annotated[Masks, Advanced] = "count"
     """With ``data``: only pixels inside of masks count, or (subject) what is outside is clear."""
     views: int | None = None

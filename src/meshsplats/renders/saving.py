@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from meshsplats._files.atomic import write_bytes
+from meshsplats._options import changed
 from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cluster import Workers, open_workers
@@ -84,8 +85,8 @@ class ImageOptions:
             raise OptionsError("``max_layers`` counts triangles: it has no effect with ``as_splats``")
         if self.as_splats and draw.order is not None:
             raise OptionsError("``order`` is that of a mesh: leave out ``as_splats``")
-        if self.as_splats and draw.device == "gpu":
-            raise OptionsError("``device`` gpu draws meshes: leave out ``as_splats``")
+        if self.as_splats and "device" in changed(draw):
+            raise OptionsError(f"``device`` {draw.device} draws meshes: leave out ``as_splats``")
         draw.check_device()
 
 
@@ -102,6 +103,7 @@ class ImageFiles:
 
     @property
     def every(self) -> list[Path]:
+        """All of them."""
         turntable = [self.turntable] if self.turntable else []
         return [*self.images, *self.depths, *turntable, self.cameras, self.config]
 

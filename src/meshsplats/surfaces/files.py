@@ -14,9 +14,8 @@ from meshsplats._files.atomic import together
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.files import load_cameras
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.datasets.scene_files import SceneReading
-from meshsplats.datasets.scene_views import check_photographs
+from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, check_photographs
 from meshsplats.errors import OptionsError
 from meshsplats.formats import base_meshes
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
@@ -39,10 +38,8 @@ class SurfaceFileOptions:
     """Levels of detail, each with a quarter of the triangles of the one before: MESH.glb, MESH_lod1.glb..."""
     data: Path | None = None
     """Data set of photographs to fit shape and texture to, in place of images of the scene."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
-    masks: Masks = "count"
-    """With ``data``: only pixels inside of masks count, or masks cut out a subject."""
+    missing: MissingOfData = "few"
+    masks: MasksOfData = "count"
     cameras: Path | None = None
     """Camera file: from where images are made, in place of ``views``."""
     unlit: bool = False
@@ -96,6 +93,7 @@ class SurfaceRun:
 
     @property
     def preview(self) -> Path:
+        """Its file, where there is one."""
         return beside(self.output, PREVIEW)
 
     def check(self, force: bool) -> SurfaceOptions:

@@ -13,9 +13,8 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Missing
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
-from meshsplats.datasets.scene_views import check_photographs
+from meshsplats.datasets.scene_views import MissingOfData, check_photographs
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import OptionsError
 from meshsplats.evaluation.backgrounds import choose_background
@@ -61,8 +60,7 @@ class ViewingOptions:
     folder that has one. Default: those of the input, if it is a model folder."""
     data: Path | None = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): viewpoints to choose from."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     up: str | None = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else of the
     mesh."""
