@@ -7,8 +7,8 @@ import pytest
 
 import meshsplats as ms
 from meshsplats.chains import TABLE, begin_folder, check_folder
-from meshsplats.formats.outputs import CAMERAS, CONFIGURATION
-from meshsplats.frames import remove_older, view_names
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, view_names
+from meshsplats.renders.frames import remove_older
 
 
 def test_a_folder_becomes_a_chain_where_nothing_is_lost(tmp_path):

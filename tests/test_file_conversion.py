@@ -51,7 +51,7 @@ def test_blocks_give_the_mesh_of_the_whole(job):
     files = MeshFileOptions(alpha="blend")
     Converter(Product(files=files), PLAIN).made(one, None)
     whole = one.outputs[0].read_bytes()
-    result = Converter(Product(in_blocks=True), PLAIN).made(one, None)
+    result = Converter(Product(stream=True), PLAIN).made(one, None)
     assert one.outputs[0].read_bytes() == whole
     assert result["splats"] == len(few_splats())
 

@@ -10,8 +10,8 @@ import pytest
 from meshsplats import convert, orbit, render, render_splats
 from meshsplats.cluster import open_workers
 from meshsplats.demo_scene import make_scene
-from meshsplats.frames import FrameOptions, depth_unit, draw_frames
 from meshsplats.images.writing import encode_image
+from meshsplats.renders.frames import FrameOptions, depth_unit, draw_frames
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ FLOORS = (
     ("evaluation", "surfaces"),
     ("finetuning", "jobs", "viewer"),
     ("levels", "prior", "tiles", "training"),
-    ("blender", "chains", "file_conversion", "frames", "inspection", "installation"),
+    ("blender", "chains", "edits", "file_conversion", "inspection", "installation", "renders", "scoring"),
     ("cli",),
     ("__main__",),
 )

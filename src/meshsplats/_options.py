@@ -42,6 +42,13 @@ class Range:
         return f"from {self.low:.7g} to {self.high:.7g}"
 
 
+@dataclass(frozen=True)
+class Help:
+    """Help of an option that is made of other values, in place of the docstring of its field."""
+
+    text: str
+
+
 class Advanced:
     """Marks options that few people set: they have no flag of their own (``--set NAME=VALUE``)."""
 
@@ -93,8 +100,9 @@ class Setting:
 
     @property
     def help(self) -> str:
-        """The docstring of the field in one line."""
-        return docstrings(self.owner).get(self.name, "")
+        """The docstring of the field in one line, or its ``Help``."""
+        own = self.mark(Help)
+        return docstrings(self.owner).get(self.name, "") if own is None else own.text
 
     @property
     def text(self) -> str:

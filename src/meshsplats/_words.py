@@ -25,6 +25,11 @@ def parse_up(text: str) -> np.ndarray:
     return np.array(numbers)
 
 
+def optional_up(text: str | None) -> np.ndarray | None:
+    """``parse_up`` of an option that may not be given."""
+    return None if text is None else parse_up(text)
+
+
 def direction_in_words(direction: np.ndarray) -> str:
     """An axis, or three numbers, as ``parse_up`` takes them."""
     axis = int(np.abs(direction).argmax())
@@ -46,6 +51,11 @@ def parse_color(text: str) -> tuple[float, float, float]:
             f"--background must be {', '.join(NAMED_COLORS)}, #rrggbb, or r,g,b from 0 to 1, got {text!r}"
         )
     return numbers
+
+
+def optional_color(text: str | None) -> tuple[float, float, float] | None:
+    """``parse_color`` of an option that may not be given."""
+    return None if text is None else parse_color(text)
 
 
 def _numbers(text: str) -> tuple[float, float, float] | None:

@@ -13,9 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._files.atomic import replace_folder, write_text
+from meshsplats._files.atomic import in_words, replace_folder, write_text
+from meshsplats.errors import OptionsError
 from meshsplats.evaluation.viewers import choose_alpha
-from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
+from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions, make_config
+from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, check_outputs
 from meshsplats.gaussians import GaussianCloud
@@ -34,8 +36,11 @@ from meshsplats.levels import (
 )
 from meshsplats.mesh import SplatMesh
 from meshsplats.order import Order
+from meshsplats.rendering.looks import comparison_in_words
 
 TABLE = "levels.json"
+MINUTES = 2.0
+"""Default length of the fine-tuning of a level."""
 OnLevel = Callable[[int, Level], AbstractContextManager[Callable[[Progress], None] | None]]
 
 
@@ -66,6 +71,15 @@ class ChainOptions:
     threads: int | None = None
     """Maximum number of threads; None: all processors."""
 
+    def check(self) -> None:
+        """OptionsError for options that are out of range or have no effect."""
+        if self.levels < 1:
+            raise OptionsError(f"``levels`` must be at least 1, got {self.levels}")
+        if self.max_splats is not None and self.max_splats < 1:
+            raise OptionsError(f"``max_splats`` must be at least 1, got {self.max_splats}")
+        if self.alpha not in ("auto", "opaque") and not takes(f"level.{self.format}", "alpha"):
+            raise OptionsError(f"``alpha`` {self.alpha} is for .glb files, not .{self.format}")
+
     def plan(self, splats: int) -> list[Level]:
         """The levels of so many ``splats`` (``plan_levels``). ValueError for orders that contradict each
         other."""
@@ -73,6 +87,30 @@ class ChainOptions:
             raise ValueError("alpha 'ordered' has an order of its own: leave out order")
         most = splats if self.max_splats is None else min(self.max_splats, splats)
         return plan_levels(most, self.levels, factor=self.factor, width=self.width)
+
+
+@dataclass(frozen=True)
+class LevelTuning:
+    """How long each level is fine-tuned."""
+
+    no_tune: bool = False
+    """Convert only: seconds in place of minutes."""
+    minutes: float | None = None
+    """Length of the fine-tuning of each level. Default: 2."""
+    steps: int | None = None
+    """Length of the fine-tuning of each level, in place of ``minutes``."""
+
+    def config(self) -> FinetuneConfig | None:
+        """The configuration for ``make_chain``. OptionsError for lengths that contradict each other."""
+        if self.no_tune and (self.minutes is not None or self.steps is not None):
+            raise OptionsError("``minutes`` and ``steps`` have no effect with ``no_tune``")
+        if self.minutes is not None and self.steps is not None:
+            raise OptionsError("give ``minutes`` or ``steps``, not both")
+        if self.no_tune:
+            return None
+        if self.steps is not None:
+            return make_config("default", steps=self.steps)
+        return make_config("default", minutes=MINUTES if self.minutes is None else self.minutes)
 
 
 def partial_folder(folder: Path) -> Path:
@@ -165,6 +203,23 @@ def make_chain(
     write_text(unfinished / TABLE, json.dumps(table, indent=1, allow_nan=False) + "\n")
     replace_folder(unfinished, folder)
     return table
+
+
+def table_in_words(table: dict[str, Any], folder: Path) -> list[str]:
+    """Lines with the ``table`` of the chain in ``folder``."""
+    rows, glb = table["levels"], any(row["file"].endswith(".glb") for row in table["levels"])
+    heads = f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}"
+    lines = [f"{heads}  alpha" if glb else heads]
+    for row in rows:
+        lines.append(
+            f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{in_words(row['bytes']):>10}"
+            f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
+            + (f"  {row['alpha']['alpha']}" if glb and row["alpha"] else "")
+        )
+    views = sorted({row["views"] for row in rows})
+    count = " to ".join(map(str, (views[0], views[-1])[: len(views)]))
+    lines.append(f"{comparison_in_words(table['look'], table['samples'])}; {count} views")
+    return [*lines, f"{folder}/: {TABLE} has this table"]
 
 
 def _made(

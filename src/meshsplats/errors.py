@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+
 
 class FileFormatError(ValueError):
     """A file that cannot be read: broken, truncated, hostile or of another format."""
@@ -9,6 +12,22 @@ class FileFormatError(ValueError):
 
 class OverwritingError(ValueError):
     """An output would replace a file that is read, or another output."""
+
+
+class OptionValueError(ValueError):
+    """A value of an option that is out of range. Names of options stand in double backquotes in the message,
+    so that programs can show them in their own way, as flags of a command line say."""
+
+    def __str__(self) -> str:
+        return self.spelled(str)
+
+    def spelled(self, how: Callable[[str], str]) -> str:
+        """The message with the names of options as ``how`` shows them."""
+        return re.sub("``(.+?)``", lambda match: how(match[1]), super().__str__())
+
+
+class OptionsError(OptionValueError):
+    """Options that contradict each other or have no effect."""
 
 
 class MissingDependencyError(ImportError):

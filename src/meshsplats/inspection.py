@@ -77,6 +77,28 @@ def describe(path: Path, reading: Mapping[str, Any] | None = None) -> dict[str, 
     return found
 
 
+def in_words(findings: Mapping[str, Any]) -> list[str]:
+    """A line for each of the findings of ``describe``."""
+    width = max(map(len, findings))
+    return [f"{key.replace('_', ' '):<{width}}  {_in_words(value)}" for key, value in findings.items()]
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, Place):
+        return f"{value:.12g}"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        if value and isinstance(value[0], list):
+            return ", ".join(" x ".join(map(str, size)) for size in value)
+        return "  ".join(_in_words(v) for v in value) or "none"
+    return str(value)
+
+
 def _layout(path: Path) -> Layout | None:
     """That of a data set; None for anything else."""
     if path.is_dir():

@@ -46,6 +46,39 @@ def examine() -> dict[str, Any]:
     }
 
 
+def in_words(findings: dict[str, Any]) -> list[str]:
+    """Lines about the findings of ``examine``, with the requirements of each extra in one text."""
+    core = findings["core"]
+    lines = [
+        f"MeshSplats {findings['meshsplats']}, Python {findings['python']}, {findings['platform']}",
+        f"threads: {findings['threads']}",
+    ]
+    if core["works"]:
+        lines.append(
+            f"core: {core['in_use']} in use; runs here: {', '.join(core['available'])}; renders correctly"
+        )
+    else:
+        lines.append(f"core: DOES NOT WORK: {core['problem']}")
+    gpu = findings["gpu"]
+    state = "renders and differentiates correctly" if gpu["works"] else gpu["problem"]
+    lines.append("gpu: " + "; ".join(filter(None, (gpu["adapter"], state))))
+    drawing = ", ".join(findings["harmonics_drawn_by"]) or "nothing"
+    lines.append(f"colours that depend on the view: drawn by {drawing}; other programs show plain ones")
+    lines.append("libraries: " + _listed(findings["required"]))
+    for extra, libraries in findings["extras"].items():
+        missing = findings["to_install"].get(extra)
+        advice = f"; to install: pip install {missing}" if missing else ""
+        if missing and extra == "blender":
+            where = "in an environment of its own with Python 3.11 or 3.13"
+            advice = f"; to install, {where}: pip install {missing}"
+        lines.append(f"extra {extra!r}: {_listed(libraries)}{advice}")
+    return lines
+
+
+def _listed(libraries: dict[str, str | None]) -> str:
+    return ", ".join(f"{name} {version or 'MISSING'}" for name, version in libraries.items()) or "unknown"
+
+
 def _core() -> dict[str, Any]:
     """Variants of the compiled core, and whether the one in use draws a triangle."""
     from meshsplats._core import library

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from meshsplats._files.atomic import refuse_existing
 from meshsplats._files.locks import lock_of, locked
-from meshsplats.errors import FileFormatError, OverwritingError
-from meshsplats.formats.mesh_formats import mesh_suffixes
+from meshsplats.errors import FileFormatError, OptionsError, OverwritingError
+from meshsplats.formats.mesh_formats import mesh_format_to_write, mesh_suffixes, written_mesh_suffixes
 from meshsplats.formats.outputs import (
     CONFIGURATION,
     PREVIEW,
@@ -174,6 +174,23 @@ def is_batch(paths: Sequence[Path]) -> bool:
     """Whether ``paths`` may name more than one input. FileFormatError for a folder without any."""
     folders = [path for path in paths if path.is_dir() and not _is_splats(path)]
     return any([_inside(folder) for folder in folders]) or len(paths) > 1
+
+
+def formats_of(output: Path, formats: Sequence[str], *, folder: bool, as_splats: bool) -> Sequence[str]:
+    """Suffixes to write in the ``folder`` ``output``, without a dot, those that are given or the usual one;
+    none for a single file. OptionsError for a name that does not fit."""
+    if folder:
+        if mesh_format_to_write(output) is not None and not output.is_dir():
+            where = f"``output`` {output.with_suffix('')}"
+            raise OptionsError(f"several inputs or formats need a folder: {where}, say")
+        return formats or (("ply",) if as_splats else ("glb",))
+    if not as_splats and mesh_format_to_write(output) is None:
+        known = ", ".join(written_mesh_suffixes())
+        raise OptionsError(
+            f"``output`` must end in {known}, got {output.name!r}; for a folder, name the formats:"
+            " ``formats`` glb"
+        )
+    return ()
 
 
 def jobs(

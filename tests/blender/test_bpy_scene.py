@@ -143,7 +143,7 @@ def test_command_line_draws_the_tiles_of_a_tileset_that_the_camera_needs(tmp_pat
         ours, theirs = (load_image(tmp_path / f"{kind}{distance}.png") / 255.0 for kind in "rb")
         assert psnr(ours, theirs) > 45
     assert images["3"] < 0.5 * images["0.4"]
-    monkeypatch.setattr("meshsplats.cli.blender._TILE_TRIANGLES", 6000)
+    monkeypatch.setattr("meshsplats.blender.files.TILE_TRIANGLES", 6000)
     given = [str(tmp_path / "tiles"), "--distance", "0.4", *view]
     assert main(["blender", *given, "-o", str(tmp_path / "limited.png")]) == 0
     told = capsys.readouterr()

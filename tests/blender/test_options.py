@@ -78,10 +78,10 @@ def test_a_white_plate_stays_white(name):
 
 
 def test_named_lights_and_what_is_said_instead():
-    from meshsplats.cli.blender import Blender, LightArguments
+    from meshsplats.cli.blender import BlenderOptions, LightArguments
 
     def light(lights, **given):
-        return Blender(None, None, lit=True, lights=lights, light=LightArguments(**given)).named_light()
+        return BlenderOptions(lit=True, lights=lights, light=LightArguments(**given)).named_light()
 
     for name, named in LIGHTS.items():
         named.check()
@@ -144,13 +144,13 @@ def test_time_left_follows_the_estimate_and_then_the_clock():
 
 
 def test_a_named_light_lights():
-    from meshsplats.cli.blender import Blender
+    from meshsplats.blender.files import PictureOptions
 
-    assert not Blender(None, None).is_lit
-    assert Blender(None, None, lights="noon").is_lit
-    assert Blender(None, None, lights="noon").named_light() == LIGHTS["noon"]
-    assert Blender(None, None, lit=True).named_light() == LIGHTS["sun"]
-    assert Blender(None, None, fast=True).is_lit
+    assert not PictureOptions().is_lit
+    assert PictureOptions(lights="noon").is_lit
+    assert PictureOptions(lights="noon").named_light() == LIGHTS["noon"]
+    assert PictureOptions(lit=True).named_light() == LIGHTS["sun"]
+    assert PictureOptions(fast=True).is_lit
 
 
 def test_phases_are_told_at_once(capsys):

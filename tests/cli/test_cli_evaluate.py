@@ -196,12 +196,12 @@ def test_existing_results_stay(scene, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_default_views_are_those_that_finetune_holds_out(scene, tmp_path):
-    from meshsplats.cli.targets import TargetOptions
+    from meshsplats.finetuning.targets import Targets
 
     out = tmp_path / "out"
     assert run(scene / "mesh.npz", "--splats", scene / "scene.ply", "-o", out, "--strips", "0") == 0
     names = list(json.loads((out / "per_view.json").read_text())["mesh"]["PSNR"])
-    data = TargetOptions().make(make_scene(300), scene / "scene.ply", (1, 1, 1), None)
+    data = Targets().make(make_scene(300), scene / "scene.ply", (1, 1, 1), None)
     assert names == [v.name for v in data.test]
     assert not (out / "strips").exists()
     assert np.isfinite(json.loads((out / "results.json").read_text())["mesh"]["SSIM"])

@@ -23,7 +23,7 @@ from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.cli.finetune import Finetune
-from meshsplats.cli.targets import TargetOptions
+from meshsplats.cli.training import TargetOptions
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, worthwhile_views
@@ -277,7 +277,7 @@ def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
 def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
     """Its views and its starting mesh stay, though so long a run would have more; its time counts, too."""
     arguments = [splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "32", "--json"]
-    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: config.steps + 1)
+    monkeypatch.setattr("meshsplats.finetuning.file_tuning.worthwhile_views", lambda config: config.steps + 1)
     monkeypatch.setattr("meshsplats.finetuning.config.LONG_STEPS", 5)
     monkeypatch.setattr("meshsplats.finetuning.baseline.TOLERANCE", 99)  # the tuned mesh, however few steps
     assert run(*arguments, "--steps", "3") == 0

@@ -17,11 +17,11 @@ from _datasets import simple_colmap
 from _photographs import write_photographs
 
 import meshsplats
+from meshsplats._words import parse_color, parse_up
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main, messages
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import parse_color, parse_up
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.gaussians import save_gaussians

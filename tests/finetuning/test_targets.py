@@ -10,6 +10,7 @@ from _photographs import write_photographs
 from meshsplats.cameras.files import save_cameras
 from meshsplats.datasets.views import WHITE
 from meshsplats.demo_scene import make_scene
+from meshsplats.errors import OptionsError
 from meshsplats.finetuning.targets import Targets
 from meshsplats.mesh import SplatMesh
 
@@ -50,5 +51,7 @@ def test_photographs_that_are_all_held_out_leave_nothing_to_train_on(tmp_path):
 
 def test_a_mesh_needs_photographs(tmp_path):
     mesh = SplatMesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.ones((3, 4)))
-    with pytest.raises(TypeError, match="scene must be a GaussianCloud"):
+    with pytest.raises(OptionsError, match="is a mesh: give its photographs with data, or splats"):
         Targets().make(mesh, tmp_path, WHITE, 1)
+    with pytest.raises(TypeError, match="scene must be a GaussianCloud"):
+        Targets().make(None, tmp_path, WHITE, 1)

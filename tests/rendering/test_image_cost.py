@@ -10,6 +10,7 @@ import pytest
 from meshsplats import Camera, DataWarning, GaussianCloud, SplatMesh, convert, orbit, save_gaussians
 from meshsplats.cli import main
 from meshsplats.evaluation.viewers import choose_alpha
+from meshsplats.rendering.drawing import announce_cost
 from meshsplats.rendering.layers import affordable, fragments, layers
 
 
@@ -84,14 +85,12 @@ def test_long_images_are_announced(tmp_path, capsys):
     assert "layers" not in capsys.readouterr().err
 
 
-def test_costs_are_said_with_their_minutes(capsys):
-    from meshsplats.cli.images import announce_cost
-
-    mesh = facing(20_000, 100.0)
-    announce_cost(mesh, [CAMERA.scaled(10)], 4, 2)
-    assert "layers lie over each other at each pixel: this may take about" in capsys.readouterr().err
-    announce_cost(mesh, [CAMERA], 1, 2)
-    assert capsys.readouterr().err == ""
+def test_costs_are_said_with_their_minutes():
+    mesh, said = facing(20_000, 100.0), []
+    announce_cost(mesh, [CAMERA.scaled(10)], 4, 2, said.append)
+    assert "layers lie over each other at each pixel: this may take about" in said.pop()
+    announce_cost(mesh, [CAMERA], 1, 2, said.append)
+    assert said == []
 
 
 def test_the_alpha_of_real_scenes_is_measured(tmp_path):

@@ -147,12 +147,12 @@ def _run(name: str, arguments: list[str]) -> int:
 
 def _execute(name: str, words: list[str]) -> int:
     from meshsplats._files.atomic import promises_kept
-    from meshsplats.cli.arguments import parse
+    from meshsplats.cli.arguments import parse, usage_errors
 
     module, _, attribute = COMMANDS[name][0].partition(":")
-    command = parse(getattr(importlib.import_module(module), attribute), f"meshsplats {name}", words)
-    with promises_kept():
-        return command.execute() or OK
+    kind = getattr(importlib.import_module(module), attribute)
+    with usage_errors(kind), promises_kept():
+        return parse(kind, f"meshsplats {name}", words).execute() or OK
 
 
 @contextmanager

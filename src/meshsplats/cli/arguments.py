@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 import types
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
@@ -18,6 +19,7 @@ from meshsplats import _toml as toml
 from meshsplats._option_values import converted, from_text, short
 from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say
+from meshsplats.errors import OptionsError, OptionValueError
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
@@ -26,11 +28,22 @@ INVOCATION = ("cluster", "executable", "force", "json", "resume", "skip_existing
 run programs, here or on a cluster, and --json, --resume and --skip-existing belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """Tables and keys of a configuration file. Only ``options`` is read."""
+METAVARS = {
+    **{"data": "FOLDER", "images": "FOLDER", "up": "TEXT", "background": "TEXT", "title": "TEXT"},
+    **dict.fromkeys(("before", "cameras", "collider", "executable", "hdri", "splats", "surface"), "FILE"),
+    **dict.fromkeys(("texture", "with_mesh"), "FILE"),
+    **{"crop": "X0 Y0 Z0 X1 Y1 Z1", "look_at": "X Y Z", "sun": "AZIMUTH ELEVATION"},
+}
+"""Placeholders for the values of options that their types do not tell."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed, tyro.conf.FlagCreatePairsOff)
 # Without the docstrings of fields, whose reading takes half of the time of parsing; --help has them from
 # ``_described``.
 _PARSED = (*_MARKERS, tyro.conf.HelptextFromCommentsOff)
 _FILLED = (*_PARSED[:2], tyro.conf.HelptextFromCommentsOff)  # --no-FLAG clears a flag that the file sets
+
+
+class Flat:
+    """Marks a group whose options the help shows among those of the command itself."""
 
 
 class Command:
@@ -51,6 +64,12 @@ class Command:
     def resolved(self) -> dict[str, Any]:
         """The values that options and presets lead to."""
         return {}
+
+    def finish(self, result: Any, *lines: str, indent: int | None = 1) -> None:
+        """Prints what came out: ``lines``, or with --json the ``result``."""
+        if getattr(self, "json", False):
+            lines = (json.dumps(result, indent=indent, default=str),)
+        print(*lines, sep="\n", flush=True)
 
 
 @dataclass(frozen=True)
@@ -140,7 +159,21 @@ options_of: Callable[[type], Mapping[str, Option]] = lru_cache(_find_options)
 def spelled(command: type, name: str) -> str:
     """The option ``name`` of ``command`` for a message: its flag, or how --set has it."""
     option = options_of(command).get(name)
+    if name == "output":
+        return "-o"
     return flag(name) if option is None or option.has_flag else f"--set {name}"
+
+
+@contextmanager
+def usage_errors(command: type) -> Iterator[None]:
+    """Within the block, an OptionsError of the library becomes a UsageError, and errors of values have the
+    flags of ``command``."""
+    try:
+        yield
+    except OptionsError as error:
+        raise UsageError(error.spelled(partial(spelled, command))) from None
+    except OptionValueError as error:
+        raise ValueError(error.spelled(partial(spelled, command))) from None
 
 
 def as_cli_options(
@@ -159,7 +192,7 @@ def as_cli_options(
     Args:
         about: description of the group; by default the docstring of the class.
         without: names of options that the command lacks, beside those that cannot be changed.
-        metavars: placeholders for values; by default the choices, the range, N or X.
+        metavars: placeholders for values; by default ``METAVARS``, the choices, the range, N or X.
         defaults: the end of an option's help, by its name.
         flags: booleans are flags and False by default.
         presets: options that are left out are None, as presets have their values; else they are those of the
@@ -170,15 +203,20 @@ def as_cli_options(
     def made(group: type[T]) -> type[T]:
         parts: list[tuple[str, Any, Any]] = []
         known, hints = reachable(group), get_type_hints(group)
+        marked = get_type_hints(group, include_extras=True)
         for name, setting in settings(group).items():
             start: Any = None if presets else setting.default
-            hint: Any = hints[name] | None if presets else hints[name]
-            if name in without or name not in known:
+            hint: Any = hints[name] | None if presets and not is_dataclass(hints[name]) else hints[name]
+            if name in vars(group):  # declared again, for the command line
+                hint = marked[name]
+            elif name in without or name not in known:
                 hint = tyro.conf.Suppress[object]
             elif setting.advanced:
                 hint = Annotated[hint, tyro.conf.Fixed]
             elif bool in setting.kinds and flags:
                 hint, start = bool, False
+            elif is_dataclass(hint):
+                start = field(default_factory=hint)  # type: ignore[arg-type]
             elif presets or setting.optional:
                 metavar = metavars.get(name) or _placeholder(setting)
                 hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
@@ -209,7 +247,9 @@ def _placeholder(setting: Setting) -> str:
     limits = setting.mark(Range)
     if limits is not None and limits.high <= 100:
         return f"{limits.low:g}..{limits.high:g}"
-    return {int: "N", float: "X", bool: "{True,False}"}.get(setting.kinds[0], "VALUE")
+    return {int: "N", float: "X", bool: "{True,False}"}.get(setting.kinds[0]) or METAVARS.get(
+        setting.name, "VALUE"
+    )
 
 
 def _taken_apart(words: Sequence[str]) -> Line:
@@ -283,15 +323,25 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
         print(" ".join(notes))
 
 
-def _described(command: type[T], shown: Collection[str], flags: Collection[str]) -> type[T]:
-    """``command`` with help for the options ``shown``; the others are hidden. ``flags``: names of all that
-    have one."""
+def _described(command: type[T], shown: Collection[str], flags: Collection[str], about: str = "") -> type[T]:
+    """A class like ``command`` with help for the options ``shown``; the others are hidden. ``flags``: names
+    of all that have one. ``about``: its description, in place of its docstring."""
+    parts, names = _described_parts(command, shown, flags), {"__doc__": about or command.__doc__}
+    return make_dataclass(command.__name__, parts, namespace=names, frozen=True)
+
+
+def _described_parts(
+    command: type, shown: Collection[str], flags: Collection[str]
+) -> list[tuple[str, Any, Any]]:
     parts: list[tuple[str, Any, Any]] = []
     known, hints = settings(command), get_type_hints(command, include_extras=True)
-    for part in fields(command):  # type: ignore[arg-type]
+    for part in fields(command):
         hint, name = hints[part.name], part.name
+        if Flat in getattr(hint, "__metadata__", ()):
+            parts += _described_parts(hint.__origin__, shown, flags)
+            continue
         if is_dataclass(hint):
-            group = _described(hint, shown, flags)  # type: ignore[arg-type]
+            group = _described(hint, shown, flags, known[name].help)  # type: ignore[arg-type]
             parts.append((name, group, field(default_factory=group)))
             continue
         if name not in shown:
@@ -299,8 +349,7 @@ def _described(command: type[T], shown: Collection[str], flags: Collection[str])
         elif known[name].help:  # else its type has the help, for options of several commands
             hint = Annotated[hint, tyro.conf.arg(help=_with_flags(known[name].text, flags))]
         parts.append((name, hint, field() if part.default is MISSING else part.default))
-    namespace = {"__doc__": command.__doc__}
-    return make_dataclass(command.__name__, parts, bases=(command,), namespace=namespace, frozen=True)
+    return parts
 
 
 def _with_flags(text: str, options: Collection[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +10,12 @@ import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
+from meshsplats._words import optional_up
 from meshsplats.cameras.files import cameras_beside, model_folder
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import SplatOptions, load_scene, optional_up
+from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
@@ -58,7 +58,7 @@ class Cameras(Command):
             raise UsageError(f"cameras are written as .json, got {self.output.name!r}")
         preview = beside(self.output, PREVIEW)
         check_outputs([self.output, preview], self.force, inputs=[self.input])
-        scene = load_scene(self.input, self.reading, up=self.up)
+        scene = self.reading.load_scene(self.input, up=self.up)
         if not isinstance(scene, GaussianCloud):
             raise UsageError(f"{self.input} is a mesh: cameras are found from the splats it was made of")
         up = optional_up(self.up)
@@ -78,22 +78,18 @@ class Cameras(Command):
         self._print_result(found, scene.origin, preview, time.perf_counter() - start)
 
     def _print_result(self, found: FoundCameras, origin: np.ndarray, preview: Path, seconds: float) -> None:
-        if self.json:
-            facts = {
-                "output": str(self.output),
-                "preview": str(preview),
-                "kind": found.kind,
-                "confidence": round(found.confidence, 2),
-                "up": [round(float(v), 4) for v in found.up],
-                "up_confidence": round(found.up_confidence, 2),
-                "ground": found.ground + float(origin @ found.up),
-                "extent": found.extent,
-                "cameras": len(found.cameras),
-                "seconds": round(seconds, 2),
-            }
-            print(json.dumps(facts, indent=1))
-            return
-        print(found.in_words())
-        print(f"{self.output} ({len(found.cameras)} cameras) in {seconds:.1f} s; {preview} shows them")
+        facts = {
+            "output": str(self.output),
+            "preview": str(preview),
+            "kind": found.kind,
+            "confidence": round(found.confidence, 2),
+            "up": [round(float(v), 4) for v in found.up],
+            "up_confidence": round(found.up_confidence, 2),
+            "ground": found.ground + float(origin @ found.up),
+            "extent": found.extent,
+            "cameras": len(found.cameras),
+            "seconds": round(seconds, 2),
+        }
         words = ["meshsplats", "render", self.input, "--as-splats", "--cameras", self.output, "-o", "views/"]
-        print(f"next: {command_line(words)}")
+        made = f"{self.output} ({len(found.cameras)} cameras) in {seconds:.1f} s; {preview} shows them"
+        self.finish(facts, found.in_words(), made, f"next: {command_line(words)}")

@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import time
-import warnings
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import tyro
 
-from meshsplats._files.atomic import together
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import (
-    SplatOptions,
-    check_mesh_suffix,
-    check_splat_endings,
-    load_scene,
-    size_of,
-    written,
-)
+from meshsplats.cli.common import SplatOptions, named, written
 from meshsplats.cli.messages import shown_path
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove, save_strip
-from meshsplats.errors import StraysWarning
-from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
-from meshsplats.formats.splat_formats import written_ending
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.conversion.cleaning import FLOATERS, CleaningRules
 
 
 @as_cli_options(
     "Rules: splats with any of these properties are removed."
     f" Default: --max-size {FLOATERS.max_size:g} --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
-    metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
 )
 class RuleOptions(CleaningRules):
     pass
@@ -62,71 +47,33 @@ class Clean(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.conversion.surroundings import floaters
-        from meshsplats.evaluation.viewers import alpha_for_viewers
-        from meshsplats.formats.gaussians import save_gaussians
-        from meshsplats.formats.meshes import save_mesh
+        from meshsplats.edits import clean_file
 
         start = time.perf_counter()
-        preview = beside(self.output, PREVIEW)
-        outputs = [preview] if self.preview_only else [self.output, preview]
-        check_outputs(outputs, self.force, inputs=[self.input])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", StraysWarning)  # which names this command
-            scene = load_scene(self.input, self.reading)
-        if isinstance(scene, GaussianCloud):
-            check_splat_endings(written_ending(self.output.name))
-        else:
-            check_mesh_suffix(self.output)
-        explicit = any(value is not None for value in vars(self.rules).values())
-        rules = self.rules if explicit else FLOATERS
-        found = find(scene, rules) if explicit else floaters(scene, self.input, threads=self.threads)
-        left = remove(scene, found)
-        alpha = {}
-        result = left if self.preview_only else written(left, self.origin)
-        if isinstance(left, SplatMesh) and not self.preview_only:
-            alpha = alpha_for_viewers(left, self.output, self.threads)
-        with together():
-            if not self.preview_only:
-                if isinstance(result, SplatMesh):
-                    save_mesh(result, self.output, **alpha)
-                else:
-                    save_gaussians(result, self.output)
-            save_strip(scene, left, found, preview, self.threads)
-        self._print_result(rules, found, left, preview, time.perf_counter() - start)
-
-    def _print_result(
-        self,
-        rules: CleaningRules,
-        found: Findings,
-        left: GaussianCloud | SplatMesh,
-        preview: Path,
-        seconds: float,
-    ) -> None:
-        places = left.means if isinstance(left, GaussianCloud) else left.vertices
-        lower, upper = (
-            [round(float(v), 4) for v in side + left.origin]
-            for side in (places.min(axis=0), places.max(axis=0))
+        made = clean_file(
+            self.input,
+            self.output,
+            self.rules,
+            reading=self.reading,
+            preview_only=self.preview_only,
+            place=partial(written, origin=self.origin),
+            threads=self.threads,
+            force=self.force,
         )
-        if self.json:
-            counts = found.counts()
-            around = counts.pop("surroundings", None)
-            result = {
-                "input": shown_path(self.input),
-                "output": None if self.preview_only else str(self.output),
-                "preview": str(preview),
-                "splats": len(found.opacities),
-                "kept": int(found.kept.sum()),
-                "removed": counts,
-                "surroundings": around,
-                "lower": lower,
-                "upper": upper,
-                "seconds": round(seconds, 3),
-            }
-            print(json.dumps(result))
-            return
-        print(*found.in_words(rules), sep="\n")
-        print(f"kept: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
-        if not self.preview_only:
-            print(f"{self.output} ({size_of(self.output)})")
-        print(f"preview, before | removed, in red | after: {preview}")
+        counts, kept, (lower, upper) = made.found.counts(), int(made.found.kept.sum()), made.extent
+        around = counts.pop("surroundings", None)
+        result = {
+            "input": shown_path(self.input),
+            "output": None if self.preview_only else str(self.output),
+            "preview": str(made.preview),
+            "splats": len(made.found.opacities),
+            "kept": kept,
+            "removed": counts,
+            "surroundings": around,
+            "lower": lower,
+            "upper": upper,
+            "seconds": round(time.perf_counter() - start, 3),
+        }
+        lines = [*made.found.in_words(made.rules), f"kept: {kept:,} splats, from {lower} to {upper}"]
+        lines += [] if self.preview_only else [named(self.output)]
+        self.finish(result, *lines, f"preview, before | removed, in red | after: {made.preview}", indent=None)

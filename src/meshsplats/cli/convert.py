@@ -6,20 +6,22 @@ import json
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 
 from meshsplats.camera import Camera
+from meshsplats.cli import option
+from meshsplats.cli.arguments import Command, Flat, as_cli_options, of_presets, usage_errors
 from meshsplats.cli.common import (
+    SplatOptions,
     again,
-    alpha_in_words,
-    check_mesh_suffix,
     draw_preview,
-    optional_up,
+    named,
     plural,
     say_origin,
     size_of,
@@ -27,7 +29,6 @@ from meshsplats.cli.common import (
     warnings_kept,
     written,
 )
-from meshsplats.cli.convert_options import ConvertCommand
 from meshsplats.cli.images import views_of_a_place
 from meshsplats.cli.messages import (
     FAILED,
@@ -42,14 +43,18 @@ from meshsplats.cli.messages import (
     shown_path,
 )
 from meshsplats.cli.records import changes_since, write_configuration
+from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.options import PRESETS
 from meshsplats.errors import DataWarning
-from meshsplats.file_conversion import Callbacks, Converter, seen_from
-from meshsplats.formats.mesh_formats import mesh_format_to_write
-from meshsplats.formats.outputs import CONFIGURATION, beside, means_splats
+from meshsplats.evaluation.mesh_files import MeshFileOptions
+from meshsplats.evaluation.viewers import AlphaChoice
+from meshsplats.file_conversion import Callbacks, Converter, Product, seen_from
+from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats
+from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.jobs import Job, is_batch, jobs, sources, without_results
+from meshsplats.jobs import Job, formats_of, is_batch, jobs, sources, without_results
 
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
@@ -59,32 +64,72 @@ ORDER_GAIN = "7 to 10 dB in three.js and Babylon.js in half a minute; not for ra
 """What a solved order gains there: benchmarks/results/viewers_ordered.md."""
 
 
+@as_cli_options(presets=False)
+class FileOptions(MeshFileOptions):
+    """How meshes are saved."""
+
+
+@as_cli_options(defaults=of_presets(PRESETS))
+class ConvertOptions(ConversionOptions):
+    """In parentheses: the values of the presets."""
+
+
+@as_cli_options(presets=False)
+class ProductOptions(Product):
+    files: FileOptions
+    origin: option.Origin = "keep"
+    conversion: ConvertOptions
+
+
 @dataclass(frozen=True)
-class Convert(ConvertCommand):
+class Convert(Command):
     """Converts splats to a mesh of translucent, vertex-coloured triangles; several files or folders, into a
     folder. Converts meshes to other formats, and splats, too: with --as-splats, or a name such as scene.spz.
 
     Writes a preview and the configuration beside the result.
     """
 
+    COMMON = (
+        *("input", "output", "formats", "preset", "look", "cameras", "data", "up", "lit"),
+        *("alpha", "as_splats", "max_splats", "max_triangles", "crop", "json", "force"),
+    )
+    EXCLUSIVE = (("cameras", "data"),)
+    CONFIGURABLE = True
+
+    input: tyro.conf.Positional[option.Inputs]
+    """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
+    input."""
+    output: option.Output
+    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or
+    splats: .spz, .sog, .splat, .compressed.ply, .usdz. Or a folder, for files named like the inputs."""
+    formats: Annotated[tuple[Ending, ...], tyro.conf.arg(help_behavior_hint="")] = ()
+    """With a folder: formats to write. Default: glb."""
+    product: Annotated[ProductOptions, Flat] = field(default_factory=ProductOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    json: bool = False
+    """Print the results as JSON, a line for each input, errors too."""
+    force: option.Force = False
+    skip_existing: bool = False
+    """Keep the meshes that are there, and make those that are missing. Says which of them are older than
+    their input or were made with other options."""
+
     def execute(self) -> int:
         if not self.input:
             raise UsageError("give a splat file, a mesh or a folder to convert")
-        ending = written_ending(self.output.name)
-        if not self.as_splats and means_splats(self.formats or [ending]):
-            return replace(self, as_splats=True).execute()
-        batch = is_batch(self.input)
-        folder = batch or bool(self.formats) or self.output.is_dir()
-        formats = self._formats(folder)
-        self.check_options(formats or [ending])
+        ending, product = written_ending(self.output.name), self.product
+        if not product.as_splats and means_splats(self.formats or [ending]):
+            return replace(self, product=replace(product, as_splats=True)).execute()
+        folder = is_batch(self.input) or bool(self.formats) or self.output.is_dir()
+        formats = formats_of(self.output, self.formats, folder=folder, as_splats=product.as_splats)
+        if self.force and self.skip_existing:
+            raise UsageError("give --force or --skip-existing, not both")
+        product.check(formats or [ending], self.input, self.output)
         found = sources(self.input)
-        preview = not (self.no_preview or self.stream)
         if formats:
             found = without_results(found, self.input, self.output, formats)
-        todo = jobs(
-            found, self.output, formats, preview=preview, sidecars=not self.no_sidecar, shown=shown_path
-        )
-        cameras = self.seen_by()
+        records = {"preview": not (product.no_preview or product.stream), "sidecars": not product.no_sidecar}
+        todo = jobs(found, self.output, formats, **records, shown=shown_path)
+        cameras = product.seen_by()
         if not folder:
             self._print_result(self._convert(todo[0], cameras), todo[0], cameras)
             return OK
@@ -98,14 +143,10 @@ class Convert(ConvertCommand):
                 with suppress(OSError):
                     self.output.rmdir()  # where nothing was written
 
-    def _formats(self, folder: bool) -> Sequence[str]:
-        """Suffixes to write in a folder; none for a single file."""
-        if not folder:
-            if not self.as_splats:
-                _check_file(self.output)
-            return ()
-        _check_folder(self.output)
-        return self.formats or (("ply",) if self.as_splats else ("glb",))
+    def resolved(self) -> dict[str, Any]:
+        if self.product.as_splats or all(identify(path) == "mesh" for path in self.input):
+            return {}
+        return vars(self.product.resolved(self.input))
 
     def _convert_all(self, todo: Sequence[Job], cameras: list[Camera] | None) -> int:
         """Does every job, also after failures; a full disk ends them. Returns the exit code: that of the
@@ -113,7 +154,8 @@ class Convert(ConvertCommand):
         codes, skipped = [], 0
         for job in track(todo, "converting", len(todo)):
             try:
-                result = self._convert(job, cameras)
+                with usage_errors(type(self)):
+                    result = self._convert(job, cameras)
                 skipped += result["skipped"]
                 self._print_line(result, job)
             except BrokenPipeError:
@@ -151,117 +193,99 @@ class Convert(ConvertCommand):
 
     def _made(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``; counts, scores and seconds."""
-        if not (self.as_splats or self.stream):
-            self.check_kind(job)
+        if not (self.product.as_splats or self.product.stream):
+            self.product.check_kind(job, self.reading)
         callbacks = Callbacks(
-            load=partial(self.reading.load, up=self.up),
+            load=partial(self.reading.load, up=self.product.up),
             stream=self._opened,
-            place=partial(written, origin=self.origin),
+            place=partial(written, origin=self.product.origin),
             record=self._record,
             preview=draw_preview,
             opening=self._opening,
         )
-        return Converter(self.product(), callbacks).made(job, cameras)
+        return Converter(self.product, callbacks).made(job, cameras)
 
     def _opened(self, source: Path) -> SplatStream:
         """The splats of an input in blocks, relative to the origin that is asked for."""
-        given = None if isinstance(self.origin, str) else self.origin
-        found = self.reading.stream(source, given, up=self.up)
-        say_origin(found.origin, self.origin, splats=self.as_splats)
+        origin = self.product.origin
+        given = None if isinstance(origin, str) else origin
+        found = self.reading.stream(source, given, up=self.product.up)
+        say_origin(found.origin, origin, splats=self.product.as_splats)
         return found
 
     def _record(self, job: Job) -> None:
         for path, config in zip(job.outputs, job.configs, strict=False):
-            write_configuration(config, "convert", self.alone(job, path))
+            write_configuration(config, "convert", self._alone(job, path))
+
+    def _alone(self, job: Job, path: Path) -> Convert:
+        """The command that writes ``path`` of ``job`` alone."""
+        taken: Any = self.product.taken_by(path)
+        return replace(self, input=(job.source,), output=path, formats=(), product=taken)
 
     def _opening(self, cloud: GaussianCloud, source: Path, given: Sequence[Camera] | None) -> Camera | None:
-        found = views_of_a_place(cloud, source, 1, up=optional_up(self.up), given=given or None)
+        found = views_of_a_place(cloud, source, 1, up=self.product.direction, given=given or None)
         return found[0] if found else None
 
     def _changes(self, job: Job, index: int) -> str | None:
         """How the record beside an output of ``job`` differs from the options of now: see ``Job.plan``."""
         path = job.outputs[index]
-        return changes_since(beside(path, CONFIGURATION), "convert", self.alone(job, path), _IDLE)
+        return changes_since(beside(path, CONFIGURATION), "convert", self._alone(job, path), _IDLE)
 
     def _print_result(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> None:
         """Prints the result of a single input."""
-        if self.json:
-            print(json.dumps(result))
-            return
+        self.finish(result, *self._lines(result, job, cameras), indent=None)
+
+    def _lines(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> list[str]:
+        made = named(self.output)
         if result["skipped"]:
-            print(f"{self.output} ({size_of(self.output)}): kept")
-            return
+            return [f"{made}: kept"]
         if "written" in result:
-            print(f"{result['written']:,} of {result['read']:,} splats in {result['seconds']:.2f} s")
-            print(f"{self.output} ({size_of(self.output)})")
+            lines = [f"{result['written']:,} of {result['read']:,} splats in {result['seconds']:.2f} s", made]
         else:
-            print(_counts(result))
-            seconds = result["seconds"]
             words = {"read": "read", "convert": "converted", "save": "saved", "choose alpha": "chose alpha"}
             words["solve order"] = "solved the order"
-            timing = ", ".join(f"{words[name]} {value:.2f} s" for name, value in seconds.items() if value)
-            print(f"{self.output} ({size_of(self.output)}): {timing}")
-            if line := alpha_in_words(result.get("alpha")):
-                print(line)
-                if "splats" in result and job.shown != "-" and self.conversion.crop is None:
-                    print(f"better there: {self._for_depth_buffers()}")
-                    print(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
+            times = [f"{words[name]} {value:.2f} s" for name, value in result["seconds"].items() if value]
+            lines = [_counts(result), f"{made}: {', '.join(times)}"]
+            if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
+                lines.append(line)
+                if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
+                    lines.append(f"better there: {self._for_depth_buffers()}")
+                    lines.append(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
         if result["preview"]:
-            print(f"preview: {result['preview']}")
-        if result.get("converted") is not None and self.files.compression == "none":
-            print(f"next: {self._next(seen_from(cameras, job.source, np.zeros(3)))}")
+            lines.append(f"preview: {result['preview']}")
+        if result.get("converted") is not None and self.product.files.compression == "none":
+            lines.append(f"next: {self._next(seen_from(cameras, job.source, np.zeros(3)))}")
+        return lines
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:
         """Prints the result of one of several inputs."""
-        if self.json:
-            print(json.dumps(result), flush=True)
-            return
         if result["skipped"]:
             sizes = "kept"
         else:
             sizes = f"{result['written']:,} splats" if "written" in result else _counts(result)
         files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
-        choice = result.get("alpha")
-        print(f"{job.shown}: {sizes}: {files}" + (f", alpha {choice['alpha']}" if choice else ""), flush=True)
+        alpha = f", alpha {choice['alpha']}" if (choice := result.get("alpha")) else ""
+        self.finish(result, f"{job.shown}: {sizes}: {files}{alpha}", indent=None)
 
     def _next(self, cameras: Sequence[Camera] | None) -> str:
         """The command that compares the mesh with the splats in its cameras, or one that renders it if only a
         part of them was converted."""
-        folder, source = self.output.with_suffix(""), shown_path(self.input[0])
-        if self.conversion.crop is not None or source == "-" or self.scale is not None:
+        folder, source, product = self.output.with_suffix(""), shown_path(self.input[0]), self.product
+        if product.conversion.crop is not None or source == "-" or product.scale is not None:
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
-        words += ["--look", self.look_of_result] if self.look_of_result != "area" else []
-        words += again(self, "data", missing="few")
-        if cameras and self.data is None:
-            words += ["--cameras", source if self.cameras is None else self.cameras]
+        words += ["--look", product.look] if product.look != "area" else []
+        words += again(product, "data", missing="few")
+        if cameras and product.data is None:
+            words += ["--cameras", source if product.cameras is None else product.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
 
     def _for_depth_buffers(self) -> str:
         """The command that makes a mesh for viewers that do not sort, and what is gained by it."""
-        words: list[str | Path] = ["meshsplats", "finetune", shown_path(self.input[0])]
-        words += [
-            *again(self, "data", missing="few"),
-            *self.reading.again(),
-            "-o",
-            self.output.with_suffix(".solid.glb"),
-        ]
-        command = command_line([*words, "--opacity", "cutoff", "--soft-share", "0.05"])
-        return f"{command} ({ENGINE_GAIN})"
-
-
-def _check_folder(output: Path) -> None:
-    """UsageError if ``output`` names a mesh file, where a folder for several is wanted."""
-    if mesh_format_to_write(output) is not None and not output.is_dir():
-        raise UsageError(f"several inputs or formats need a folder: -o {output.with_suffix('')}, say")
-
-
-def _check_file(output: Path) -> None:
-    """UsageError if no mesh can be written as ``output``."""
-    try:
-        check_mesh_suffix(output)
-    except UsageError as error:
-        raise UsageError(f"{error}; for a folder, name the formats: --formats glb") from None
+        words: list[object] = ["meshsplats", "finetune", shown_path(self.input[0])]
+        words += [*again(self.product, "data", missing="few"), *self.reading.again()]
+        words += ["-o", self.output.with_suffix(".solid.glb"), "--opacity", "cutoff", "--soft-share", "0.05"]
+        return f"{command_line(words)} ({ENGINE_GAIN})"
 
 
 def _counts(result: dict[str, Any]) -> str:

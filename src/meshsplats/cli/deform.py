@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,10 +11,9 @@ import tyro
 
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import check_mesh_suffix, placed, plural, say_origin, size_of, track
+from meshsplats.cli.common import plural, say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
-from meshsplats.formats.mesh_formats import keeps
-from meshsplats.formats.outputs import check_outputs
+from meshsplats.formats.outputs import placed
 from meshsplats.mesh import SplatMesh
 
 
@@ -42,53 +40,29 @@ class Deform(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.formats.base_meshes import load_base
-        from meshsplats.prior import load_prior
+        from meshsplats.prior.planning import pose_files, posed_files
 
-        start = time.perf_counter()
-        check_mesh_suffix(self.output)
+        start, count = time.perf_counter(), len(self.base)
         if not self.base:
             raise UsageError("give the edited base with --base")
-        targets = self.targets()
-        check_outputs(targets, self.force, inputs=[self.input, *self.base])
-        prior = load_prior(self.input)
-        origin = prior.mesh.origin
-        bases = [load_base(path, textures=False, origin=origin) for path in self.base]
-        for path, base in zip(self.base, bases, strict=True):  # all, before anything is written
-            try:
-                prior.check_topology(base)
-            except ValueError as error:
-                raise ValueError(f"{path}: {error}") from None
-        lift = self.lift
-        if lift is None and self.output.suffix.lower() != ".npz" and not prior.lift:
-            lift = prior.export_lift
-        say_origin(origin, self.origin)
-        for base, target in track(list(zip(bases, targets, strict=True)), "moving", len(targets)):
-            _save(placed(prior.pose(base.vertices, lift=lift), self.origin), target)
+        triangles = 0
+
+        def place(mesh: SplatMesh) -> SplatMesh:
+            nonlocal triangles
+            if not triangles:
+                say_origin(mesh.origin, self.origin)
+            triangles = len(mesh.faces)
+            return placed(mesh, self.origin)
+
+        given = (self.input, self.base, self.output)
+        for _ in track(posed_files(*given, lift=self.lift, place=place, force=self.force), "moving", count):
+            pass
         seconds = time.perf_counter() - start
-        if self.json:
-            files = [str(target) for target in targets]
-            print(
-                json.dumps({"files": files, "triangles": len(prior.mesh.faces), "seconds": round(seconds, 3)})
-            )
-            return
-        more = f" to {targets[-1]}" if len(targets) > 1 else ""
-        print(
-            f"{targets[0]}{more} ({plural(len(prior.mesh.faces), 'triangle')}, {size_of(targets[0])}):"
-            f" {plural(len(targets), 'pose')} in {seconds:.2f} s"
+        files = [str(path) for path in pose_files(self.output, count)]
+        more = f" to {files[-1]}" if count > 1 else ""
+        made = f"{files[0]}{more} ({plural(triangles, 'triangle')}, {size_of(Path(files[0]))}):"
+        self.finish(
+            {"files": files, "triangles": triangles, "seconds": round(seconds, 3)},
+            f"{made} {plural(count, 'pose')} in {seconds:.2f} s",
+            indent=None,
         )
-
-    def targets(self) -> list[Path]:
-        """The output for each base."""
-        if len(self.base) == 1:
-            return [self.output]
-        width = max(4, len(str(len(self.base))))
-        stem, suffix = self.output.stem, self.output.suffix
-        return [self.output.with_name(f"{stem}_{i:0{width}d}{suffix}") for i in range(1, len(self.base) + 1)]
-
-
-def _save(mesh: SplatMesh, target: Path) -> None:
-    from meshsplats.formats.meshes import save_mesh
-
-    # Formats without a place for the binding would warn of it.
-    save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)

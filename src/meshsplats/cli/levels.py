@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
-from meshsplats.chains import TABLE, ChainOptions, begin_folder, check_folder, make_chain, partial_folder
+from meshsplats._words import optional_up
+from meshsplats.chains import (
+    ChainOptions,
+    LevelTuning,
+    begin_folder,
+    check_folder,
+    make_chain,
+    partial_folder,
+    table_in_words,
+)
 from meshsplats.cli import option
-from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.common import SplatOptions, optional_up, placed, say_origin, size_of
+from meshsplats.cli.arguments import Command, Flat, as_cli_options
+from meshsplats.cli.common import SplatOptions, say_origin
 from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
-from meshsplats.cli.records import configuration, write_configuration
+from meshsplats.cli.records import differences, write_configuration
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
-from meshsplats.formats.mesh_formats import takes
-from meshsplats.formats.outputs import CONFIGURATION, recorded_options
+from meshsplats.finetuning import Interrupted, Progress
+from meshsplats.formats.outputs import CONFIGURATION, placed
 from meshsplats.formats.sniff import identify
-from meshsplats.levels import SAMPLES, Level
-from meshsplats.rendering.looks import comparison_in_words
+from meshsplats.levels import Level
+from meshsplats.order import Order
 
-MINUTES = 2.0
-"""Default length of the fine-tuning of a level."""
 _CHANGEABLE = ("output", "threads")
 """Options that may change when a chain is resumed."""
 
@@ -37,6 +42,11 @@ _CHANGEABLE = ("output", "threads")
 @as_cli_options(without=("order", "up", "threads"), presets=False)
 class ChainArguments(ChainOptions):
     """The meshes and their files."""
+
+
+@as_cli_options(presets=False)
+class TuningArguments(LevelTuning):
+    """How long each level is fine-tuned."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +66,8 @@ class Levels(Command):
     output: option.Output
     """Folder for the meshes; it appears when all of them are done."""
     chain: ChainArguments = field(default_factory=ChainArguments)
-    no_tune: bool = False
-    """Convert only: seconds in place of minutes."""
-    minutes: option.Number = None
-    """Length of the fine-tuning of each level. Default: 2."""
-    steps: option.Count = None
-    """Length of the fine-tuning of each level, in place of --minutes."""
-    order: Literal["fragment", "splat"] = "fragment"
+    tuning: Annotated[TuningArguments, Flat] = field(default_factory=TuningArguments)
+    order: Order = "fragment"
     """Order in which triangles are blended, tuned and scored: exact at every sample, or whole splats by their
     centres."""
     up: option.Text = None
@@ -79,8 +84,8 @@ class Levels(Command):
     """Overwrite an older chain in the folder."""
 
     def execute(self) -> int:
-        config = self._configured()
-        self._check_output()
+        self._check()
+        config = self.tuning.config()
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
         cloud = self.reading.load(self.input, up=self.up)
@@ -98,82 +103,36 @@ class Levels(Command):
         options = replace(self.chain, order=self.order, up=optional_up(self.up), threads=self.threads)
         options.plan(len(cloud))  # before the folder is made
         self._begin()
+        how: dict[str, Any] = {"place": partial(placed, origin=self.origin), "on_level": shown}
         try:
-            table = make_chain(
-                cloud,
-                self.output,
-                options,
-                config,
-                source=str(self.input),
-                place=partial(placed, origin=self.origin),
-                on_level=shown,
-            )
+            table = make_chain(cloud, self.output, options, config, source=str(self.input), **how)
         except Interrupted as stop:
             say(f"stopped in level {level_now}: the same command with --resume continues with it")
             return 128 + (stop.signal or signal.SIGINT)
-        if self.json:
-            print(json.dumps(table | {"folder": str(self.output)}, indent=1))
-        else:
-            self._print_table(table["levels"])
+        self.finish(table | {"folder": str(self.output)}, *table_in_words(table, self.output))
         return 0
 
     def resolved(self) -> dict[str, Any]:
-        config = self._configured()
+        config = self.tuning.config()
         return {} if config is None else config.to_dict()
 
-    def _configured(self) -> FinetuneConfig | None:
-        """Configuration of the fine-tuning; UsageError for options that contradict each other."""
-        if self.chain.levels < 1:
-            raise UsageError(f"--levels must be at least 1, got {self.chain.levels}")
-        if self.chain.max_splats is not None and self.chain.max_splats < 1:
-            raise UsageError(f"--max-splats must be at least 1, got {self.chain.max_splats}")
-        if self.no_tune and (self.minutes is not None or self.steps is not None):
-            raise UsageError("--minutes and --steps have no effect with --no-tune")
-        if self.minutes is not None and self.steps is not None:
-            raise UsageError("give --minutes or --steps, not both")
-        if self.resume and self.force:
-            raise UsageError("--resume continues, --force starts again: give one of them")
-        if self.chain.alpha not in ("auto", "opaque") and not takes(f"level.{self.chain.format}", "alpha"):
-            raise UsageError(f"--alpha {self.chain.alpha} is for .glb files, not .{self.chain.format}")
+    def _check(self) -> None:
+        """UsageError or OptionsError for options that contradict each other; OSError, before the work, if the
+        folder cannot appear."""
+        self.chain.check()
+        option.check_resumption(self.resume, self.force)
         optional_up(self.up)
-        if self.no_tune:
-            return None
-        if self.steps is not None:
-            return make_config("default", steps=self.steps)
-        return make_config("default", minutes=MINUTES if self.minutes is None else self.minutes)
-
-    def _check_output(self) -> None:
-        """OSError, before the work, if the folder cannot appear."""
+        self.tuning.config()
         if self.output.suffix:
             raise UsageError(f"-o must name a folder, got {self.output.name!r}")
         check_folder(self.output, resume=self.resume, replace_old=self.force)
 
     def _begin(self) -> None:
         """Makes the folder of unfinished levels, empty; with --resume it must be that of the same command."""
-        if self.resume:
-            unfinished = partial_folder(self.output)
-            before = recorded_options(unfinished / CONFIGURATION, "levels") or {}
-            for name, value in configuration("levels", self, unfinished)["options"].items():
-                if name not in _CHANGEABLE and before.get(name) != value:
-                    raise UsageError(
-                        f"{unfinished} was started with {flag(name)} {before.get(name)}, not {value}"
-                    )
+        if not self.resume:
+            write_configuration(begin_folder(self.output) / CONFIGURATION, "levels", self)
             return
-        write_configuration(begin_folder(self.output) / CONFIGURATION, "levels", self)
-
-    def _print_table(self, rows: list[dict[str, Any]]) -> None:
-        heads = (
-            f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}"
-        )
-        print(f"{heads}  alpha" if self.chain.format == "glb" else heads)
-        for row in rows:
-            size = size_of(self.output / row["file"])
-            print(
-                f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{size:>10}"
-                f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
-                + (f"  {row['alpha']['alpha']}" if self.chain.format == "glb" and row["alpha"] else "")
-            )
-        views = sorted({row["views"] for row in rows})
-        count = " to ".join(map(str, (views[0], views[-1])[: len(views)]))
-        print(f"{comparison_in_words('area', SAMPLES)}; {count} views")
-        print(f"{self.output}/: {TABLE} has this table")
+        unfinished = partial_folder(self.output)
+        differ = differences(unfinished / CONFIGURATION, "levels", self, _CHANGEABLE) or {}
+        for name, (old, new) in differ.items():
+            raise UsageError(f"{unfinished} was started with {flag(name)} {old}, not {new}")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from meshsplats.cli.messages import UsageError
 from meshsplats.formats.mesh_formats import formats_in_words
 
 # Optional options. Their help describes the default, in place of "(default: None)".
@@ -14,15 +15,7 @@ Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
-Point = Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")]
-Box = Annotated[
-    tuple[float, float, float, float, float, float] | None,
-    tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
-]
-LookOfSplats = Annotated[
-    Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
-]
+Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
 Threads = Annotated[
     int | None,
     tyro.conf.arg(
@@ -42,12 +35,8 @@ Origin = Annotated[
     ),
 ]
 
-Missing = Annotated[
-    Literal["few", "error", "skip"],
-    tyro.conf.arg(help="With --data: missing images are left out; few: if fewer than half are missing."),
-]
 
-MeaningOfMasks = Annotated[
-    Literal["count", "subject"],
-    tyro.conf.arg(help="With --data: only pixels inside of masks count, or masks cut out a subject."),
-]
+def check_resumption(resume: bool, force: bool) -> None:
+    """UsageError for both of --resume and --force."""
+    if resume and force:
+        raise UsageError("--resume continues, --force starts again: give one of them")

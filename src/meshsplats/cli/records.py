@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Collection, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import meshsplats
 from meshsplats import _toml as toml
 from meshsplats._option_values import relative_to
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
@@ -30,8 +30,6 @@ def configuration(
     name: str, command: Command, folder: Path, result: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """The content of a configuration file in ``folder``."""
-    import meshsplats
-
     values = {key: option.value(command) for key, option in options_of(type(command)).items()}
     plain = {key: _plain(value, folder) for key, value in values.items()}
     resolved = {key: _plain(value, folder) for key, value in command.resolved().items()}
@@ -45,23 +43,51 @@ def configuration(
     }
 
 
-def changes_since(path: Path, name: str, command: Command, idle: Collection[str] = ()) -> str | None:
-    """How ``command`` differs from the one recorded at ``path``, in words: empty if it does not, None without
-    a record of a command ``name``. ``idle``: options that do not change the result."""
+def differences(
+    path: Path, name: str, command: Command, idle: Collection[str] = ()
+) -> dict[str, tuple[Any, Any]] | None:
+    """The options of ``command`` that differ from those recorded at ``path``: what they were and are. None
+    without a record of a command ``name``. ``idle``: options that do not count."""
     before = recorded_options(path, name)
     if before is None:
         return None
-    today = configuration(name, command, path.parent)
-    now = {key: value for key, value in today["options"].items() if value is not None}
-    same = partial(_same, path.parent)
-    changed = [key for key in sorted({*now, *before} - set(idle)) if not same(before.get(key), now.get(key))]
+    now = configuration(name, command, path.parent)["options"]
+    return {
+        key: (before.get(key), now.get(key))
+        for key in dict.fromkeys((*now, *before))
+        if key not in idle and not _same(path.parent, before.get(key), now.get(key))
+    }
+
+
+def in_plain_words(command: Command, differ: Mapping[str, tuple[Any, Any]]) -> str:
+    """``differences`` in a line."""
+
+    def shown(value: Any) -> str:
+        return (
+            "not given"
+            if value is None
+            else " ".join(map(str, value if isinstance(value, list) else [value]))
+        )
+
+    return ", ".join(
+        f"{spelled(type(command), key)} was {shown(old)} and is {shown(new)}"
+        for key, (old, new) in differ.items()
+    )
+
+
+def changes_since(path: Path, name: str, command: Command, idle: Collection[str] = ()) -> str | None:
+    """How ``command`` differs from the one recorded at ``path``, in words: empty if it does not, None without
+    a record of a command ``name``. ``idle``: options that do not change the result."""
+    differ = differences(path, name, command, idle)
+    if differ is None:
+        return None
     found = [
-        f"{spelled(type(command), key)} was {_shown(before.get(key))} and is {_shown(now.get(key))}"
-        for key in changed
+        f"{spelled(type(command), key)} was {_shown(old)} and is {_shown(new)}"
+        for key, (old, new) in sorted(differ.items())
     ]
-    version = toml.load(path).get("version")
-    if version != today["version"]:
-        found.append(f"MeshSplats was {version} and is {today['version']}")
+    version, today = toml.load(path).get("version"), meshsplats.__version__
+    if version != today:
+        found.append(f"MeshSplats was {version} and is {today}")
     return ", ".join(found)
 
 
@@ -76,13 +102,6 @@ def _same(folder: Path, a: Any, b: Any) -> bool:
 
 def _shown(value: Any) -> str:
     return "not given" if value is None else json.dumps(value)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
-    from meshsplats._files.atomic import write_text
-
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def _plain(value: Any, folder: Path) -> Any:

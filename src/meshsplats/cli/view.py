@@ -2,46 +2,31 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import tyro
 
-from meshsplats._files.atomic import in_words
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
-from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats._files.atomic import in_words, write_text
 from meshsplats.cli import option
-from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import (
-    PartOptions,
-    SplatOptions,
-    check_data,
-    load_scene,
-    optional_color,
-    optional_up,
-    size_of,
-)
-from meshsplats.cli.images import views_of_a_place
+from meshsplats.cli.arguments import Command, Flat, as_cli_options
+from meshsplats.cli.common import PartOptions, SplatOptions, named
 from meshsplats.cli.messages import UsageError, say, shown_path
 from meshsplats.cli.records import write_configuration
-from meshsplats.datasets.views import Dataset
-from meshsplats.evaluation.backgrounds import choose_background
-from meshsplats.formats.base_meshes import load_base
 from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.viewer import content
 from meshsplats.viewer.content import Content
-from meshsplats.viewpoints.showing import opening_beside
+from meshsplats.viewer.files import EXCLUSIVE, ViewingOptions, shown_file
 
 if TYPE_CHECKING:
     from meshsplats.viewer.page import Page
-FOUND_VIEWS = 12
-"""Viewpoints of a place, where the input has none."""
+
+
+@as_cli_options(presets=False)
+class ViewerOptions(ViewingOptions):
+    reading: SplatOptions
+    part: PartOptions
 
 
 @dataclass(frozen=True)
@@ -53,7 +38,7 @@ class View(Command):
     this machine: the browser gets the scene from 127.0.0.1 until Ctrl-C.
     """
 
-    EXCLUSIVE = (("cameras", "data"), ("splats", "without_splats"), ("max_triangles", "whole"))
+    EXCLUSIVE = EXCLUSIVE
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
@@ -62,32 +47,7 @@ class View(Command):
         None
     )
     """An .html file with everything inside. Default: the browser is opened."""
-    splats: option.File = None
-    """Splats to compare a mesh with. Default: the input, where that is splats."""
-    surface: option.File = None
-    """A surface to compare the input with (.glb or .obj with its texture, or any mesh)."""
-    without_splats: bool = False
-    """Leave the splats out: the page is smaller."""
-    max_triangles: option.Count = None
-    """Splats are merged until their mesh has no more triangles. Default: 4,000,000."""
-    whole: bool = False
-    """Merge no splats, up to 20,000,000 triangles."""
-    cameras: option.File = None
-    """Viewpoints to choose from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model
-    folder that has one. Default: those of the input, if it is a model folder."""
-    data: option.Folder = None
-    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): viewpoints to choose from."""
-    missing: option.Missing = "few"
-    up: option.Text = None
-    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else of the
-    mesh."""
-    background: option.Text = None
-    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with --data that of the
-    model folder or of the photographs."""
-    title: option.Text = None
-    """Name of the scene in the page. Default: that of the file."""
-    reading: SplatOptions = field(default_factory=SplatOptions)
-    part: PartOptions = field(default_factory=PartOptions)
+    viewing: Annotated[ViewerOptions, Flat] = field(default_factory=ViewerOptions)
     no_open: bool = False
     """Print the address, and open no browser."""
     json: option.AsJson = False
@@ -95,20 +55,18 @@ class View(Command):
 
     def execute(self) -> None:
         self._check()
+        viewing = self.viewing
+        viewing.check()
         if self.output is not None:
-            inputs = [p for p in (self.input, self.splats, self.surface, self.cameras) if p is not None]
+            inputs = [self.input, viewing.splats, viewing.surface, viewing.cameras]
             outputs = [self.output, beside(self.output, CONFIGURATION)]
-            check_outputs(outputs, self.force, inputs=inputs)
-        scene = self._scene()
-        photographs = self._photographs(scene.origin)
-        cameras = self._cameras(photographs, scene)
-        shown = self._content(scene, cameras)
-        del scene  # large, and partly copied
-        self._announce(shown)
-        page = self._page(shown, photographs, cameras)
-        result = content.measured(shown, page, cameras)
+            check_outputs(outputs, self.force, inputs=[path for path in inputs if path is not None])
+        shown = shown_file(self.input, viewing, say=say)
+        self._announce(shown.content)
+        name = shown_path(self.input)
+        page, result = shown.page("scene" if name == "-" else Path(name).resolve().stem)
         if self.output is not None:
-            self._write(page, result)
+            self._write(self.output, page, result)
         else:
             self._serve(page, result)
 
@@ -119,77 +77,6 @@ class View(Command):
             raise UsageError("--no-open has no effect with -o, which opens nothing")
         if self.output is None and self.force:
             raise UsageError("--force has no effect without -o")
-        check_data(self.data, self.missing)
-        for first, second in self.EXCLUSIVE:
-            if getattr(self, first) and getattr(self, second):
-                raise UsageError(f"give --{first} or --{second.replace('_', '-')}, not both")
-        if self.max_triangles is not None and not 8 <= self.max_triangles <= content.MOST_TRIANGLES:
-            raise UsageError(
-                f"--max-triangles must be from 8, one splat's, to {content.MOST_TRIANGLES:,},"
-                f" got {self.max_triangles}"
-            )
-        optional_color(self.background)
-        optional_up(self.up)
-
-    def _scene(self) -> GaussianCloud | SplatMesh | BaseMesh:
-        scene = content.surface_or(lambda path: load_scene(path, self.reading, up=self.up), self.input)
-        if isinstance(scene, BaseMesh):
-            if self.surface is not None or self.part.crop is not None:
-                given = "--crop" if self.surface is None else "--surface"
-                raise UsageError(f"{shown_path(self.input)} is a textured surface: {given} has no effect")
-        else:
-            scene = self.part.of(scene)
-        if not isinstance(scene, GaussianCloud):
-            if self.max_triangles is not None or self.whole:
-                given = "--whole" if self.whole else "--max-triangles"
-                raise UsageError(f"{shown_path(self.input)} is a mesh: {given} is for splats")
-            return scene
-        if self.splats is not None:
-            raise UsageError(f"{shown_path(self.input)} is splats: --splats is for a mesh")
-        return scene
-
-    def _content(self, scene: GaussianCloud | SplatMesh | BaseMesh, cameras: list[Camera]) -> Content:
-        """What the page will show."""
-        beside = None if self.surface is None else load_base(self.surface, origin=scene.origin)
-        try:
-            if isinstance(scene, GaussianCloud):
-                advice = "leave --whole out, or make 'meshsplats tiles'"
-                most = None if self.whole else self.max_triangles or content.TRIANGLES
-                shown = not self.without_splats
-                made = content.content_of_splats(scene, cameras, max_triangles=most, shown=shown)
-                return replace(made, surface=beside)
-            advice = "fine-tune it with --max-triangles, or make 'meshsplats tiles'"
-            splats = None
-            if self.splats is not None:
-                splats = self.part.of(self.reading.load(self.splats, scene.origin))
-            if isinstance(scene, BaseMesh):
-                return Content(None, splats, surface=scene)
-            return replace(content.content_of_mesh(scene, splats), surface=beside)
-        except content.TooManyTrianglesError as error:
-            raise UsageError(f"{error}: {advice}") from None
-
-    def _photographs(self, origin: np.ndarray) -> Dataset | None:
-        if self.data is None:
-            return None
-        from meshsplats.datasets.folder import load_dataset
-
-        return load_dataset(self.data, missing=self.missing, origin=origin)
-
-    def _cameras(
-        self, photographs: Dataset | None, scene: GaussianCloud | SplatMesh | BaseMesh
-    ) -> list[Camera]:
-        if photographs is not None:
-            return [view.camera for view in photographs.views]
-        if self.cameras is not None:
-            return load_cameras(self.cameras, origin=scene.origin)
-        if isinstance(scene, BaseMesh):
-            return cameras_beside(self.input, scene.origin) or []
-        splats = isinstance(scene, GaussianCloud)
-        opening = opening_beside(self.input, scene.origin) if splats else None
-        first, beside = [] if opening is None else [opening], cameras_beside(self.input, scene.origin)
-        if beside is not None:
-            return [*first, *beside]
-        return views_of_a_place(scene, self.input, FOUND_VIEWS, up=optional_up(self.up)) or first
 
     def _announce(self, shown: Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""
@@ -205,49 +92,22 @@ class View(Command):
             size = in_words(shown.estimated_size())
             say(f"{self.output} will have about {size}: {content.in_words(shown.counts())}")
 
-    def _page(self, shown: Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
-        from meshsplats.viewer.page import PageOptions
-
-        background = choose_background(
-            optional_color(self.background),
-            None if shown.mesh is None else photographs,
-            {} if shown.mesh is None else {"mesh": shown.mesh},
-            self.input,
-            None,
-            whole=self.part.crop is None,
+    def _write(self, output: Path, page: Page, result: dict[str, Any]) -> None:
+        write_text(output, page.html)
+        write_configuration(beside(output, CONFIGURATION), "view", self, result)
+        self.finish(
+            {"page": str(output), **result},
+            f"{named(output)}: {content.in_words(result)}",
+            content.errors_in_words(result),
+            "next: open it with a double click, or send it to someone; it needs no network",
         )
-        name = shown_path(self.input)
-        options = PageOptions(
-            title=self.title or ("scene" if name == "-" else Path(name).resolve().stem),
-            background=background.color,
-            up=optional_up(self.up),
-            merged_from=shown.merged_from,
-        )
-        return shown.page(cameras, options)
-
-    def _write(self, page: Page, result: dict[str, Any]) -> None:
-        from meshsplats._files.atomic import write_text
-
-        assert self.output is not None
-        write_text(self.output, page.html)
-        write_configuration(beside(self.output, CONFIGURATION), "view", self, result)
-        if self.json:
-            print(json.dumps({"page": str(self.output), **result}, indent=1, allow_nan=False))
-            return
-        print(f"{self.output} ({size_of(self.output)}): {content.in_words(result)}")
-        print(content.errors_in_words(result))
-        print("next: open it with a double click, or send it to someone; it needs no network")
 
     def _serve(self, page: Page, result: dict[str, Any]) -> None:
         from meshsplats.viewer.server import open_page, serving
 
         with serving(page.html) as server:
-            if self.json:
-                print(json.dumps({"url": server.url, **result}, allow_nan=False), flush=True)
-            else:
-                print(content.in_words(result))
-                print(content.errors_in_words(result))
-                print(f"{server.url}\nCtrl-C ends", flush=True)
+            about = [content.in_words(result), content.errors_in_words(result), server.url, "Ctrl-C ends"]
+            self.finish({"url": server.url, **result}, *about, indent=None)
             if not self.no_open and not open_page(server.url):
                 say("no browser was found: open the address above in one, on this machine")
             try:

@@ -9,20 +9,31 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from meshsplats._options import Range, changed, check_options
+from meshsplats._options import Help, Range, changed, check_options
 from meshsplats._words import parse_up
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome, look_around, orbit
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Missing
+from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.datasets.views import Dataset
+from meshsplats.errors import OptionsError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 Origin = Sequence[float] | np.ndarray
+MissingOfData = Annotated[
+    Missing, Help("With ``data``: missing images are left out; few: if fewer than half are missing.")
+]
+"""An option of whatever has an option ``data``, a data set of photographs."""
+MasksOfData = Annotated[
+    Masks, Help("With ``data``: only pixels inside of masks count, or masks cut out a subject.")
+]
+"""Another."""
+WAYS_OF_VIEWS = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
+"""Options of views of which one may be given."""
 
 
 def cameras_named(
@@ -34,6 +45,18 @@ def cameras_named(
         dataset = load_dataset(data, missing=missing, origin=origin)
         return [view.camera for view in dataset.train or dataset.views]
     return None if cameras is None else load_cameras(cameras, origin=origin)
+
+
+def check_photographs(
+    data: Path | None, missing: Missing, cameras: Path | None = None, masks: Masks = "count"
+) -> None:
+    """OptionsError for ``missing`` and ``masks`` without ``data``, and for ``cameras`` with it."""
+    if cameras is not None and data is not None:
+        raise OptionsError("give ``cameras`` or ``data``, not both")
+    if missing != "few" and data is None:
+        raise OptionsError("``missing`` has no effect without ``data``")
+    if masks != "count" and data is None:
+        raise OptionsError("``masks`` has no effect without ``data``")
 
 
 @dataclass(frozen=True)
@@ -56,8 +79,7 @@ class SceneViews:
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
     """With ``data``: factor by which images are smaller than the photographs."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     elevation: float | None = None
     """Degrees above the horizon. Default: 15; 0 with ``look_around``."""
     azimuth: float = 0.0
@@ -78,6 +100,29 @@ class SceneViews:
     """Image width in pixels. With ``cameras`` or ``data``, images are scaled to this width."""
     height: Annotated[int | None, Range(1, MAX_SIDE)] = None
     """Image height in pixels. Default: the width. Not with ``cameras`` or ``data``."""
+
+    def check(self) -> None:
+        """OptionsError for options that exclude each other or have no effect."""
+        if self.downscale != 1 and (self.data is None or self.width is not None):
+            idle, both = "``downscale`` has no effect without ``data``", "give ``downscale`` or ``width``"
+            raise OptionsError(idle if self.data is None else both)
+        check_photographs(self.data, self.missing)
+        modes = [name for name in WAYS_OF_VIEWS[0] if getattr(self, name) is not None]
+        if len(modes) > 1:
+            raise OptionsError(f"give one of {', '.join(f'``{mode}``' for mode in modes)}, not several")
+        if self.fov is not None and self.focal_length is not None:
+            raise OptionsError("give ``fov`` or ``focal_length``, not both")
+        placing = ("elevation", "azimuth", "distance", "look_at", "fov", "focal_length", "up", "height")
+        without_effect = {
+            "dome": ("elevation", "azimuth"),
+            "look_around": ("distance", "look_at"),
+            "cameras": placing,
+            "data": placing,
+        }
+        for mode in modes:
+            for name in without_effect.get(mode, ()):
+                if name in changed(self):
+                    raise OptionsError(f"``{name}`` has no effect with ``{mode}``")
 
     @property
     def moving(self) -> bool:

@@ -11,12 +11,13 @@ from meshsplats._options import Advanced
 from meshsplats.camera import Camera
 from meshsplats.conversion.normals import shading_normals
 from meshsplats.draw_order import DrawOrder
+from meshsplats.errors import OptionsError
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.ordering import NODES, drawing_order
+from meshsplats.mesh import SplatMesh, checked_cutoff
+from meshsplats.rendering.ordering import NODES, check_nodes, drawing_order
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -50,6 +51,34 @@ class MeshFileOptions:
     """``alpha`` opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb: meshopt: a quarter to a third of the size, for viewers that can unpack it."""
+
+    def check(self, kinds: Sequence[str]) -> None:
+        """Checks options before the work. ``kinds``: suffixes of the files, without a dot.
+
+        Raises:
+            OptionsError: options contradict each other or have no effect.
+            ValueError: one is out of range.
+        """
+        names = [f"mesh.{kind}" for kind in kinds]
+        if self.lit and not any(takes(name, "lit") for name in names):
+            raise OptionsError(f"``lit`` is for .glb and .usd files: .{kinds[0]} has no material")
+        if self.smooth and not self.lit:
+            raise OptionsError("``smooth`` has no effect without ``lit``")
+        only_glb = self.color_type != "uint16" or self.alpha in GLB_ALPHA or self.compression != "none"
+        if only_glb and not any(takes(name, "alpha") for name in names):
+            raise OptionsError(
+                "``alpha`` mask, hybrid or ordered, ``compression`` and ``color_type`` are for .glb files"
+            )
+        if self.cutoff is not None:
+            if self.alpha not in ("opaque", "mask"):
+                raise OptionsError("``cutoff`` is for ``alpha`` opaque or mask")
+            checked_cutoff(self.cutoff)
+        if self.alpha != "ordered" and (self.nodes is not None or self.quick):
+            raise OptionsError("``nodes`` and quick are for ``alpha`` ordered")
+        if self.alpha == "ordered" and (self.lit or self.compression != "none"):
+            raise OptionsError("``alpha`` ordered goes with neither ``lit`` nor ``compression``")
+        if self.nodes is not None:
+            check_nodes(self.nodes)
 
     def taken_by(self, path: Path) -> Self:
         """Those that have an effect on the file ``path``; the others as by default."""

@@ -67,6 +67,20 @@ class AlphaChoice:
             return {}  # its default for a solid mesh, which needs no cut
         return {"alpha": self.alpha} | ({"cutoff": self.cutoff} if self.alpha == "mask" else {})
 
+    def in_words(self) -> str | None:
+        """A line about the measurement; None where nothing was measured."""
+        if self.blend is None:
+            return None
+        modes = {"blend": "blend", "mask": f"mask with cutoff {self.cutoff:g}"}
+        other = "mask" if self.alpha == "blend" else "blend"
+        sorting = (
+            "" if self.alpha == "blend" else " (--alpha blend for ray tracers and Blender's own importer)"
+        )
+        return (
+            f"alpha: {modes[self.alpha]}, {getattr(self, self.alpha):.1f} dB from the sorted image in viewers"
+            f" that do not sort; {modes[other]}: {getattr(self, other):.1f} dB{sorting}"
+        )
+
 
 def choose_alpha(
     mesh: SplatMesh,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from meshsplats._files.locks import locked
 from meshsplats.finetuning.cells import RECORD
+from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint
 from meshsplats.finetuning.journal import CHECKPOINT
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
 
@@ -43,6 +44,11 @@ class RunFiles:
     def held_out(self) -> Path:
         """Cameras of held-out images of splats."""
         return self.folder / "held_out.cameras.json"
+
+    def earlier(self) -> Checkpoint | None:
+        """Of a run that is to be resumed, the checkpoint without its arrays; None for one in cells, which
+        have their own."""
+        return None if self.in_cells else load_checkpoint(self.folder / CHECKPOINT, only_header=True)
 
     def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
         """OSError if something would be overwritten, cannot be written, or is missing for --resume."""

@@ -13,9 +13,11 @@ from meshsplats._words import parse_up
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
+from meshsplats.datasets.image_files import Masks
+from meshsplats.datasets.scene_views import MissingOfData
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset
+from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import FEWEST_VIEWS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -23,6 +25,12 @@ from meshsplats.rendering.looks import Look
 
 PLACING = ("placement", "distance", "up")
 """Options of cameras that are placed."""
+
+
+def check_cache(gigabytes: float) -> None:
+    """OptionValueError for what is no size of a cache."""
+    if not gigabytes >= 0:
+        raise OptionValueError(f"``cache`` must be a number of gigabytes, >= 0, got {gigabytes}")
 
 
 @dataclass(frozen=True)
@@ -35,8 +43,7 @@ class Targets:
     """With ``data``: factor by which images are smaller than photographs. Default: by the minutes."""
     test_every: int = 8
     """With ``data``: every n-th view is held out, if the data set has no split; 0: none."""
-    missing: Missing = "few"
-    """With ``data``: missing images are left out; few: if fewer than half are missing."""
+    missing: MissingOfData = "few"
     masks: Annotated[Masks, Advanced] = "count"
     """With ``data``: only pixels inside of masks count, or (subject) what is outside is clear."""
     views: int | None = None
@@ -72,6 +79,22 @@ class Targets:
     def look_for(self, preset: str) -> Look:
         """The look of images of splats for a ``preset`` of fine-tuning."""
         return self.look or ("area" if preset == "default" else "splats")
+
+    def check(self) -> None:
+        """OptionsError for options without effect, OptionValueError for values out of range."""
+        idle = ("views", "held_out", "width", *PLACING, "below", "cameras", "look", "sh_degree")
+        of_data = ("downscale", "test_every", "missing", "masks")
+        names, source = (idle, "``data``") if self.data is not None else (of_data, "splats")
+        given = changed(self)
+        for name in names:
+            if name in given:
+                raise OptionsError(f"``{name}`` has no effect with {source}")
+        for name in (*PLACING, "below"):
+            if self.cameras is not None and name in given:
+                raise OptionsError(f"``{name}`` has no effect with ``cameras``")
+        if self.views is not None and self.views < 1:
+            raise OptionsError(f"``views`` must be at least 1, got {self.views}")
+        check_cache(self.cache)
 
     @property
     def cache_bytes(self) -> int:
@@ -117,6 +140,10 @@ class Targets:
                     " train on; --test-every 0 holds none out"
                 )
             return dataset
+        if isinstance(scene, SplatMesh):
+            raise OptionsError(
+                f"{source} is a mesh: give its photographs with ``data``, or splats in its place"
+            )
         need(GaussianCloud, scene=scene)
         assert isinstance(scene, GaussianCloud)
         if self.cameras is not None:

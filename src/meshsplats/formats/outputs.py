@@ -13,15 +13,18 @@ import numpy as np
 
 from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
+from meshsplats._origin import lost_detail, sampled
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.errors import FileFormatError, OverwritingError
-from meshsplats.formats.mesh_formats import written_mesh_suffixes
-from meshsplats.formats.splat_formats import format_to_write, taken_by, written_suffixes
+from meshsplats.errors import FileFormatError, OptionsError, OverwritingError
+from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
+from meshsplats.formats.splat_formats import format_to_write, listed, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-Scene = TypeVar("Scene", GaussianCloud, SplatMesh, BaseMesh)
+Scene = TypeVar("Scene", GaussianCloud, SplatMesh, BaseMesh, GaussianCloud | SplatMesh)
+WantedOrigin = Literal["keep", "local"] | Sequence[float]
+"""Where outputs of scenes stand: see ``placed``."""
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
@@ -43,6 +46,11 @@ def beside(output: Path, record: str) -> Path:
     """Name of a record of the file ``output``: with the whole name of that, so that records of ``mesh.glb``
     and ``mesh.png`` are different files."""
     return output.with_name(f"{output.name}.{record}")
+
+
+def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
+    """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
+    return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]
 
 
 def means_splats(kinds: Sequence[str]) -> bool:
@@ -74,6 +82,32 @@ def scaled(scene: Scene, factor: float | None) -> Scene:
     if isinstance(scene, SplatMesh) and scene.binding is not None:
         raise ValueError("a mesh prior has the lengths of its base mesh: scale the base and bind to that")
     return replace(scene, vertices=scene.vertices * np.float32(factor), origin=scene.origin * factor)
+
+
+def placed(scene: Scene, origin: WantedOrigin) -> Scene:
+    """``scene`` as it is to be written: with its origin ("keep"), without any ("local"), or relative to this
+    point of the world. OptionsError for a point that is too far away for float32."""
+    if isinstance(origin, str):
+        return scene if origin == "keep" else replace(scene, origin=np.zeros(3))
+    scene = scene.relative_to(origin)
+    places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
+    if lost := lost_detail(sampled(places)):
+        raise OptionsError(f"``origin``: too far from the scene; relative to that point, {lost}")
+    return replace(scene, origin=np.zeros(3))
+
+
+def check_mesh_suffix(path: Path) -> None:
+    """OptionsError if no mesh can be written under this name."""
+    if mesh_format_to_write(path) is None:
+        known = ", ".join(written_mesh_suffixes())
+        raise OptionsError(f"``output`` must end in {known}, got {path.name!r}")
+
+
+def check_splat_endings(*kinds: str) -> None:
+    """OptionsError if no splats can be written to files that end in ``kinds``, without a dot."""
+    for kind in kinds:
+        if f".{kind}" not in written_suffixes():
+            raise OptionsError(f"splats are written as {listed(written_suffixes())}, not as .{kind}")
 
 
 def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:

@@ -63,6 +63,14 @@ class TilesetSummary:
     alpha: AlphaChoice | None
     """The alpha mode of the tiles; None for tiles of splats."""
 
+    def in_words(self) -> str:
+        """Counts and size."""
+        made = f" -> {self.triangles:,} triangles" if self.alpha else ""
+        return (
+            f"{self.splats:,} splats{made} in {self.tiles:,} tiles of {self.levels} levels,"
+            f" {self.bytes / 1e6:,.1f} MB"
+        )
+
 
 def build_tiles(
     source: SplatStream,

@@ -7,9 +7,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal
 
 from meshsplats._options import Range, check_options
+from meshsplats._words import parse_up
 from meshsplats.conversion.budget import triangles_each
 from meshsplats.conversion.options import ConversionOptions, Preset
 from meshsplats.conversion.streaming import refuse_whole
+from meshsplats.rendering.looks import Look
 
 TilesAlpha = Literal["auto", "blend", "mask", "opaque"]
 
@@ -81,3 +83,51 @@ class TileOptions:
                 f"{', '.join(wrong)}: of meshes; tiles of splats have only {', '.join(_OF_SPLATS)}: leave it"
                 " out, or as_splats"
             )
+
+
+@dataclass(frozen=True)
+class TilingOptions:
+    """``TileOptions`` and those of their conversion, as commands have them: side by side, with words for
+    directions."""
+
+    as_splats: bool = False
+    """Tiles of splats (SPZ in glTF), as CesiumJS draws them, not of triangles."""
+    max_triangles: int = MAX_TRIANGLES
+    """Maximum number of triangles of a tile. A splat of ``as_splats`` counts as 2."""
+    preset: Preset = "default"
+    """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
+    look: Look | None = None
+    """area: for programs that take several samples a pixel; splats: as splat viewers show them. Default:
+    area."""
+    min_opacity: float | None = None
+    """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
+    colors: Literal["base", "view"] | None = None
+    """base: one colour for each splat, which every program shows; the default of meshes. view: also the
+    harmonics of colours that depend on the view, for this program's images and for shaders; 1.6 to 2 times
+    as large."""
+    color_degree: int | None = None
+    """Harmonics of 'view' up to this degree, 1 to 3. Default: all that the splats have."""
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Only splats with their centre in this box, in the coordinates of the file."""
+    up: str | None = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
+    files, else -y."""
+    lit: bool = False
+    """A material that takes light and shadow, not one that shows the colours as they are."""
+    alpha: TilesAlpha = "auto"
+    """auto: blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by a few
+    images of both. blend: viewers blend true opacities; mask: they draw as solid what is at least 20 %
+    opaque; opaque: solid triangles, cut there."""
+
+    def tile_options(self, place: Literal["world", "local"] = "world") -> TileOptions:
+        """The checked options of ``build_tiles``. Raises ValueError."""
+        names = ("look", "min_opacity", "crop", "colors", "color_degree")
+        conversion = ConversionOptions(**{name: getattr(self, name) for name in names})
+        up = None
+        if self.up is not None:
+            x, y, z = (float(u) for u in parse_up(self.up))
+            up = (x, y, z)
+        given = (self.preset, conversion, up, self.lit, self.alpha, place)
+        options = TileOptions(self.max_triangles, self.as_splats, *given)
+        options.resolved()
+        return options

@@ -13,7 +13,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Shared, Workers
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, recorded_options
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, recorded_options, view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import encode_array, encode_depth_png, encode_image, straight_rgba
 from meshsplats.mesh import SplatMesh
@@ -86,11 +86,6 @@ def depth_unit(points: np.ndarray, cameras: Sequence[Camera]) -> float:
         float((corners @ c.world_to_camera[2, :3] + c.world_to_camera[2, 3]).max()) for c in cameras
     )
     return max(farthest, 1e-6) / 65535
-
-
-def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
-    """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
-    return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]
 
 
 def remove_older(folder: Path, kept: Sequence[Path]) -> None:

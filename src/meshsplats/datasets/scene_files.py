@@ -1,0 +1,116 @@
+"""Scenes from files, as programs read them: splats or a mesh, whole or in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+
+from meshsplats._options import Advanced, Help, changed
+from meshsplats._words import direction_in_words
+from meshsplats.cameras.framing import warn_of_strays_in
+from meshsplats.errors import FileFormatError, OptionsError
+from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_formats import listed, y_up_suffixes
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from meshsplats.formats.streaming import SplatStream
+
+_AXES = Help(
+    "Direction of the y axis in the file; auto: as its format prescribes, up in"
+    f" {listed(y_up_suffixes(), 'and')}, else down. After reading, y points down. Some programs write SPZ"
+    " with y down: if the image is upside down, give y-down."
+)
+
+
+@dataclass(frozen=True)
+class SceneReading:
+    """How splat files are read. Programs that show what headers say override ``tell``."""
+
+    axes: Annotated[Literal["auto", "y-down", "y-up"], _AXES] = "auto"
+    kernel: Literal["auto", "3dgs", "antialiased", "2dgs"] = "auto"
+    """Kernel that the splats were trained with; auto: as the file says."""
+    time: float | None = None
+    """Splats that move in time: the instant to show, in the file's unit. Default: one in the middle."""
+    activated: Annotated[tuple[Literal["scales", "opacities", "colors"], ...], Advanced] = ()
+    """Values that a .ply stores as they are, where logarithms, logits and harmonics belong."""
+    strict: Annotated[bool, Advanced] = False
+    """Refuse files with splats that are not finite; by default these are left out with a warning."""
+
+    def tell(self, text: str) -> None:
+        """Gets what headers say that changes the scene."""
+
+    def load(self, path: Path, origin: np.ndarray | None = None, *, up: str | None = None) -> GaussianCloud:
+        """The splats of a file, relative to ``origin`` (3,). Tells what its header names; ``up``: the option
+        that counts in its place. FileFormatError for a mesh, and what ``load_gaussians`` raises."""
+        from meshsplats.formats.gaussians import load_gaussians
+
+        try:
+            cloud = load_gaussians(path, origin=origin, **self.arguments)
+        except FileFormatError:
+            if identify(path) == "mesh":
+                raise FileFormatError(f"{path}: a mesh, not splats") from None
+            raise
+        warn_of_strays_in(cloud)
+        if up is None and cloud.up is not None:
+            self.tell(f"up: {direction_in_words(cloud.up)}, from the file's header")
+        if self.kernel == "auto" and cloud.kernel != "3dgs":
+            self.tell(f"kernel: {cloud.kernel}, from the file")
+        return cloud
+
+    def stream(
+        self, path: Path | Sequence[Path], origin: Sequence[float] | None = None, *, up: str | None = None
+    ) -> SplatStream:
+        """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
+        from meshsplats.formats.streaming import stream_gaussians
+
+        stream = stream_gaussians(path, origin=origin, **self.arguments)
+        if up is None and (told := stream.up) is not None:
+            self.tell(f"up: {direction_in_words(told)}, from the files' headers")
+        return stream
+
+    def load_scene(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh:
+        """The splats or the mesh at ``path``; ``up`` as for ``load``. FileFormatError for cameras, and
+        OptionsError as by ``refuse_for``."""
+        kind = identify(path)
+        if kind == "cameras":
+            raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
+        if kind == "splats":
+            return self.load(path, up=up)
+        self.refuse_for(path)
+        from meshsplats.formats.meshes import load_mesh
+
+        mesh = load_mesh(path)
+        warn_of_strays_in(mesh)
+        return mesh
+
+    def refuse_for(self, path: Path) -> None:
+        """OptionsError for options that have no effect on ``path``, which is not a file of splats."""
+        given = [name for name in ("kernel", "time", "activated") if name in changed(self)]
+        if given:
+            names = ", ".join(f"``{name}``" for name in given)
+            raise OptionsError(f"{path} holds no splats: {names} would have no effect")
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Those of ``load_gaussians``."""
+        return {
+            "strict": self.strict,
+            "axes": self.axes,
+            "kernel": None if self.kernel == "auto" else self.kernel,
+            "time": self.time,
+            "activated": self.activated,
+        }
+
+
+@dataclass(frozen=True)
+class PartOfScene:
+    """Part of the scene."""
+
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Only splats with their centre in this box, in the coordinates of the file; 'info' prints its extent."""

@@ -1,0 +1,149 @@
+"""Splats and a mesh from files compared, with images side by side and scores as files."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from meshsplats._files.atomic import write_text
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import save_cameras
+from meshsplats.conversion import convert
+from meshsplats.conversion.cleaning import cropped
+from meshsplats.conversion.options import Preset
+from meshsplats.datasets.scene_files import PartOfScene, SceneReading
+from meshsplats.datasets.scene_views import SceneViews
+from meshsplats.errors import FileFormatError, OptionValueError
+from meshsplats.evaluation.backgrounds import Background, choose_background
+from meshsplats.evaluation.comparison import Comparison, compare_views
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, check_outputs, view_names
+from meshsplats.formats.sniff import identify
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.images.writing import amplified_error, save_image, strip
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.drawing import DrawingOptions
+from meshsplats.rendering.looks import Look, mesh_samples
+
+RESULTS = "results.json"
+
+
+@dataclass(frozen=True)
+class ComparisonOptions:
+    """How splats and a mesh are compared."""
+
+    preset: Preset = "default"
+    """Preset of the conversion, without a mesh."""
+    look: Look = "area"
+    """Ground truth. area: the mean over each pixel's area, as in photographs, Blender, MSAA and ray tracers.
+    splats: the image of a 3DGS viewer at this size."""
+    views: SceneViews = field(default_factory=SceneViews)
+    """Default: 8 views of an orbit, 400 pixels wide."""
+    draw: DrawingOptions = field(default_factory=DrawingOptions)
+    reading: SceneReading = field(default_factory=SceneReading)
+    part: PartOfScene = field(default_factory=PartOfScene)
+    """Of the splats and of the mesh."""
+    amplify: float = 4.0
+    """Factor of the error in the strips."""
+
+    def check(self) -> None:
+        """OptionsError for options that contradict each other or have no effect, ValueError for values out of
+        range, DeviceError or MissingDependencyError for a device that is not there."""
+        if not self.amplify > 0:
+            raise OptionValueError(f"``amplify`` must be positive, got {self.amplify}")
+        _ = self.draw.color  # which is checked
+        self.views.check()
+        self.draw.check_device()
+
+
+@dataclass(frozen=True)
+class SavedComparison:
+    """A comparison, and what was compared."""
+
+    scores: Comparison
+    background: Background
+    result: dict[str, Any]
+    """As in the file ``results.json``."""
+
+
+def save_comparison(
+    splats: Path,
+    mesh: Path | None,
+    folder: Path,
+    options: ComparisonOptions,
+    *,
+    force: bool = False,
+    say: Callable[[str], object] = lambda text: None,
+    progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None,
+) -> SavedComparison:
+    """Compares the ``splats`` of a file with the ``mesh`` of another, or with the one that they are converted
+    to, and writes scores, cameras and a strip splats | mesh | error of each view into ``folder``.
+
+    Args:
+        force: replace files that are there.
+        say: gets lines about the views.
+        progress: shows the progress of views, of which there are so many, and passes them on.
+
+    Raises what ``ComparisonOptions.check`` and ``check_outputs`` raise, and FileFormatError for a file of
+    another kind.
+    """
+    options.check()
+    cloud = cropped(options.reading.load(splats), options.part.crop)
+    photographs = options.views.photographs(cloud.origin)
+    cameras = options.views.make(cloud, splats, count=8, side=400, photographs=photographs, say=say)
+    strips = view_names(len(cameras))
+    check_outputs([folder / name for name in (*strips, RESULTS, CAMERAS, CONFIGURATION)], force, folder)
+    made = _mesh(mesh, cloud, cameras, options)
+    start, draw = time.perf_counter(), options.draw
+    background = choose_background(draw.color, photographs, {"splats": cloud}, splats, draw.threads)
+    samples = draw.samples or mesh_samples(options.look, made, cameras)
+    views: Iterable[Any] = compare_views(
+        cloud,
+        made,
+        cameras,
+        look=options.look,
+        sh_degree=draw.sh_degree,
+        background=background.color,
+        samples=samples,
+        max_layers=draw.max_layers,
+        threads=draw.threads,
+        device=draw.device,
+    )
+    views, scores = progress(views, len(cameras)) if progress else views, []
+    captions = ("splats", "mesh", f"error x {options.amplify:g}")
+    for name, view in zip(strips, views, strict=True):
+        scores.append(view.score)
+        folder.mkdir(exist_ok=True)
+        error = amplified_error(view.splats, view.mesh, options.amplify)
+        save_image(folder / name, strip([view.splats, view.mesh, error], captions))
+    comparison = Comparison(tuple(scores))
+    result = {
+        "splats": len(cloud),
+        "triangles": len(made.faces),
+        "look": options.look,
+        "samples": samples,
+        "ssim_convention": "3dgs",
+        "error_amplified": options.amplify,
+        **background.to_dict(),
+        "seconds": round(time.perf_counter() - start, 3),
+        **comparison.to_dict(),
+    }
+    write_text(folder / RESULTS, json.dumps(result, indent=1, allow_nan=False) + "\n")
+    save_cameras(cameras, folder / CAMERAS, origin=cloud.origin)
+    return SavedComparison(comparison, background, result)
+
+
+def _mesh(
+    path: Path | None, cloud: GaussianCloud, cameras: Sequence[Camera], options: ComparisonOptions
+) -> SplatMesh:
+    if path is None:
+        mesh = convert(cloud, preset=options.preset, cameras=cameras, look=options.look)
+    elif identify(path) != "mesh":
+        raise FileFormatError(f"{path}: not a mesh; give splats first, then the mesh")
+    else:
+        mesh = cropped(load_mesh(path, origin=cloud.origin), options.part.crop)
+    return mesh if options.draw.order is None else replace(mesh, order=options.draw.order)

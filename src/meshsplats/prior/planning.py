@@ -1,0 +1,185 @@
+"""Mesh priors of files: how splats are laid on a base, what they are trained on, and their poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.cameras.framing import guess_up
+from meshsplats.datasets.scene_files import SceneReading
+from meshsplats.datasets.views import Dataset
+from meshsplats.errors import OptionsError
+from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
+from meshsplats.finetuning.config import FinetuneConfig, worthwhile_views
+from meshsplats.finetuning.plans import Plan, Trained, over_background
+from meshsplats.finetuning.run import RunOptions
+from meshsplats.finetuning.setup import Display
+from meshsplats.finetuning.targets import Targets
+from meshsplats.formats.base_meshes import load_base
+from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
+from meshsplats.mesh import SplatMesh
+from meshsplats.prior.bind import LAYERS, Source, bind
+from meshsplats.prior.model import load_prior
+from meshsplats.prior.training import train_prior
+
+
+@dataclass(frozen=True)
+class LayingOptions:
+    """Splats on the base."""
+
+    triangles: int = 1
+    """Triangles on each face, in each layer: 1 to 256; square numbers avoid T-junctions."""
+    by_area: bool = False
+    """Take ``triangles`` as the mean, with more on larger faces."""
+    layers: int = LAYERS
+    """Layers of triangles on each face: 1 to 16."""
+    spacing: float | None = None
+    """Distance between layers along the base's normals, scene units; below 0 inwards; 0: all layers lie in
+    the base. Default: inwards, all layers together 1/30 of the diagonal of the base's box."""
+    colors: Source = "auto"
+    """Initial colours: the base's texture, its vertex colours, or the images that see a point most squarely;
+    auto: the first of these that exists."""
+    texture: Path | None = None
+    """Image for the base's texture coordinates, if its file names none."""
+
+    def check(self) -> None:
+        """OptionsError for options without effect."""
+        if self.texture is not None and self.colors not in ("auto", "texture"):
+            raise OptionsError(f"``texture`` has no effect with ``colors`` {self.colors}")
+        if self.spacing and self.layers == 1:
+            raise OptionsError("``spacing`` has no effect with one layer; give ``layers``")
+
+    def load_base(self, path: Path) -> BaseMesh:
+        """The base mesh at ``path``, with its textures where colours come from them."""
+        return load_base(path, texture=self.texture, textures=self.colors in ("auto", "texture"))
+
+
+@dataclass(frozen=True)
+class PriorTraining:
+    """A training of splats on the base mesh ``source``, to the file ``output``."""
+
+    source: Path
+    output: Path
+    laying: LayingOptions
+    target: Targets
+    splats: Path | None
+    """Splats whose images are the targets; None: photographs."""
+    reading: SceneReading
+    say: Callable[[str], object]
+    """Gets lines about the run."""
+    threads: int | None = None
+
+    def check(self) -> None:
+        """OptionsError for options that contradict each other or have no effect, and for an output that
+        cannot be moved with its base."""
+        if not keeps(self.output, "binding"):
+            known = " or ".join(s for s in written_mesh_suffixes() if keeps(f"mesh{s}", "binding"))
+            raise OptionsError(
+                f"``output`` must end in {known}, which keep the binding, got {self.output.name!r}"
+            )
+        if self.splats is not None and self.target.data is not None:
+            raise OptionsError("give ``data`` or ``splats``, not both")
+        if self.splats is None and self.target.data is None:
+            raise OptionsError("give photographs with ``data``, or splats with ``splats``, as targets")
+        self.laying.check()
+
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+        """Reads the files and prepares the run. ``earlier``: checkpoint of a run that is resumed."""
+        base = self.laying.load_base(self.source)
+        dataset = self._dataset(base, config, earlier)
+        up = guess_up(_grey_mesh(base), [view.camera for view in dataset.train])
+        laying = self.laying
+        prior = bind(
+            replace(base, up=up),
+            triangles=laying.triangles,
+            by_area=laying.by_area,
+            layers=laying.layers,
+            spacing=laying.spacing,
+            colors=laying.colors,
+            views=dataset.train,
+            threads=self.threads,
+        )
+        background = None
+        if self.target.data is not None:
+            dataset, background = over_background(
+                dataset, prior.mesh, config, self.source, self.threads, whole=False, say=self.say
+            )
+        summary = f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles"
+
+        def optimise(run: RunOptions, show: Display) -> Trained:
+            trained = train_prior(prior, dataset, config, run=run, on_progress=show)
+            counts = {"base_faces": len(trained.base_faces), "triangles": len(trained.mesh.faces)}
+            made = f"{counts['triangles']:,} triangles on {counts['base_faces']:,} faces"
+            return Trained(trained.in_file(self.output), trained.mesh, counts, made)
+
+        return Plan(prior.mesh, dataset, summary, background, optimise)
+
+    def _dataset(self, base: BaseMesh, config: FinetuneConfig, earlier: Checkpoint | None) -> Dataset:
+        background = config.behind_splats
+        if self.splats is None:
+            return self.target.make(_grey_mesh(base), self.source, background, self.threads)
+        cloud = self.reading.load(self.splats, base.origin)
+        views = worthwhile_views(as_begun(config, earlier))
+        return self.target.make(cloud, self.splats, background, self.threads, views)
+
+
+def _grey_mesh(base: BaseMesh) -> SplatMesh:
+    grey = np.full((len(base.vertices), 4), 0.5, np.float32)
+    return SplatMesh(base.vertices, base.faces, grey, up=base.up, origin=base.origin)
+
+
+def pose_files(output: Path, count: int) -> list[Path]:
+    """The files of so many poses: ``output``, or numbered ones beside it, ``edited_0001.glb`` and so on."""
+    if count == 1:
+        return [output]
+    width = max(4, len(str(count)))
+    return [output.with_name(f"{output.stem}_{i:0{width}d}{output.suffix}") for i in range(1, count + 1)]
+
+
+def posed_files(
+    source: Path,
+    bases: Sequence[Path],
+    output: Path,
+    *,
+    lift: float | None = None,
+    place: Callable[[SplatMesh], SplatMesh] = lambda mesh: mesh,
+    force: bool = False,
+) -> Iterator[tuple[Path, SplatMesh]]:
+    """Writes the splats of the prior in the file ``source`` on each of the edited ``bases``, to
+    ``pose_files(output, len(bases))``.
+
+    Args:
+        lift: distance between layers, scene units. By default that of the prior; for coplanar layers 0 in
+            .npz, and ``MeshPrior.export_lift`` in other formats.
+        place: makes of a mesh the one that is written.
+        force: replace files that are there.
+
+    Yields:
+        Each file, when it is written, with its mesh.
+
+    Raises, before anything is written, what ``check_outputs`` raises, and ValueError for a base with another
+    number of vertices or other triangles.
+    """
+    check_mesh_suffix(output)
+    targets = pose_files(output, len(bases))
+    check_outputs(targets, force, inputs=[source, *bases])
+    prior = load_prior(source)
+    loaded = [load_base(path, textures=False, origin=prior.mesh.origin) for path in bases]
+    for path, base in zip(bases, loaded, strict=True):
+        try:
+            prior.check_topology(base)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    if lift is None and output.suffix.lower() != ".npz" and not prior.lift:
+        lift = prior.export_lift
+    for base, target in zip(loaded, targets, strict=True):
+        mesh = place(prior.pose(base.vertices, lift=lift))
+        # Formats without a place for the binding would warn of it.
+        save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)
+        yield target, mesh

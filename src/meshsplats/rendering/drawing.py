@@ -1,0 +1,68 @@
+"""Options of commands and programs that draw splats and meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from meshsplats._words import optional_color
+from meshsplats.camera import Camera
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
+from meshsplats.rendering.devices import engine
+from meshsplats.rendering.layers import MANY_LAYERS, estimated_seconds, layers
+
+LONG_SECONDS = 10
+"""Images that take longer than this, as far as can be estimated, are announced."""
+
+
+@dataclass(frozen=True)
+class DrawingOptions:
+    """How images are rendered."""
+
+    background: str | None = None
+    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with ``data`` that of
+    the model folder or of the photographs."""
+    samples: int | None = None
+    """Side of the sample grid in each pixel: 2 means 2 x 2. Default: what the mesh needs at this size, 2 to
+    8; 1 for splats, whose filter is as wide as a pixel. compare: of the mesh."""
+    sh_degree: int | None = None
+    """Render splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
+    max_layers: int | None = None
+    """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default:
+    all."""
+    order: Order | None = None
+    """Order in which the triangles of a mesh are blended: exact at every sample, or whole splats by their
+    centres. Default: that of the mesh."""
+    threads: int | None = None
+    """Maximum number of threads. Default: all processors."""
+    device: Literal["cpu", "gpu"] = "cpu"
+    """Where meshes are rendered. gpu: by WebGPU, on any graphics card (extra gpu)."""
+
+    @property
+    def color(self) -> tuple[float, float, float] | None:
+        """``background`` as display RGB; None where it is not given. ValueError for what is no colour."""
+        return optional_color(self.background)
+
+    def check_device(self) -> None:
+        """Raises MissingDependencyError or DeviceError if there is no such device."""
+        engine(self.device).check()
+
+
+def announce_cost(
+    scene: SplatMesh | GaussianCloud,
+    cameras: Sequence[Camera],
+    samples: int,
+    threads: int | None,
+    say: Callable[[str], object],
+) -> None:
+    """Says before the work how long images may take, where layers upon layers make it long."""
+    count = layers(scene, cameras[0])
+    if (
+        count > MANY_LAYERS
+        and (seconds := estimated_seconds(scene, cameras, samples, threads)) > LONG_SECONDS
+    ):
+        long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")

@@ -1,0 +1,1 @@
+"""Images of splats, meshes and tilesets as files."""

@@ -1,0 +1,300 @@
+"""Meshes and splats from files scored on held-out views, of photographs or of splats, and of benchmarks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from meshsplats._origin import shared_origin
+from meshsplats._words import optional_color
+from meshsplats.cameras.files import load_cameras
+from meshsplats.cluster import Workers
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.scene_files import SceneReading
+from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, check_photographs
+from meshsplats.datasets.splat_targets import splat_views
+from meshsplats.datasets.views import WHITE, Dataset
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
+from meshsplats.evaluation.backgrounds import Background, choose_background
+from meshsplats.evaluation.benchmarks import BENCHMARKS, Candidates, convert_scene, run_benchmark
+from meshsplats.evaluation.lpips import load_lpips
+from meshsplats.evaluation.report import Report, ScoredView, evaluate
+from meshsplats.evaluation.results import (
+    PER_VIEW,
+    REPORT,
+    RESULTS,
+    TABLE,
+    Strips,
+    save_benchmark,
+    save_report,
+)
+from meshsplats.evaluation.strips import image_folder, mesh_names
+from meshsplats.finetuning.candidates import tuned_candidates
+from meshsplats.finetuning.targets import Targets
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs, view_names
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.order import Order
+from meshsplats.rendering.looks import Look
+
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class ScoringOptions:
+    """What is scored, against what, and how."""
+
+    data: Path | None = None
+    """Data set of photographs; with ``protocol`` the folder of its scenes. Default: images of the splats."""
+    before: Path | None = None
+    """Another mesh to score, such as the one before fine-tuning."""
+    splats: Path | None = None
+    """The splats. With ``data``: scored, too, at SH degree 0 and with all spherical harmonics. Without: their
+    images are the ground truth (also scored at SH degree 0)."""
+    images: Path | None = None
+    """Images by other programs to score, such as Blender: a file for each view, by its name or in order."""
+    cameras: Path | None = None
+    """Without ``data``: cameras. Default: those that finetune holds out."""
+    look: Look = "area"
+    """Without ``data``: kind of ground truth. area: means over each pixel's area, as in programs that take
+    several samples per pixel. splats: images of a 3DGS viewer at this size."""
+    sh_degree: int | None = None
+    """Without ``data``: SH degree of the ground truth. Default: all that are stored."""
+    lpips: tuple[Path, ...] = ()
+    """Weights of LPIPS, files or a folder: torchvision's vgg16-397923af.pth and vgg.pth of the package lpips,
+    or one file of both (see docs/finetuning.md). Default: no LPIPS."""
+    network: Literal["vgg", "alex"] = "vgg"
+    """Network of LPIPS; splatting papers use vgg."""
+    fit_exposure: bool = False
+    """Also score with a gain and an offset per channel, fitted to each image."""
+    samples: int | None = None
+    """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
+    with ``look`` splats."""
+    order: Order | None = None
+    """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
+    centres. Default: that of each mesh."""
+    background: str | None = None
+    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs without
+    alpha that of the model folder, else black or white, the one that fits the splats best."""
+    downscale: int | None = None
+    """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
+    test_every: int = 8
+    """Every n-th view is held out, if the data set has no split."""
+    missing: MissingOfData = "few"
+    masks: MasksOfData = "count"
+    protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
+    """Score all scenes of a benchmark as in the paper's Table 1."""
+    tune: Literal["default", "paper"] | None = None
+    """With ``protocol``: first fine-tune each scene on its training views, with this preset."""
+    strips: int = 8
+    """Number of views, spread over all, for which strips and enlarged crops are written."""
+    amplify: float = 4.0
+    """Factor of the error in the strips."""
+    reading: SceneReading = field(default_factory=SceneReading)
+
+    def check(self, meshes: Sequence[Path]) -> None:
+        """OptionsError for options that contradict each other or have no effect, ValueError for values out of
+        range. ``meshes``: what is scored; with ``protocol``, the folder of the scenes."""
+        optional_color(self.background)
+        if self.amplify <= 0 or self.strips < 0:
+            raise OptionValueError("``amplify`` must be positive and ``strips`` >= 0")
+        if self.protocol is not None:
+            if self.data is None or len(meshes) != 1:
+                raise OptionsError(
+                    "``protocol`` needs a folder of meshes or models, and ``data`` with the scenes"
+                )
+            for name in ("before", "splats", "images", "cameras", "sh_degree", "order"):
+                if getattr(self, name) is not None:
+                    raise OptionsError(f"``{name}`` has no effect with ``protocol``")
+            if self.missing != "few":
+                raise OptionsError("``missing`` has no effect with ``protocol``, which needs every image")
+            return
+        if self.tune is not None:
+            raise OptionsError(
+                "``tune`` is for ``protocol``; otherwise use meshsplats finetune, then evaluate"
+            )
+        if len(set(map(os.path.abspath, meshes))) < len(meshes):
+            raise OptionsError("a mesh was given twice")
+        if not meshes and self.images is None and (self.splats is None or self.data is None):
+            raise OptionsError("nothing to score: give a mesh, ``images``, or ``splats`` with ``data``")
+        if self.data is None and self.splats is None:
+            raise OptionsError("nothing to compare with: give ``data``, or ``splats``")
+        of_splats = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
+        for name, value in of_splats.items():
+            if self.data is not None and value not in (None, "area"):
+                raise OptionsError(f"``{name}`` has no effect with ``data``")
+        if self.data is None and self.downscale is not None:
+            raise OptionsError("``downscale`` has no effect without ``data``")
+        check_photographs(self.data, self.missing, masks=self.masks)
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """Scores as the files of ``folder``.
+
+    ``threads``: maximum number of threads. ``progress``: shows the progress of views, of which there are so
+    many, and passes them on.
+    """
+
+    options: ScoringOptions
+    folder: Path
+    threads: int | None = None
+    progress: Progress | None = None
+
+    def run(self, paths: Sequence[Path], *, force: bool = False) -> Report:
+        """Scores the meshes at ``paths`` and writes the files of them. ``force``: in place of older ones.
+
+        Raises what ``check_outputs`` raises, and FileFormatError for splats in place of a mesh.
+        """
+        chosen = self.options
+        self.check_outputs(force)
+        meshes = {name: self._load_mesh(path) for name, path in mesh_names(paths).items()}
+        before = None if chosen.before is None else self._load_mesh(chosen.before)
+        splats = None if chosen.splats is None else chosen.reading.load(chosen.splats)
+        known = [each for each in (splats, *meshes.values(), before) if each is not None]
+        origin = shared_origin(each.origin for each in known)
+        splats = None if splats is None else splats.relative_to(origin)
+        before = None if before is None else before.relative_to(origin)
+        meshes = {name: mesh.relative_to(origin) for name, mesh in meshes.items()}
+        dataset = self._dataset(splats, origin if known else None)
+        scenes = {"splats": splats, **meshes, "mesh before": before}
+        background = choose_background(
+            optional_color(chosen.background),
+            None if chosen.data is None else dataset,
+            {name: scene for name, scene in scenes.items() if scene is not None},
+            chosen.splats or (paths[0] if paths else None),
+            self.threads,
+        )
+        if chosen.data is None and splats is not None:
+            # Their images are the ground truth; a mesh can reach degree 0 of it.
+            more = splats.sh_degree > 0 and chosen.sh_degree != 0
+            splats = replace(splats, sh=splats.sh[:, :1]) if more else None
+        return self._score(dataset, background, meshes, splats, before)
+
+    def run_benchmark(
+        self,
+        models: Path,
+        workers: Callable[[int | None], AbstractContextManager[Workers]],
+        *,
+        force: bool = False,
+    ) -> list[Report]:
+        """Scores the scenes of the protocol in the folder ``models``, by ``workers`` of so many threads, and
+        writes the files of each and those of all. ``force``: in place of older ones."""
+        chosen = self.options
+        assert chosen.data is not None
+        assert chosen.protocol is not None
+        self.check_outputs(force)
+        with workers(self.threads) as found:
+            task, prepare = replace(self, threads=found.threads), convert_scene
+            if chosen.tune is not None:
+                prepare = partial(tuned_candidates, preset=chosen.tune, threads=found.threads)
+            result = run_benchmark(
+                BENCHMARKS[chosen.protocol],
+                models,
+                chosen.data,
+                chosen.reading.load_scene,
+                prepare=prepare,
+                score=task.score_scene,
+                background=optional_color(chosen.background),
+                downscale=chosen.downscale,
+                workers=found,
+            )
+        save_benchmark(result, self.folder, chosen.protocol)
+        return list(result.reports)
+
+    def check_outputs(self, force: bool) -> None:
+        """OSError if something would be overwritten or cannot be written."""
+        names = (RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION)
+        check_outputs([self.folder / name for name in names], force, self.folder)
+
+    def score_scene(
+        self, scene: str, dataset: Dataset, background: Background, candidates: Candidates
+    ) -> Report:
+        """Scores the ``candidates`` of a ``scene`` of a benchmark, with a folder of its own."""
+        mesh, splats, before = candidates
+        self.folder.mkdir(exist_ok=True)
+        own = replace(self, folder=self.folder / scene)
+        return own._score(dataset, background, {"mesh": mesh}, splats, before)
+
+    def _load_mesh(self, path: Path) -> SplatMesh:
+        found, order = self.options.reading.load_scene(path), self.options.order
+        if not isinstance(found, SplatMesh):
+            raise FileFormatError(
+                f"{path}: splats, not a mesh; give them with --splats, or convert them first"
+            )
+        return found if order is None else replace(found, order=order)
+
+    def _dataset(self, splats: GaussianCloud | None, origin: np.ndarray | None) -> Dataset:
+        chosen = self.options
+        if chosen.data is not None:
+            return load_dataset(
+                chosen.data,
+                downscale=1 if chosen.downscale is None else chosen.downscale,
+                test_every=chosen.test_every,
+                missing=chosen.missing,
+                masks=chosen.masks,
+                origin=origin,
+            )
+        background = optional_color(chosen.background) or WHITE
+        assert splats is not None
+        assert chosen.splats is not None
+        if chosen.cameras is not None:
+            views = splat_views(
+                splats,
+                load_cameras(chosen.cameras, origin=splats.origin),
+                look=chosen.look,
+                sh_degree=chosen.sh_degree,
+                background=background,
+                threads=self.threads,
+            )
+            return Dataset((), views, "splats", chosen.look, splats.origin)
+        targets = Targets(look=chosen.look, sh_degree=chosen.sh_degree)
+        return replace(targets.make(splats, chosen.splats, background, self.threads), train=())
+
+    def _score(
+        self,
+        dataset: Dataset,
+        background: Background,
+        meshes: Mapping[str, SplatMesh],
+        splats: GaussianCloud | None,
+        before: SplatMesh | None,
+    ) -> Report:
+        """Evaluates one scene over ``background`` and writes its files."""
+        chosen, dataset = self.options, dataset.over(background.color)
+        views = dataset.test or dataset.views
+        images = None if chosen.images is None else image_folder(chosen.images, [v.camera for v in views])
+        lpips = load_lpips(list(chosen.lpips) or None, network=chosen.network)
+        self.folder.mkdir(exist_ok=True)
+        shown = iter(self.progress(range(len(views)), len(views)) if self.progress else range(len(views)))
+        next(shown, None)
+        save_strips = Strips(self.folder, view_names(len(views)), chosen.strips, chosen.amplify)
+
+        def keep(scored: ScoredView) -> None:
+            save_strips(scored)
+            next(shown, None)
+
+        report = evaluate(
+            meshes,
+            dataset,
+            before=before,
+            splats=splats,
+            images=images,
+            samples=chosen.samples,
+            lpips=lpips,
+            fit_exposure=chosen.fit_exposure,
+            threads=self.threads,
+            on_view=keep,
+        )
+        about: dict[str, Any] = {**background.to_dict(), "lpips_network": chosen.network if lpips else None}
+        if chosen.cameras is not None:
+            about["held_out"] = None  # it is unknown what a mesh was trained on
+        report = replace(report, about={**report.about, **about})
+        save_report(report, self.folder)
+        return report

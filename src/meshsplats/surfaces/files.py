@@ -1,0 +1,150 @@
+"""Surfaces of scenes in files, as the files of their levels of detail, with a preview."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats._files.atomic import together
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.cameras.files import load_cameras
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.scene_files import SceneReading
+from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, check_photographs
+from meshsplats.errors import OptionsError
+from meshsplats.formats import base_meshes
+from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.images.writing import save_image
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.previews import preview_camera
+from meshsplats.surfaces import draw_surface
+from meshsplats.surfaces.making import surfaces_from
+from meshsplats.surfaces.options import SurfaceOptions, level_options
+from meshsplats.surfaces.views import Sources, place_of, sources_of
+
+
+@dataclass(frozen=True)
+class SurfaceFileOptions:
+    """Surfaces and their files."""
+
+    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+    levels: int = 1
+    """Levels of detail, each with a quarter of the triangles of the one before: MESH.glb, MESH_lod1.glb..."""
+    data: Path | None = None
+    """Data set of photographs to fit shape and texture to, in place of images of the scene."""
+    missing: MissingOfData = "few"
+    masks: MasksOfData = "count"
+    cameras: Path | None = None
+    """Camera file: from where images are made, in place of ``views``."""
+    unlit: bool = False
+    """A material that shows the texture as it is, without lights."""
+    image: base_meshes.TextureImage | None = None
+    """File of the texture. Default: png, or jpg where that is large and the format knows it."""
+    collision: base_meshes.Collision | None = None
+    """(.glb, USD) A static collider for engines, which is drawn, too, or not; or (.glb) convex parts of it
+    that Unreal takes for its collider. Default: none."""
+    scale: float | None = None
+    """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
+    no_preview: bool = False
+    """Write no preview."""
+
+    def checked(self, output: Path) -> SurfaceOptions:
+        """The options of the finest surface, of which those are by default that are None.
+
+        Raises:
+            OptionsError: options contradict each other, have no effect or do not fit the name ``output``.
+            ValueError: one is out of range.
+        """
+        suffix, known = output.suffix.lower(), ", ".join(base_meshes.BASE_SUFFIXES)
+        if suffix not in base_meshes.BASE_SUFFIXES:
+            raise OptionsError(f"``output`` must end in {known}, got {output.name!r}")
+        base_meshes.check_writing(output, unlit=self.unlit, image=self.image, collision=self.collision)
+        if suffix in base_meshes.PRINTED and self.surface.shape in ("open", "floor"):
+            raise OptionsError(f"{suffix} is for printing, which wants a solid: ``shape`` closed")
+        check_photographs(self.data, self.missing, self.cameras, self.masks)
+        if self.scale is not None and not 0 < self.scale < np.inf:
+            raise OptionsError(f"``scale`` must be above 0, got {self.scale}")
+        given = {name: value for name, value in asdict(self.surface).items() if value is not None}
+        return level_options(SurfaceOptions(**given), self.levels)[0]
+
+
+@dataclass(frozen=True)
+class SurfaceRun:
+    """The surfaces of the scene at ``source`` as ``output``, the file of the finest one.
+
+    ``place`` makes of a surface the one that is written; ``record`` writes what is noted at this path, with
+    which the surfaces appear; ``say`` gets lines about them.
+    """
+
+    source: Path
+    output: Path
+    options: SurfaceFileOptions = field(default_factory=SurfaceFileOptions)
+    reading: SceneReading = field(default_factory=SceneReading)
+    threads: int | None = None
+    place: Callable[[BaseMesh], BaseMesh] = lambda base: base
+    record: Callable[[Path], object] = lambda path: None
+    say: Callable[[str], object] = lambda text: None
+
+    @property
+    def preview(self) -> Path:
+        """Its file, where there is one."""
+        return beside(self.output, PREVIEW)
+
+    def check(self, force: bool) -> SurfaceOptions:
+        """``SurfaceFileOptions.checked``. OSError for outputs that exist, unless ``force``, or cannot be
+        written, OverwritingError if one of them is the source."""
+        chosen, options = self.options, self.options.checked(self.output)
+        meshes, textured = base_meshes.level_files(self.output, chosen.levels), chosen.collision != "only"
+        more = [
+            path
+            for mesh in meshes
+            for path in base_meshes.companions(mesh, chosen.image)
+            if options.texture and textured
+        ]
+        previews = [] if chosen.no_preview else [self.preview]
+        outputs = [*meshes, *more, beside(self.output, CONFIGURATION), *previews]
+        check_outputs(outputs, force, inputs=[self.source])
+        return options
+
+    def save(
+        self, *, force: bool = False, progress: Callable[[str, int, int], object] | None = None
+    ) -> tuple[GaussianCloud | SplatMesh, list[tuple[Path, BaseMesh]]]:
+        """Makes them. The scene, and each file with its surface.
+
+        Args:
+            force: replace files that are there.
+            progress: as for ``surfaces_from``.
+        """
+        chosen, options = self.options, self.check(force)
+        scene = self.reading.load_scene(self.source)
+        data = None
+        if chosen.data is not None:
+            how: dict[str, Any] = {"missing": chosen.missing, "masks": chosen.masks}
+            data = load_dataset(chosen.data, **how, origin=scene.origin)
+        given = None if chosen.cameras is None else load_cameras(chosen.cameras, origin=scene.origin)
+        sources = sources_of(scene, data, given, options, self.threads)
+        bases = surfaces_from(scene, sources, options, chosen.levels, threads=self.threads, progress=progress)
+        files = base_meshes.level_files(self.output, chosen.levels)
+        save = partial(
+            base_meshes.save_base, unlit=chosen.unlit, image=chosen.image, collision=chosen.collision
+        )
+        with together():
+            for base, path in zip(bases, files, strict=True):
+                save(self.place(scaled(base, chosen.scale)), path)
+            self.record(beside(self.output, CONFIGURATION))
+            if not chosen.no_preview:
+                self._draw_preview(scene, bases[0], sources)
+        return scene, list(zip(files, bases, strict=True))
+
+    def _draw_preview(self, scene: GaussianCloud | SplatMesh, base: BaseMesh, sources: Sources) -> None:
+        camera = preview_camera(scene)
+        if place := place_of(scene, sources):
+            self.say(f"{place.in_words()}: seen from views that were found")
+            camera = place.cameras[0].within(camera.width)
+        save_image(self.preview, draw_surface(base, camera, threads=self.threads))

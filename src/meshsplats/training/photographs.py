@@ -1,0 +1,108 @@
+"""Photographs to train on, from a folder or a video, and what is planned for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.image_files import Masks, Missing
+from meshsplats.datasets.points import load_points
+from meshsplats.datasets.views import Dataset
+from meshsplats.errors import OptionsError
+from meshsplats.evaluation.backgrounds import BLACK, Background
+from meshsplats.finetuning.config import BACKGROUNDS
+from meshsplats.finetuning.plans import Plan, Trained
+from meshsplats.finetuning.run import RunOptions
+from meshsplats.finetuning.setup import Display
+from meshsplats.finetuning.targets import check_cache
+from meshsplats.training.as_splats import FITTED_SHARE
+from meshsplats.training.config import TrainConfig
+from meshsplats.training.reconstruction import ensure_cameras
+from meshsplats.training.run import check_training_memory, train
+from meshsplats.training.video import photographs_of
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class PhotographOptions:
+    """The photographs."""
+
+    downscale: int | None = None
+    """Factor by which images are smaller than the photographs. Default: what the minutes suffice for."""
+    test_every: int = 8
+    """Every n-th view is held out for scores, if the data set has no split; 0: none."""
+    missing: Missing = "few"
+    """Missing photographs are left out (skip), if they are fewer than half (few), or an error."""
+    masks: Masks = "count"
+    """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
+    estimate_cameras: bool = False
+    """Find the cameras of the photographs though the folder holds some of a kind that is not read."""
+    frames: int | None = None
+    """Frames to take of a video. Default: two per second, 40 to 120."""
+    cache: float = 2.0
+    """Gigabytes of images kept in memory; others are read again when they are needed."""
+
+    def check(self) -> None:
+        """ValueError for values out of range."""
+        check_cache(self.cache)
+
+    @property
+    def cache_bytes(self) -> int:
+        return int(self.cache * 1e9)
+
+    def with_cameras(self, source: Path, say: Say) -> Path:
+        """The folder of the photographs at ``source``, a folder or a video, with cameras, which are found
+        where there are none. ``say`` gets lines about it. OptionsError if they are not to be found."""
+        folder = photographs_of(source, self.frames, say)
+        there = ensure_cameras(folder, replacing=self.estimate_cameras, say=say)
+        if there is not None and self.estimate_cameras:
+            raise OptionsError(f"``estimate_cameras`` has no effect: {there} has cameras")
+        return folder
+
+    def load(self, folder: Path, config: TrainConfig) -> tuple[Dataset, Background]:
+        """The photographs in ``folder``, over the background of the training, and that background. ValueError
+        if there are fewer than two to train on."""
+        dataset = load_dataset(
+            folder,
+            downscale=1 if self.downscale is None else self.downscale,
+            test_every=self.test_every,
+            cache_bytes=self.cache_bytes,
+            missing=self.missing,
+            masks=self.masks,
+        )
+        if len(dataset.train) < 2:
+            raise ValueError(
+                f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
+                " are needed to train on (--test-every 0 holds none out)"
+            )
+        if config.background in BACKGROUNDS:
+            found = Background(BACKGROUNDS[config.background], "given")
+        elif dataset.train[0].load().alpha is None:
+            found = Background(BLACK, "given")  # covered by the fans themselves
+        else:
+            found = Background((1.0, 1.0, 1.0), "usual")
+        return dataset.over(found.color), found
+
+    def plan(self, folder: Path, config: TrainConfig, *, as_splats: bool = False, say: Say) -> Plan:
+        """A training on the photographs in ``folder``, of which splats are made afterwards, too, if
+        ``as_splats``. ``say`` gets lines about it. Raises what ``load`` and ``check_training_memory`` do."""
+        dataset, background = self.load(folder, config)
+        mask = dataset.train[0].mask
+        if mask is not None and mask.mean() < 0.5:
+            say("masks leave most pixels out, which may become anything: --masks subject cuts out an object")
+        points = load_points(folder, origin=dataset.origin)
+        known = "no known points" if points is None else f"{len(points.positions):,} known points"
+
+        def optimise(run: RunOptions, show: Display) -> Trained:
+            mesh = train(dataset, config, points=points, run=run, on_progress=show)
+            counts: dict[str, int] = {"fans": mesh.splat_count or 0, "triangles": len(mesh.faces)}
+            made = f"{counts['triangles']:,} triangles of {counts['fans']:,} fans"
+            return Trained(mesh, mesh, counts, made)
+
+        needed = check_training_memory(dataset, config, cache_bytes=self.cache_bytes)
+        summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
+        reserve = 60 * FITTED_SHARE * (config.minutes or 0) if as_splats else 0.0
+        return Plan(None, dataset, summary, background, optimise, reserve=reserve, needed=needed)
