@@ -222,22 +222,54 @@ class AdjustSplats(bpy.types.Operator):
         return can_edit(cls, context)
 
     def invoke(self, context, event):  # by themselves, its defaults change nothing
-        return context.window_manager.invoke_props_popup(self, event)
+        from meshsplats.blender.inside import adjusting
+
+        every = {obj.data for obj in self._every(context)}
+        self._kept = [(data, adjusting.kept_colors(data)) for data in every]
+        return context.window_manager.invoke_props_dialog(self)
+
+    def check(self, context):
+        """Called by Blender's dialog after each move of a slider: shows the colours at once. Only OK is a
+        step that can be undone."""
+        self._put_back()
+        self._adjust(context)
+        return False
+
+    def cancel(self, context):
+        self._put_back()
 
     def execute(self, context):
-        from meshsplats.blender.inside import adjusting, levels, stand_ins
+        from meshsplats.blender.inside import stand_ins
+
+        self._put_back()
+        with waiting(context):
+            self._adjust(context)
+        for obj in self._every(context):
+            if stand_ins.SHAPE in obj:  # light bounces off the old colours
+                obj[stand_ins.SHAPE] = ""
+        return {"FINISHED"}
+
+    def _every(self, context):
+        """The selected splat meshes and the active one, with all levels of their chains."""
+        from meshsplats.blender.inside import levels
+
+        chosen = {context.object, *(obj for obj in context.selected_objects if is_splat_mesh(obj))}
+        return {level for obj in chosen for level in levels.with_levels(obj)}
+
+    def _adjust(self, context):
+        from meshsplats.blender.inside import adjusting
 
         values = {name: getattr(self, name) for name in ("saturation", "brightness", "contrast", "opacity")}
         change = adjusting.Adjustment(hue=math.degrees(self.hue), **values)
-        chosen = {context.object, *(obj for obj in context.selected_objects if is_splat_mesh(obj))}
-        every = {level for obj in chosen for level in levels.with_levels(obj)}
-        with waiting(context):
-            for data in {obj.data for obj in every}:
-                adjusting.adjust(data, change)
-            for obj in every:
-                if stand_ins.SHAPE in obj:  # light bounces off the old colours
-                    obj[stand_ins.SHAPE] = ""
-        return {"FINISHED"}
+        for data in {obj.data for obj in self._every(context)}:
+            adjusting.adjust(data, change)
+
+    def _put_back(self):
+        """Takes back what the dialog has shown."""
+        from meshsplats.blender.inside import adjusting
+
+        for data, kept in getattr(self, "_kept", ()):
+            adjusting.put_back(data, kept)
 
 
 CLASSES = (CutSplats, CleanSplats, AdjustSplats)
