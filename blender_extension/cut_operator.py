@@ -212,10 +212,10 @@ class AdjustSplats(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
     hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE")
-    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, max=4.0)
-    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, max=4.0)
-    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, max=4.0)
-    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, max=4.0)
+    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, soft_max=2.0, max=4.0)
+    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, soft_max=2.0, max=4.0)
+    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, soft_max=2.0, max=4.0)
+    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, soft_max=2.0, max=4.0)
 
     @classmethod
     def poll(cls, context):
@@ -227,6 +227,13 @@ class AdjustSplats(bpy.types.Operator):
         every = {obj.data for obj in self._every(context)}
         self._kept = [(data, adjusting.kept_colors(data)) for data in every]
         return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        for name in ("hue", "saturation", "brightness", "contrast", "opacity"):
+            # As a mere number, a hue would turn by a degree in 200 pixels.
+            layout.prop(self, name, slider=True)
 
     def check(self, context):
         """Called by Blender's dialog after each move of a slider: shows the colours at once. Only OK is a

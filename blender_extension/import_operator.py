@@ -70,7 +70,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, views
+        from meshsplats.blender.inside import objects, priors, views
 
         objs = []
         for result in work.results:
@@ -88,9 +88,10 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
                 views.remember(made[0], [view.relative_to(origin) for view in result.views])
             objs.append(made[0])
         if self.at_origin:  # all by the same way: files of one capture keep their places to each other
-            away = objs[0].location.copy()
-            for obj in objs:
-                obj.location -= away
+            roots = [priors.base_of(obj) or obj for obj in objs]
+            away = objects.foot_of(roots[0], work.results[0].prepared[0])
+            for root in roots:
+                root.location -= away
         settle(self, context, objs)
         if not bpy_background():
             bpy.ops.ed.undo_push(message=self.bl_label)

@@ -18,7 +18,8 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats
 from mathutils import Matrix
 
-from meshsplats import convert, load_gaussians, look_at, save_gaussians
+from meshsplats import bind, convert, load_gaussians, look_at, save_gaussians, save_mesh
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender import subject
 from meshsplats.blender.inside import adjusting, baking, materials, meshes, objects, stand_ins, views
 from meshsplats.conversion.cleaning import find
@@ -112,6 +113,20 @@ def test_a_place_is_searched_for_views_once(extension, tmp_path, monkeypatch):
     bpy.ops.scene.meshsplats_bake_light(fast=True, only_active=True)
     assert len(asked) == 3
     assert views.opening([obj]) is None, "it is not known where they are"
+
+
+def test_a_mesh_prior_stands_on_the_grid_with_its_base(extension, tmp_path):
+    corners = np.add([[-1.0, -2, 0], [1, -2, 0], [1, 0, 0], [-1, 0, 0]], [5, 6, 7])
+    base = BaseMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), up=np.array([0, -1, 0]))
+    save_mesh(bind(base, triangles=200).mesh, tmp_path / "prior.npz")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "prior.npz"), at_origin=True)
+    bpy.context.view_layer.update()
+    obj = bpy.context.object
+    points = meshes.world_points(obj)
+    np.testing.assert_allclose([points[:, 2].min(), np.median(points[:, 0])], 0, atol=0.1)
+    assert np.ptp(points[:, 2]) > 1.8
+    np.testing.assert_allclose(meshes.local_points(obj).mean(axis=0), corners.mean(axis=0), atol=0.1)
 
 
 def splat_count(obj) -> int:

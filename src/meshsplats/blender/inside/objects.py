@@ -77,9 +77,10 @@ def prepare(
     if lit:
         made, facts = lit_subject(mesh, within=views, effort=FAST if fast else CAREFUL, announce=announce)
         arrays |= made | facts
+    below = foot(mesh) if len(mesh.faces) else np.zeros(3)
+    arrays |= {"mesh": mesh, "lit": lit, "fast": fast, "layers": most_layers(mesh), "foot": below}
     # Splats on a base keep the base's frame.
-    origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
-    return arrays | {"mesh": mesh, "lit": lit, "fast": fast, "layers": most_layers(mesh), "origin": origin}
+    return arrays | {"origin": np.zeros(3) if mesh.binding is not None else below}
 
 
 def foot(mesh: SplatMesh) -> np.ndarray:
@@ -101,6 +102,13 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
         priors.give_base(obj, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = obj
     return obj
+
+
+def foot_of(root: Any, prepared: dict[str, Any]) -> Any:
+    """Where the foot of the splats that ``add`` has made of ``prepared`` is, Blender's world: a Vector.
+    ``root``: their object, or that of the base that they follow."""
+    rotation = frame.to_blender(prepared["mesh"].up)
+    return root.location + type(root.location)((rotation @ (prepared["foot"] - prepared["origin"])).tolist())
 
 
 def add_chain(
