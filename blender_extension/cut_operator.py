@@ -204,6 +204,10 @@ class CleanSplats(bpy.types.Operator):
         return {"FINISHED"}
 
 
+_AFRESH = {"SKIP_SAVE"}
+"""Options of a property that begins with its default each time."""
+
+
 class AdjustSplats(bpy.types.Operator):
     """Change hue, saturation, brightness, contrast and opacity of the selected splat meshes"""
 
@@ -211,11 +215,11 @@ class AdjustSplats(bpy.types.Operator):
     bl_label = "Adjust Colours"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
-    hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE")
-    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, soft_max=2.0, max=4.0)
-    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, soft_max=2.0, max=4.0)
-    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, soft_max=2.0, max=4.0)
-    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, soft_max=2.0, max=4.0)
+    hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE", options=_AFRESH)
+    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
+    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
+    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
+    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
 
     @classmethod
     def poll(cls, context):

@@ -208,6 +208,8 @@ def test_sliders_show_colours_before_they_are_accepted(ball, extension, lit):
         for name in (meshes.MADE, meshes.DISPLAY):
             ball.data.attributes.remove(ball.data.attributes[name])
     ours = vars(sys.modules["blender_extension.cut_operator"].AdjustSplats)
+    described = bpy.ops.object.meshsplats_adjust.get_rna_type().properties
+    assert all(described[name].is_skip_save for name in ("hue", "opacity")), "it begins with what is shown"
     dialog = type("Dialog", (), {name: value for name, value in ours.items() if callable(value)})()
     dialog.hue, dialog.saturation, dialog.brightness, dialog.contrast, dialog.opacity = 0, 1, 1, 1, 1
     window = SimpleNamespace(invoke_props_dialog=lambda operator: {"RUNNING_MODAL"})
