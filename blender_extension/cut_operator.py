@@ -204,6 +204,10 @@ class CleanSplats(bpy.types.Operator):
         return {"FINISHED"}
 
 
+_AFRESH = {"SKIP_SAVE"}
+"""Options of a property that begins with its default each time."""
+
+
 class AdjustSplats(bpy.types.Operator):
     """Change hue, saturation, brightness, contrast and opacity of the selected splat meshes"""
 
@@ -211,33 +215,72 @@ class AdjustSplats(bpy.types.Operator):
     bl_label = "Adjust Colours"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
-    hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE")
-    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, max=4.0)
-    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, max=4.0)
-    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, max=4.0)
-    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, max=4.0)
+    hue: FloatProperty(name="Hue", default=0.0, min=-math.pi, max=math.pi, subtype="ANGLE", options=_AFRESH)
+    saturation: FloatProperty(name="Saturation", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
+    brightness: FloatProperty(name="Brightness", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
+    contrast: FloatProperty(name="Contrast", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
+    opacity: FloatProperty(name="Opacity", default=1.0, min=0.0, soft_max=2.0, max=4.0, options=_AFRESH)
 
     @classmethod
     def poll(cls, context):
         return can_edit(cls, context)
 
     def invoke(self, context, event):  # by themselves, its defaults change nothing
-        return context.window_manager.invoke_props_popup(self, event)
+        from meshsplats.blender.inside import adjusting
+
+        every = {obj.data for obj in self._every(context)}
+        self._kept = [(data, adjusting.kept_colors(data)) for data in every]
+        return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        for name in ("hue", "saturation", "brightness", "contrast", "opacity"):
+            # As a mere number, a hue would turn by a degree in 200 pixels.
+            layout.prop(self, name, slider=True)
+
+    def check(self, context):
+        """Called by Blender's dialog after each move of a slider: shows the colours at once. Only OK is a
+        step that can be undone."""
+        self._put_back()
+        self._adjust(context)
+        return False
+
+    def cancel(self, context):
+        self._put_back()
 
     def execute(self, context):
-        from meshsplats.blender.inside import adjusting, levels, stand_ins
+        from meshsplats.blender.inside import stand_ins
+
+        self._put_back()
+        with waiting(context):
+            self._adjust(context)
+        for obj in self._every(context):
+            if stand_ins.SHAPE in obj:  # light bounces off the old colours
+                obj[stand_ins.SHAPE] = ""
+        return {"FINISHED"}
+
+    def _every(self, context):
+        """The selected splat meshes and the active one, with all levels of their chains."""
+        from meshsplats.blender.inside import levels
+
+        chosen = {context.object, *(obj for obj in context.selected_objects if is_splat_mesh(obj))}
+        return {level for obj in chosen for level in levels.with_levels(obj)}
+
+    def _adjust(self, context):
+        from meshsplats.blender.inside import adjusting
 
         values = {name: getattr(self, name) for name in ("saturation", "brightness", "contrast", "opacity")}
         change = adjusting.Adjustment(hue=math.degrees(self.hue), **values)
-        chosen = {context.object, *(obj for obj in context.selected_objects if is_splat_mesh(obj))}
-        every = {level for obj in chosen for level in levels.with_levels(obj)}
-        with waiting(context):
-            for data in {obj.data for obj in every}:
-                adjusting.adjust(data, change)
-            for obj in every:
-                if stand_ins.SHAPE in obj:  # light bounces off the old colours
-                    obj[stand_ins.SHAPE] = ""
-        return {"FINISHED"}
+        for data in {obj.data for obj in self._every(context)}:
+            adjusting.adjust(data, change)
+
+    def _put_back(self):
+        """Takes back what the dialog has shown."""
+        from meshsplats.blender.inside import adjusting
+
+        for data, kept in getattr(self, "_kept", ()):
+            adjusting.put_back(data, kept)
 
 
 CLASSES = (CutSplats, CleanSplats, AdjustSplats)

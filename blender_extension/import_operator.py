@@ -10,7 +10,7 @@ from bpy_extras.io_utils import ImportHelper
 from meshsplats.formats.splat_formats import folder_files, splat_suffixes
 
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
-from .work import Modal, Work, settle
+from .work import Modal, Work, bpy_background, settle
 
 SUFFIXES = (*splat_suffixes(), ".npz")
 ENDS = tuple(dict.fromkeys(f".{suffix.rpartition('.')[2]}" for suffix in SUFFIXES))
@@ -24,7 +24,9 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
 
     bl_idname = "import_scene.meshsplats"
     bl_label = "Import Splats"
-    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012 - Blender's own form
+    # Not UNDO: after its file dialog, Blender adds a step when such an operator begins, before there is
+    # anything to undo, and another one when it ends.
+    bl_options = {"PRESET"}  # noqa: RUF012 - Blender's own form
 
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
@@ -68,7 +70,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, setting
+        from meshsplats.blender.inside import objects, priors, views
 
         objs = []
         for result in work.results:
@@ -81,14 +83,18 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
             for obj, path in zip(made, result.level_paths or (result.path,), strict=True):
                 obj.meshsplats.path = path
                 copy_choices(obj.meshsplats, self)
-            if result.view is not None:
-                setting.remember_view(made[0], result.view.relative_to(result.prepared[0]["origin"]))
+            if result.views:
+                origin = result.prepared[0]["origin"]
+                views.remember(made[0], [view.relative_to(origin) for view in result.views])
             objs.append(made[0])
         if self.at_origin:  # all by the same way: files of one capture keep their places to each other
-            away = objs[0].location.copy()
-            for obj in objs:
-                obj.location -= away
+            roots = [priors.base_of(obj) or obj for obj in objs]
+            away = objects.foot_of(roots[0], work.results[0].prepared[0])
+            for root in roots:
+                root.location -= away
         settle(self, context, objs)
+        if not bpy_background():
+            bpy.ops.ed.undo_push(message=self.bl_label)
         count = sum(len(obj.data.polygons) for obj in objs)
         self.report({"INFO"}, f"MeshSplats: {len(objs)} imported, {count:,} triangles")
 

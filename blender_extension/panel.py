@@ -93,11 +93,11 @@ class MeshSplatsPanel(bpy.types.Panel):
 
     def _chain(self, layout, chain):
         box = layout.box()
-        box.label(text=chain.name, icon="OUTLINER_COLLECTION")
+        box.label(text=f"{chain.name}: level in", icon="OUTLINER_COLLECTION")
         children = sorted((c for c in chain.children if LEVEL in c), key=lambda c: c[LEVEL])
         for where, text, hidden in (
-            ("view", "Level in view", "hide_viewport"),
-            ("render", "Level in render", "hide_render"),
+            ("view", "Viewport", "hide_viewport"),
+            ("render", "Render", "hide_render"),  # the side bar cuts longer labels
         ):
             row = box.row(align=True)
             row.label(text=text)

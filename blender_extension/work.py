@@ -24,8 +24,9 @@ class Result:
     """Of a chain: the file of each level."""
     screen_sizes: tuple = ()
     """Of a chain: of each level, the size for which it was made, in pixels."""
-    view: object = None
-    """A ``Camera``, relative to the file's origin, that sees a place from within; None of an object."""
+    views: tuple | None = None
+    """A ``Camera`` for each view of a place from within, relative to the file's origin, the first one to open
+    with; none of an object. None: not looked for."""
 
 
 @contextmanager
@@ -100,18 +101,21 @@ class Work:
         from meshsplats.formats.splat_paths import subject_name
 
         if not is_chain(Path(path)):
-            prepared, view = self._prepared(path, index, 1.0)
-            return Result(path, subject_name(Path(path)), (prepared,), view=view)
+            prepared, views = self._prepared(path, index, 1.0)
+            return Result(path, subject_name(Path(path)), (prepared,), views=views)
         chain = read_chain(Path(path))
         files = tuple(str(level.path) for level in chain.levels)
         share = 1 / len(files)
-        levels = [self._prepared(file, index + i * share, share, look=i == 0) for i, file in enumerate(files)]
+        levels, views = [], None
+        for i, file in enumerate(files):  # what is seen from within the finest is seen in all
+            prepared, views = self._prepared(file, index + i * share, share, views)
+            levels.append(prepared)
         sizes = tuple(level.screen_size for level in chain.levels)
-        return Result(path, chain.name, tuple(p for p, _ in levels), files, sizes, levels[0][1])
+        return Result(path, chain.name, tuple(levels), files, sizes, views)
 
-    def _prepared(self, path, begin, share, look=True):
-        """Arguments of ``objects.add`` and, with ``look``, a view from within a place. Progress, in files,
-        goes from ``begin`` on by ``share``."""
+    def _prepared(self, path, begin, share, views=None):
+        """Arguments of ``objects.add``, and views from within a place, which are looked for unless given.
+        Progress, in files, goes from ``begin`` on by ``share``."""
         from pathlib import Path
 
         from meshsplats.formats.sniff import identify
@@ -127,22 +131,28 @@ class Work:
             scene = load_gaussians(path, axes=self.choices["axes"])
             self._at(begin + 0.3 * share, "converting")
             mesh = self._converted(scene)
-        view = None
-        if look and self.choices.get("frame_view"):
+        if views is None and self.choices.get("frame_view"):
             self._at(begin + 0.4 * share, "looking for a view")
-            view = self._view(scene, path)
-        return self._ready(mesh, begin, share), view
+            views = self._views(scene, path)
+        # One alone is a given start camera: what light needs is still to be found.
+        known = None if views is None or len(views) == 1 else views
+        return self._ready(mesh, begin, share, known), views
 
-    def _view(self, scene, path):
-        """The opening view of a place; None of an object, and of a mesh that is no fans of splats."""
+    def _views(self, scene, path):
+        """The views of a place from within, the first one to open with; none of an object, and of a mesh that
+        is no fans of splats."""
         from pathlib import Path
 
+        from meshsplats.blender.subject import VIEWS
         from meshsplats.conversion.recovery import splats_of
-        from meshsplats.viewpoints.showing import default_views
+        from meshsplats.viewpoints.showing import default_views, opening_beside
 
         cloud = splats_of(scene)
-        found = cloud and default_views(cloud, Path(path), 1)
-        return found[0][0] if found else None
+        if cloud is None:
+            return ()
+        opening = opening_beside(Path(path), cloud.origin)
+        found = default_views(cloud, Path(path), VIEWS if opening is None else 1, side=(400, 400))
+        return tuple(found[0]) if found else ()
 
     def _converted(self, cloud, up=None):
         from meshsplats.conversion import convert
@@ -155,7 +165,7 @@ class Work:
             options["mode"] = "flat"
         return convert(cloud, preset=self.choices["preset"], up=up, **options)
 
-    def _ready(self, mesh, begin, share):
+    def _ready(self, mesh, begin, share, views=None):
         from meshsplats.blender.inside import objects
 
         lit = self.choices["shading"] == "lit"
@@ -165,7 +175,8 @@ class Work:
         def announce(phase):  # Escape takes effect between phases
             self._at(begin + next(phases, 0.9) * share, f"{phase} for light")
 
-        prepared = objects.prepare(mesh, lit, fast=self.choices.get("fast", False), announce=announce)
+        fast = self.choices.get("fast", False)
+        prepared = objects.prepare(mesh, lit, fast=fast, views=views, announce=announce)
         self._at(begin + share, "building")
         return prepared
 
@@ -189,14 +200,16 @@ class LightWork(Work):
     def __init__(self, meshes, shading, fast=False):
         import bpy
 
-        from meshsplats.blender.inside import stand_ins
+        from meshsplats.blender.inside import objects, stand_ins
 
         super().__init__(meshes, {"shading": shading, "fast": fast})
         self._meshes = meshes
-        self.shapes = {name: stand_ins.shape(bpy.data.objects[name].data) for name in meshes}
+        named = {name: bpy.data.objects[name] for name in meshes}
+        self.shapes = {name: stand_ins.shape(obj.data) for name, obj in named.items()}
+        self._views_of = {name: objects.views_within(obj) for name, obj in named.items()}
 
     def _one(self, path, index):
-        return Result("", path, (self._ready(self._meshes[path], index, 1.0),))
+        return Result("", path, (self._ready(self._meshes[path], index, 1.0, self._views_of[path]),))
 
 
 class Modal:
@@ -271,7 +284,7 @@ def waiting(context):
 def settle(operator, context, objs):
     """Selects new splat meshes, hides Blender's start scene, shows them in the viewports, a place from
     within, and, if ``operator`` is to, sets up the render for all of the scene."""
-    from meshsplats.blender.inside import objects, setting
+    from meshsplats.blender.inside import objects, setting, views
 
     for other in context.selected_objects:
         other.select_set(False)
@@ -283,7 +296,7 @@ def settle(operator, context, objs):
     context.view_layer.update()
     if operator.frame_view:
         windows = context.window_manager.windows
-        view = setting.view_from_within(objs)
+        view = views.opening(objs)
         if view is None:
             setting.frame_in_viewports(windows, objs)
             setting.frame_in_start_camera(context.scene, objs)

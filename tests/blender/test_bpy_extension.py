@@ -176,8 +176,8 @@ def test_a_whole_session(packed, tmp_path):
     assert "no chain of levels of detail nothing" in report["level_errors"][1]
     assert "cameras.json" in report["level_errors"][2]
     levels = [["0", False], ["1", True]]
-    rows = [["Level in view", None], *levels, ["Level in render", None], *levels]
-    assert report["panel"][:7] == [["chain.001", None], *rows]
+    rows = [["Viewport", None], *levels, ["Render", None], *levels]
+    assert report["panel"][:7] == [["chain.001: level in", None], *rows]
     assert report["panel"][7][0] == "scene.meshsplats_fit_level"
     waited = report["waited"]
     assert waited["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["FINISHED"]]

@@ -16,9 +16,12 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import ball_splats
+from mathutils import Matrix
 
-from meshsplats import convert, load_gaussians, look_at, save_gaussians
-from meshsplats.blender.inside import baking, materials, objects, setting, stand_ins
+from meshsplats import bind, convert, load_gaussians, look_at, save_gaussians, save_mesh
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.blender import subject
+from meshsplats.blender.inside import adjusting, baking, materials, meshes, objects, stand_ins, views
 from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
@@ -54,7 +57,7 @@ def test_a_place_is_imported_with_a_view_from_within(extension, tmp_path, monkey
     save_gaussians(ball_splats(200)[0], tmp_path / "place.ply")
     asked = []
 
-    def default_views(scene, source, count):
+    def default_views(scene, source, count, side):
         asked.append((len(scene), source, count))
         return [look_at((0.1, 0.2, 0.3), (1, 0.4, 0.3), fov=60, width=400, height=400)], "a place"
 
@@ -65,16 +68,65 @@ def test_a_place_is_imported_with_a_view_from_within(extension, tmp_path, monkey
         bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "place.ply"), frame_view=frame_view)
         bpy.context.view_layer.update()
         obj, after = bpy.context.object, np.array(bpy.context.scene.camera.matrix_world)
-        assert asked == [(200, tmp_path / "place.ply", 1)]
+        assert asked == [(200, tmp_path / "place.ply", 24)]
         if not frame_view:
             np.testing.assert_array_equal(after, before)
-            assert setting.VIEW not in obj
+            assert views.VIEWS not in obj
             continue
-        np.testing.assert_allclose(after, setting.view_from_within([obj]).pose, atol=1e-5)
+        np.testing.assert_allclose(after, views.opening([obj]).pose, atol=1e-5)
         # Where the file has the camera, the object's own vertices being relative to its foot.
         foot = objects.prepare(convert(load_gaussians(tmp_path / "place.ply")), False)["origin"]
         local = np.array(obj.matrix_world.inverted()) @ after[:, 3]
         np.testing.assert_allclose(local[:3] + foot, [0.1, 0.2, 0.3], atol=1e-4)
+
+
+def test_a_place_is_searched_for_views_once(extension, tmp_path, monkeypatch):
+    """Whether it is imported lit, or lit later; not where it was changed so much that they are not of it."""
+    save_gaussians(ball_splats(300)[0], tmp_path / "place.ply")
+    given = [look_at((0.1, y, 0.3), (1, 0.4, 0.3), fov=60, width=400, height=400) for y in (0.1, 0.2, 0.3)]
+    asked, seen = [], []
+
+    def default_views(cloud, *arguments, **options):
+        asked.append(len(cloud))
+        return given, "a place"
+
+    def lit_arrays(mesh, cameras, **options):
+        seen.append([camera.world_to_camera for camera in cameras])
+        return made(mesh, cameras, **options)
+
+    made = subject.lit_arrays
+    monkeypatch.setattr("meshsplats.viewpoints.showing.default_views", default_views)
+    monkeypatch.setattr(subject, "default_views", default_views)
+    monkeypatch.setattr(subject, "lit_arrays", lit_arrays)
+    bpy.ops.wm.read_factory_settings()
+    bpy.context.scene.meshsplats_fast = True
+    for shading in ("lit", "unlit"):
+        bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "place.ply"), shading=shading, at_origin=True)
+    assert len(asked) == 2
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    assert len(asked) == 2
+    assert len(seen) == 2
+    for views_of_one in seen:
+        np.testing.assert_allclose(views_of_one, [c.world_to_camera for c in given], atol=1e-5)
+    obj = bpy.context.object
+    obj.data.transform(Matrix.Scale(3, 4))
+    bpy.ops.scene.meshsplats_bake_light(fast=True, only_active=True)
+    assert len(asked) == 3
+    assert views.opening([obj]) is None, "it is not known where they are"
+
+
+def test_a_mesh_prior_stands_on_the_grid_with_its_base(extension, tmp_path):
+    corners = np.add([[-1.0, -2, 0], [1, -2, 0], [1, 0, 0], [-1, 0, 0]], [5, 6, 7])
+    base = BaseMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), up=np.array([0, -1, 0]))
+    save_mesh(bind(base, triangles=200).mesh, tmp_path / "prior.npz")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "prior.npz"), at_origin=True)
+    bpy.context.view_layer.update()
+    obj = bpy.context.object
+    points = meshes.world_points(obj)
+    np.testing.assert_allclose([points[:, 2].min(), np.median(points[:, 0])], 0, atol=0.1)
+    assert np.ptp(points[:, 2]) > 1.8
+    np.testing.assert_allclose(meshes.local_points(obj).mean(axis=0), corners.mean(axis=0), atol=0.1)
 
 
 def splat_count(obj) -> int:
@@ -133,6 +185,51 @@ def test_undo_takes_edits_back(ball):
         bpy.context.view_layer.objects.active = back
         assert splat_count(back) == count
         np.testing.assert_array_equal(objects.as_splat_mesh(back).colors, before)
+
+
+def test_an_import_is_one_step_that_can_be_undone(ball, extension, tmp_path, monkeypatch):
+    """Blender itself adds a step to what its file dialog starts, before anything has changed."""
+    operator = sys.modules["blender_extension.import_operator"]
+    assert "UNDO" not in operator.ImportMeshSplats.bl_options
+    monkeypatch.setattr(operator, "bpy_background", lambda: False)
+    bpy.ops.import_scene.meshsplats(filepath=str(tmp_path / "ball.ply"))
+    after = sorted(bpy.data.objects.keys())
+    bpy.ops.ed.undo()
+    assert sorted(bpy.data.objects.keys()) == ["ball"]
+    bpy.ops.ed.redo()
+    assert sorted(bpy.data.objects.keys()) == after == ["ball", "ball.001"]
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_sliders_show_colours_before_they_are_accepted(ball, extension, lit):
+    """And leave nothing behind where they are not: no colour, no attribute, no stale light."""
+    if lit:
+        objects.replace_mesh(ball, objects.prepare(objects.as_splat_mesh(ball), True, fast=True))
+        for name in (meshes.MADE, meshes.DISPLAY):
+            ball.data.attributes.remove(ball.data.attributes[name])
+    ours = vars(sys.modules["blender_extension.cut_operator"].AdjustSplats)
+    described = bpy.ops.object.meshsplats_adjust.get_rna_type().properties
+    assert all(described[name].is_skip_save for name in ("hue", "opacity")), "it begins with what is shown"
+    dialog = type("Dialog", (), {name: value for name, value in ours.items() if callable(value)})()
+    dialog.hue, dialog.saturation, dialog.brightness, dialog.contrast, dialog.opacity = 0, 1, 1, 1, 1
+    window = SimpleNamespace(invoke_props_dialog=lambda operator: {"RUNNING_MODAL"})
+    context = SimpleNamespace(object=ball, selected_objects=[ball], window_manager=window)
+
+    def now():
+        stored = {name: colors.tolist() for name, colors in adjusting.kept_colors(ball.data).items()}
+        return stored | {"light": stand_ins.is_current(ball)}
+
+    before, shown = now(), objects.as_splat_mesh(ball).colors
+    assert dialog.invoke(context, None) == {"RUNNING_MODAL"}
+    for dialog.brightness in (0.2, 0.5):  # each from where it began
+        dialog.check(context)
+    np.testing.assert_allclose(objects.as_splat_mesh(ball).colors[:, :3], shown[:, :3] / 2, atol=1e-4)
+    dialog.cancel(context)
+    assert now() == before
+    dialog.check(context)
+    assert dialog.execute(context) == {"FINISHED"}
+    np.testing.assert_allclose(objects.as_splat_mesh(ball).colors[:, :3], shown[:, :3] / 2, atol=1e-4)
+    assert not stand_ins.is_current(ball)
 
 
 @pytest.mark.slow

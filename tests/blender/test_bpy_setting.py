@@ -17,7 +17,7 @@ from mathutils import Matrix, Vector
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import objects, rendering, setting, versions, written
+from meshsplats.blender.inside import objects, rendering, setting, versions, views, written
 from meshsplats.blender.options import LIGHTS
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.images.reading import load_image
@@ -240,10 +240,10 @@ def test_a_place_is_seen_from_within(tmp_path):
     bpy.ops.wm.read_factory_settings()
     scene, obj = bpy.context.scene, ball()
     inside = look_at((0.2, -0.3, 0.1), (1, 0.4, 0.3), up=(0, 1, 0), fov=60, width=400, height=300)
-    setting.remember_view(obj, inside)
+    views.remember(obj, [inside])
     obj.location, obj.scale, obj.rotation_euler = (5, 2, 3), (3, 3, 3), (0.3, 0, 1)
     bpy.context.view_layer.update()
-    view = setting.view_from_within([obj])
+    view = views.opening([obj])
     setting.look_from(view, bpy.context.window_manager.windows, scene)
     bpy.context.view_layer.update()
     x, y = np.meshgrid([-200.0, 0, 200], [-150.0, 0, 150])
@@ -267,19 +267,19 @@ def test_a_place_is_seen_from_within(tmp_path):
     camera = view.camera(400, 300)
     np.testing.assert_allclose(camera.center, eye, atol=1e-4)
     np.testing.assert_allclose(camera.fx, 300 / 2 / view.half)
-    assert setting.view_from_within([]) is None
-    for broken in ([1.0] * 5, [float("nan")] * 18, [0.0] * 18):
-        obj[setting.VIEW] = broken
-        assert setting.view_from_within([obj]) is None
+    assert views.opening([]) is None
+    for broken in ([1.0] * 5, [float("nan")] * 18, [0.0] * 18, [1.0] * 20, "view", {"a": 1}, [{"a": 1}], obj):
+        obj[views.VIEWS] = broken
+        assert views.opening([obj]) is None
 
 
 def test_studio_looks_at_a_place_from_within(empty):
     obj = ball()
-    setting.remember_view(obj, look_at((0.2, -0.3, 0.1), (1, 0.4, 0.3), fov=60, width=400, height=300))
+    views.remember(obj, [look_at((0.2, -0.3, 0.1), (1, 0.4, 0.3), fov=60, width=400, height=300)])
     bpy.context.view_layer.update()
     setting.set_up(empty, [obj], fast=True)
     bpy.context.view_layer.update()
-    pose = setting.view_from_within([obj]).pose
+    pose = views.opening([obj]).pose
     np.testing.assert_allclose(np.array(empty.camera.matrix_world), pose, atol=1e-5)
 
 

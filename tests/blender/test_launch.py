@@ -248,6 +248,7 @@ def test_what_blender_says_is_passed_on(program, tmp_path):
     camera = cameras()[0]
     assert ahead[0]["pixels"] == camera.width * camera.height
     assert (ahead[0]["triangles"], ahead[0]["samples"]) == (3, 1)
+    assert ahead[0]["harmonics"] == 0
     assert 0 < ahead[0]["mean_layers"] <= ahead[0]["layers"] <= 3
 
 

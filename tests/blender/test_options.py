@@ -92,19 +92,21 @@ def test_named_lights_and_what_is_said_instead():
 
 
 @pytest.mark.parametrize(
-    ("layers", "options", "seconds"),
+    ("terms", "options", "seconds"),
     [
-        (10, SceneOptions(light=LightOptions(), samples=10, threads=2), (1e6 * 10 * 20.3e-6 + 8) / 2),
-        (10, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 223e-6 + 8),
-        (10, SceneOptions(threads=1), 1e6 * 10 * 19.3e-6),
-        (10, SceneOptions(engine="eevee"), None),
+        (0, SceneOptions(light=LightOptions(), samples=10, threads=2), (1e6 * 10 * 20.3e-6 + 8) / 2),
+        (8, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 223e-6 + 8),
+        (0, SceneOptions(threads=1), 1e6 * 10 * 19.3e-6),
+        (8, SceneOptions(threads=1), 1e6 * 10 * (19.3e-6 + 8 * 1.4e-6)),
+        (0, SceneOptions(engine="eevee"), None),
     ],
 )
-def test_the_estimate(layers, options, seconds):
+def test_the_estimate(terms, options, seconds):
     from meshsplats.blender.plan import estimated_seconds
 
     ahead = {
-        "mean_layers": layers,
+        "harmonics": terms,
+        "mean_layers": 10,
         "mean_square_layers": 1000,
         "samples": 10,
         "pixels": 10**6,

@@ -49,6 +49,16 @@ def test_files_without_a_start_camera_name_none(content):
     assert start_camera(content, HERE) is None
 
 
+def test_the_default_of_a_program_is_no_choice():
+    """splat-transform writes it for every scene: a bird 20 cm high is a dot in it."""
+    pose = {"position": [2, 2, -2], "target": [0, 0, 0], "fov": 75}
+    content = {"version": 2, "cameras": [{"initial": pose}]}
+    assert np.allclose(start_camera(content, HERE).center, [-2, -2, -2])
+    assert start_camera(content, HERE, chosen=True) is None
+    pose["target"] = [0, 0.5, 0]
+    assert start_camera(content, HERE, chosen=True) is not None
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -124,6 +124,9 @@ def test_a_start_camera_is_of_the_only_splats_of_its_folder(tmp_path):
     (tmp_path / "b.sog").touch()
     assert opening_beside(source) is None
     assert opening_beside(tmp_path) is not None
+    unchosen = {"camera": {"position": [2, 2, -2], "target": [0, 0, 0], "fov": 75}}
+    (tmp_path / "settings.json").write_text(json.dumps(unchosen))
+    assert opening_beside(tmp_path) is None
     (tmp_path / "settings.json").write_text(json.dumps({"camera": {"position": [1], "target": [0, 0, 0]}}))
     with pytest.warns(DataWarning, match="the start camera is not used"):
         assert opening_beside(tmp_path) is None

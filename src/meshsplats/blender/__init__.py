@@ -72,7 +72,8 @@ def draw(
         options: unlit in Cycles by default.
         executable: an installed Blender, 4.2 or newer; the module bpy of this environment by default.
         announce: called once before Blender starts, with the size of the work: ``{"triangles", "layers",
-            "bounce_limit", "samples" per pixel, "pixels" of all images, "mean_layers" of a pixel}``.
+            "bounce_limit", "samples" per pixel, "pixels" of all images, "mean_layers" of a pixel,
+            "harmonics": terms of colours that depend on the view}``.
         progress: called whenever Blender reports progress.
 
     Returns:
@@ -127,6 +128,7 @@ def draw(
             "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
             "mean_layers": mean,
             "mean_square_layers": mean_square,
+            "harmonics": 0 if finest.harmonics is None else finest.harmonics.shape[1],
         }
         if announce is not None:
             announce(ahead)

@@ -53,14 +53,16 @@ def duration(seconds: float) -> str:
 def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:
     """Estimated time with Cycles, from the plan of ``draw``; None for EEVEE. Fitted to processor times of
     Blender 4.2 and 4.5 (docs/blender.md): a ray that meets m layers costs 1.1 m + 0.0083 m^2 microseconds,
-    as each layer is searched for among those around it, and lit one more for the ground. Before a lit image
+    as each layer is searched for among those around it, 0.14 m more for each term of colours that depend on
+    the view, and lit one more for the ground. Before a lit image
     come the stand-in, colours and baked light."""
     if options.engine != "cycles":
         return None
     from meshsplats._core.library import processors
 
     lit = options.light is not None
-    ray = 1.1e-6 * ahead["mean_layers"] + 8.3e-9 * ahead["mean_square_layers"] + (1e-6 if lit else 0)
+    layer = 1.1e-6 + (0 if lit else 0.14e-6 * ahead.get("harmonics", 0))
+    ray = layer * ahead["mean_layers"] + 8.3e-9 * ahead["mean_square_layers"] + (1e-6 if lit else 0)
     pixel = ray * ahead["samples"] + (20e-6 if options.denoise else 0)
     busy = pixel * ahead["pixels"] + 1e-6 * ahead["triangles"]
     return (busy + sum(phase_seconds(ahead, options).values())) / (options.threads or processors())

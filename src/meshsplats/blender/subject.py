@@ -18,8 +18,8 @@ from meshsplats.conversion.recovery import splats_of
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
-_VIEWS = 24
-"""Views that are looked for within a place."""
+VIEWS = 24
+"""Views that are looked for within a place, for light on it."""
 _FLOOR = 0.002
 """Share of the opacity that may lie below the ground: strays must not lift the subject off it."""
 
@@ -133,16 +133,18 @@ def lit_subject(
     mesh: SplatMesh,
     cameras: Sequence[Camera] = (),
     *,
+    within: Sequence[Camera] | None = None,
     effort: Effort = CAREFUL,
     threads: int | None = None,
     announce: Announce = lambda phase: None,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Arrays and facts that a lit mesh has besides or instead of those of an unlit one, by the names of
     ``inside.scene.Subject``. A mesh prior, whose shape changes, has no stand-in. They are made of images from
-    around the mesh and from ``cameras``; of a place, also from views from within."""
+    around the mesh and from ``cameras``; of a place, also from views ``within`` it, which are looked for
+    where they are None; an object has none."""
     mesh = mesh.plain
     announce("colours")
-    cameras = [*cameras, *_views_within(mesh, threads)]
+    cameras = [*cameras, *(_views_within(mesh, threads) if within is None else within)]
     lit, self_shadow = lit_arrays(mesh, cameras, effort=effort, threads=threads, announce=announce)
     arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
     if mesh.binding is None:
@@ -156,7 +158,7 @@ def _views_within(mesh: SplatMesh, threads: int | None) -> Sequence[Camera]:
     """Views from within a place, found in the splats of ``mesh``; none of an object, or without splats. From
     around it, one sees walls from behind, and the noise that no photograph saw."""
     cloud = splats_of(mesh)
-    views = cloud and default_views(cloud, None, _VIEWS, side=(400, 400), threads=threads)
+    views = cloud and default_views(cloud, None, VIEWS, side=(400, 400), threads=threads)
     return views[0] if views else []
 
 

@@ -24,12 +24,18 @@ NEAR_SHARE = 0.02
 """Near plane as a share of the distance of the target."""
 _SIDE = 800
 _MOST = 1e9
+_DEFAULT = np.array([[2.0, 2.0, -2.0], [0.0, 0.0, 0.0]])
+"""Position and target that PlayCanvas's splat-transform 2 writes for every scene, of any size."""
 _HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 
-def start_camera(content: object, path: Path) -> Camera | None:
+def start_camera(content: object, path: Path, *, chosen: bool = False) -> Camera | None:
     """The camera with which the viewer starts, of a square image; None if the ``content`` of the JSON file
-    ``path`` names none, or is another program's. Raises FileFormatError for a camera that is broken."""
+    ``path`` names none, or is another program's. ``chosen``: None, too, for the default of the program that
+    writes such files, which knows nothing of the scene.
+
+    Raises FileFormatError for a camera that is broken.
+    """
     if not isinstance(content, dict):
         return None
     pose, cameras = content.get("camera"), content.get("cameras")
@@ -37,7 +43,10 @@ def start_camera(content: object, path: Path) -> Camera | None:
         pose = cameras[0].get("initial") if isinstance(cameras[0], dict) else None
     if not isinstance(pose, dict) or not ("position" in pose and "target" in pose):
         return None
-    place, target = (_HALF_TURN * _point(pose, key, path) for key in ("position", "target"))
+    points = np.array([_point(pose, key, path) for key in ("position", "target")])
+    if chosen and (points == _DEFAULT).all():
+        return None
+    place, target = _HALF_TURN * points
     fov = pose.get("fov") or FOV
     if type(fov) not in (int, float) or not 1 <= fov <= 170:
         raise FileFormatError(

@@ -30,7 +30,8 @@ def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (
     or if there is no file or folder of them.
 
     It is the first camera inside a glTF file, or the start camera of SuperSplat's viewer: that of a
-    ``settings.json`` in the folder, which has no other splats. A DataWarning says where it cannot be read.
+    ``settings.json`` in the folder, which has no other splats, unless nobody chose it. A DataWarning says
+    where it cannot be read.
     """
     if source is None:
         return None
@@ -40,7 +41,7 @@ def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (
         if source.is_file() and source.suffix.lower() in (".glb", ".gltf"):
             camera = next(iter(cameras_in_gltf(source)), None)
         elif path.is_file() and (folder == source or len(files_named(folder, splat_suffixes())) <= 1):
-            camera = start_camera(read_json(path), path)
+            camera = start_camera(read_json(path), path, chosen=True)
         else:
             return None
     except FileFormatError as error:

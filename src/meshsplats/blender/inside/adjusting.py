@@ -81,6 +81,26 @@ def adjust(data: Any, change: Adjustment) -> None:
     data.update()
 
 
+def kept_colors(data: Any) -> dict[str, np.ndarray]:
+    """All colours of the vertices of the mesh ``data`` by name, those that depend on the view, too; (v, 4)
+    float32 each. ``put_back`` takes them."""
+    return {name: meshes.read_colors(data, name) for name in _color_names(data)}
+
+
+def put_back(data: Any, kept: dict[str, np.ndarray]) -> None:
+    """Undoes what ``adjust`` has done to the mesh ``data`` since its colours were ``kept``."""
+    for name in _color_names(data):
+        if name in kept:
+            _store(data, name, kept[name])
+        else:
+            data.attributes.remove(data.attributes[name])
+    data.update()
+
+
+def _color_names(data: Any) -> list[str]:
+    return [a.name for a in data.attributes if a.data_type == "FLOAT_COLOR" and a.domain == "POINT"]
+
+
 def _store(data: Any, name: str, colors: np.ndarray) -> None:
     attribute = data.attributes.get(name) or data.attributes.new(name, "FLOAT_COLOR", "POINT")
     attribute.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())

@@ -98,6 +98,7 @@ def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collect
     if count in (0, len(faces)):
         raise ValueError(f"{'all' if count else 'none'} of the splats meet the conditions: nothing was cut")
     lit, fast = bool(obj.data[objects.LIT]), bool(obj.get(objects.ROUGH))
+    views = objects.views_within(obj) if lit else None
     made = None
     if separate:
         prepared = objects.prepare(mesh.take(np.flatnonzero(faces)), lit, fast=fast)
@@ -105,7 +106,7 @@ def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collect
         away = np.array(made.data[objects.ORIGIN]) - np.array(obj.data[objects.ORIGIN])
         made.matrix_world = obj.matrix_world.copy()
         made.location = obj.matrix_world @ type(made.location)(away.tolist())
-    objects.replace_mesh(obj, objects.prepare(mesh.take(np.flatnonzero(~faces)), lit, fast=fast))
+    objects.replace_mesh(obj, objects.prepare(mesh.take(np.flatnonzero(~faces)), lit, fast=fast, views=views))
     return made
 
 

@@ -164,12 +164,16 @@ def face_middles(mesh: Any) -> np.ndarray:
 
 def world_points(obj: Any) -> np.ndarray:
     """(k, 3) float64 sample of the visible vertices of ``obj``, in Blender's world."""
+    world = np.array(obj.matrix_world)
+    return local_points(obj) @ world[:3, :3].T + world[:3, 3]
+
+
+def local_points(obj: Any) -> np.ndarray:
+    """(k, 3) float64 sample of the visible vertices of ``obj``, in its own frame."""
     data = obj.data
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
     points = vertices.reshape(-1, 3).astype(np.float64)
     if COLOR in data.attributes and len(points):
         points = points[read_colors(data, COLOR)[:, 3] > _VISIBLE]
-    points = points[:: -(-max(len(points), 1) // SAMPLE)]
-    world = np.array(obj.matrix_world)
-    return points @ world[:3, :3].T + world[:3, 3]
+    return points[:: -(-max(len(points), 1) // SAMPLE)]

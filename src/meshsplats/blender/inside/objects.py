@@ -18,11 +18,13 @@ from meshsplats.blender.inside import (
     rendering,
     stand_ins,
     versions,
+    views,
 )
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import CAREFUL, FAST, LightOptions
 from meshsplats.blender.subject import Announce, lit_subject, lowest, vertex_harmonics
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.baking import bake_filter
@@ -48,11 +50,17 @@ ROUGH = "meshsplats_rough"
 
 
 def prepare(
-    mesh: SplatMesh, lit: bool, *, fast: bool = False, announce: Announce = lambda phase: None
+    mesh: SplatMesh,
+    lit: bool,
+    *,
+    fast: bool = False,
+    views: Sequence[Camera] | None = None,
+    announce: Announce = lambda phase: None,
 ) -> dict[str, Any]:
     """Everything that takes time and does not touch Blender, so that it may run in another thread. Coplanar
     layers of a mesh prior are separated, as in exports; a filter is baked for images of the whole subject.
-    ``fast``: a lit mesh for a preview. ``announce`` is told the phases of a lit one, and may raise."""
+    ``fast``: a lit mesh for a preview. ``views``: those within a place, as in ``lit_subject``. ``announce``
+    is told the phases of a lit one, and may raise."""
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
         mesh = prior.pose(lift=prior.export_lift)
@@ -67,11 +75,12 @@ def prepare(
         "harmonics": vertex_harmonics(shown),
     }
     if lit:
-        made, facts = lit_subject(mesh, effort=FAST if fast else CAREFUL, announce=announce)
+        made, facts = lit_subject(mesh, within=views, effort=FAST if fast else CAREFUL, announce=announce)
         arrays |= made | facts
+    below = foot(mesh) if len(mesh.faces) else np.zeros(3)
+    arrays |= {"mesh": mesh, "lit": lit, "fast": fast, "layers": most_layers(mesh), "foot": below}
     # Splats on a base keep the base's frame.
-    origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
-    return arrays | {"mesh": mesh, "lit": lit, "fast": fast, "layers": most_layers(mesh), "origin": origin}
+    return arrays | {"origin": np.zeros(3) if mesh.binding is not None else below}
 
 
 def foot(mesh: SplatMesh) -> np.ndarray:
@@ -93,6 +102,13 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
         priors.give_base(obj, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = obj
     return obj
+
+
+def foot_of(root: Any, prepared: dict[str, Any]) -> Any:
+    """Where the foot of the splats that ``add`` has made of ``prepared`` is, Blender's world: a Vector.
+    ``root``: their object, or that of the base that they follow."""
+    rotation = frame.to_blender(prepared["mesh"].up)
+    return root.location + type(root.location)((rotation @ (prepared["foot"] - prepared["origin"])).tolist())
 
 
 def add_chain(
@@ -148,9 +164,17 @@ def renew_light(scene: Any, objs: Iterable[Any], *, fast: bool = False) -> list[
     found = []
     for obj in objs:
         if needs_light(obj, fast=fast):
-            replace_mesh(obj, prepare(as_splat_mesh(obj), True, fast=fast))
+            replace_mesh(obj, prepare(as_splat_mesh(obj), True, fast=fast, views=views_within(obj)))
             found.append(obj.name)
     return found
+
+
+def views_within(obj: Any) -> list[Camera] | None:
+    """The views of the place ``obj`` from within that its import has found, for ``prepare``, in the frame of
+    ``as_splat_mesh``; None where they are to be looked for."""
+    origin = np.array(obj.data.get(ORIGIN, (0, 0, 0)), np.float64)
+    # All levels of a chain stand where the finest does, which has them.
+    return views.within(obj, origin) or views.within(levels.with_levels(obj)[0], origin)
 
 
 def needs_light(obj: Any, *, fast: bool = False) -> bool:

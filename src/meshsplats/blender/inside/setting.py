@@ -4,46 +4,24 @@ up."""
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, frame, meshes, objects, scene, stage
+from meshsplats.blender.inside import baking, meshes, objects, scene, stage, views
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import CAREFUL, FAST, LIGHTS, LightOptions
 from meshsplats.blender.subject import ground_height, lowest
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 
 UP = (0.0, 0.0, 1.0)
-VIEW = "MeshSplats view"
-"""Name of an object's property: a view of a place from within, as ``remember_view`` stores it."""
 _AWAY = 2.5
 """Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
 _START_CAMERA = (7.3589, -6.9258, 4.9583)
 """Where the camera stands that Blender starts with."""
 _ROOM = 1.1
 """Half the height of an image, in radii of the subject that the camera is moved to."""
-
-
-class View(NamedTuple):
-    """A view of a place from within, in Blender's world."""
-
-    pose: np.ndarray
-    """(4, 4) camera to world; Blender's cameras look along -z."""
-    half: float
-    """Tangent of half the angle that is to be seen at least."""
-    near: float
-    """What is nearer is not to be seen."""
-    away: float
-    """Distance of the middle of the place."""
-
-    def camera(self, width: int, height: int) -> Camera:
-        """As a camera of images of this size."""
-        focal = min(width, height) / (2 * self.half)
-        matrix = frame.world_to_camera(self.pose)
-        return Camera(matrix, focal, focal, width / 2, height / 2, width, height, near=self.near)
 
 
 def set_up(
@@ -72,7 +50,7 @@ def set_up(
     viewer = None
     if camera:
         width, height = view.render.resolution_x, view.render.resolution_y
-        within = view_from_within(objs)
+        within = views.opening(objs)
         if within is None:
             seen = orbit(points, 1, elevation=15, azimuth=20, up=UP, width=width, height=height)[0]
         else:
@@ -138,30 +116,7 @@ def frame_in_start_camera(scene: Any, objs: list[Any]) -> None:
     lens.clip_end = max(lens.clip_end, away + 100 * bounds.radius)
 
 
-def remember_view(obj: Any, view: Camera) -> None:
-    """Stores with the place ``obj`` a ``view`` of it from within, relative to the object's origin."""
-    half = max(view.width / view.fx, view.height / view.fy) / 2
-    obj[VIEW] = [*frame.camera_pose(view, np.eye(3)).ravel().tolist(), half, view.near or 0.0]
-
-
-def view_from_within(objs: list[Any]) -> View | None:
-    """The view that is stored with one of ``objs``, where that stands now; None of objects, which are seen
-    from around."""
-    for obj in objs:
-        stored = np.array(obj.get(VIEW, ()), np.float64)
-        if stored.shape != (18,) or not np.isfinite(stored).all() or stored[16] <= 0:
-            continue
-        pose = np.array(obj.matrix_world) @ stored[:16].reshape(4, 4)
-        scale = np.linalg.norm(pose[:3, :3], axis=0)
-        if scale.all():
-            pose[:3, :3] /= scale
-            away = float(np.linalg.norm(scene_bounds(meshes.world_points(obj)).center - pose[:3, 3]))
-            near = min(stored[17] * scale[0], away / 10) or away / 1000
-            return View(pose, float(stored[16]), near, away)
-    return None
-
-
-def look_from(view: View, windows: Any, scene: Any) -> None:
+def look_from(view: views.View, windows: Any, scene: Any) -> None:
     """Shows a place by ``view``, in the 3D views of ``windows`` and by the camera that Blender starts with,
     in a file that was not saved yet."""
     from mathutils import Matrix
