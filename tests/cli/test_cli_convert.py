@@ -355,6 +355,17 @@ def material(path) -> dict:
     return GltfDocument(path).json["materials"][0]
 
 
+def test_a_file_that_no_viewer_opens_says_so(tmp_path, capsys, monkeypatch):
+    source = tmp_path / "balls.ply"
+    save_gaussians(nested_balls(0.5), source)
+    for limit, said in ((10**6, False), (1000, True)):
+        monkeypatch.setattr("meshsplats.cli.convert.LARGE_BYTES", limit)
+        assert run(source, "-o", tmp_path / "m.glb", "--no-preview", "--force") == 0
+        assert ("too large for viewers" in capsys.readouterr().out) == said
+    assert run(source, "-o", tmp_path / "m.npz", "--no-preview") == 0
+    assert "too large" not in capsys.readouterr().out
+
+
 def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     source, out = tmp_path / "balls.ply", tmp_path / "m.glb"
     save_gaussians(nested_balls(0.95), source)

@@ -58,6 +58,12 @@ from meshsplats.jobs import Job, formats_of, is_batch, jobs, sources, without_re
 
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
+LARGE_BYTES = 1_000_000_000
+TOO_LARGE = (
+    "too large for viewers in browsers, and for most engines: --max-triangles 2000000 merges splats first,"
+    " `meshsplats tiles` keeps them all"
+)
+"""Of a .glb of more than ``LARGE_BYTES``: viewers in browsers hold it in memory, more than once."""
 ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 """What meshes for a depth buffer gain in three.js with MSAA: docs/viewers.md."""
 ORDER_GAIN = "7 to 10 dB in three.js and Babylon.js in half a minute; not for ray tracers and CesiumJS"
@@ -246,6 +252,8 @@ class Convert(Command):
             words["solve order"] = "solved the order"
             times = [f"{words[name]} {value:.2f} s" for name, value in result["seconds"].items() if value]
             lines = [_counts(result), f"{made}: {', '.join(times)}"]
+            if self.output.suffix.lower() == ".glb" and self.output.stat().st_size > LARGE_BYTES:
+                lines.append(TOO_LARGE)
             if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
