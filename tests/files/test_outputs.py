@@ -244,20 +244,20 @@ def test_two_processes_one_output(tmp_path):
 
 
 _HANGING_PREVIEW = """
-import sys, time, meshsplats.cli.{0}
+import sys, time, meshsplats.cli, meshsplats.{0}
 def hang(*_, **__):
     print("drawing", flush=True)
     time.sleep(60)
-meshsplats.cli.{0}.{1} = hang
+meshsplats.{0}.{1} = hang
 sys.exit(meshsplats.cli.main(sys.argv[1:]))
 """
 
 
 def killed_in_the_preview(
-    folder: Path, *arguments: str, function: str = "draw_preview", module: str | None = None
+    folder: Path, *arguments: str, function: str = "draw_preview", module: str = ""
 ) -> None:
     """Runs a command there that is killed when its result is written and its preview is not."""
-    code = _HANGING_PREVIEW.format(module or arguments[0], function)
+    code = _HANGING_PREVIEW.format(module or f"cli.{arguments[0]}", function)
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments], cwd=folder, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -288,7 +288,9 @@ def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, opti
 @posix
 def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, monkeypatch):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    killed_in_the_preview(tmp_path, "clean", "scene.ply", "-o", "out.ply", function="save_strip")
+    killed_in_the_preview(
+        tmp_path, "clean", "scene.ply", "-o", "out.ply", function="save_strip", module="edits"
+    )
     killed_in_the_preview(tmp_path, "simplify", "scene.ply", "-o", "out.ply", "--share", "0.5")
     assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == ["scene.ply"]
     monkeypatch.setattr(atomic, "_swept", set())
@@ -299,7 +301,7 @@ def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, mo
 @posix
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    code = _HANGING_PREVIEW.format("convert", "draw_preview")
+    code = _HANGING_PREVIEW.format("cli.convert", "draw_preview")
     arguments = ["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.glb")]
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True
@@ -320,7 +322,7 @@ def test_a_run_that_is_killed_in_its_preview_is_resumed_whole(tmp_path):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
     options = ["--steps", "2", "--views", "2", "--held-out", "1", "--width", "16"]
     words = ["finetune", "scene.ply", "-o", "tuned.npz", *options]
-    killed_in_the_preview(tmp_path, *words, module="training")
+    killed_in_the_preview(tmp_path, *words, module="cli.training")
     assert [name for name in os.listdir(tmp_path) if name.startswith("tuned")] == ["tuned.npz.run"]
     words[1], words[3] = str(tmp_path / "scene.ply"), str(tmp_path / "tuned.npz")
     assert main([*words, "--resume"]) == 0

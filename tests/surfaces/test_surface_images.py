@@ -196,6 +196,29 @@ def test_charts_of_an_atlas_do_not_overlap():
     assert GUTTER >= 2
 
 
+@needs_atlas
+def test_what_the_library_of_atlases_gives_up_with_is_an_error(monkeypatch):
+    import uvunwrap
+
+    class PanicException(BaseException):
+        pass
+
+    class Other(BaseException):
+        pass
+
+    def panic(*arguments, **options):
+        raise raised("index out of bounds")
+
+    monkeypatch.setattr(uvunwrap, "generate", panic)
+    points, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]])
+    raised = PanicException
+    with pytest.raises(ValueError, match=r"uvunwrap fails for the 1 triangles .*\(index out of bounds\)"):
+        unwrap(points, faces, 64)
+    raised = Other
+    with pytest.raises(Other):
+        unwrap(points, faces, 64)
+
+
 def test_texels_that_nobody_saw_are_filled_from_near():
     texels = np.zeros((40, 33, 3), np.float32)
     texels[:, :16] = [1, 0, 0]

@@ -15,7 +15,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
     that do not overlap, at least ``GUTTER`` texels apart in a texture of ``side`` x ``side``.
 
     Raises:
-        ValueError: the charts do not fit.
+        ValueError: the charts do not fit, or the library fails.
         MissingDependencyError: the library of the extra ``base`` is missing.
     """
     try:
@@ -32,6 +32,14 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
         )
     except uvunwrap.UnwrapError as error:
         raise ValueError(f"the surface does not fit into a texture of {side} texels: {error}") from error
+    except BaseException as error:
+        # A panic of compiled code is no Exception: uvunwrap 0.3 with 120,000 faces of a flat.
+        if type(error).__name__ != "PanicException":
+            raise
+        raise ValueError(
+            f"uvunwrap fails for the {len(faces):,} triangles of this surface ({error}): choose another"
+            " number of faces"
+        ) from error
     if atlas.page_count > 1:
         raise ValueError(
             f"the surface needs {atlas.page_count} textures of {side} texels: choose fewer faces or"
