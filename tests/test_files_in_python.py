@@ -24,6 +24,7 @@ from meshsplats.datasets.scene_views import SceneViews, check_photographs
 from meshsplats.edits import BakingOptions, Callbacks, SimplifyOptions, bake_file, clean_file, simplify_file
 from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.evaluation.comparison_files import ComparisonOptions, save_comparison
+from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.file_conversion import Product
 from meshsplats.finetuning.file_tuning import FileTuning, StartOptions
 from meshsplats.finetuning.plans import RunResult
@@ -181,6 +182,32 @@ def test_scores_are_a_folder(files):
         ScoringOptions().check([files / "m.npz"])
     with pytest.raises(OptionsError, match="tune is for protocol"):
         replace(options, tune="paper").check([files / "m.npz"])
+    wrong = Scoring(replace(options, amplify=-1.0), files / "wrong")
+    with pytest.raises(OptionValueError, match="amplify must be positive"):
+        wrong.run([files / "m.npz"])
+    with pytest.raises(OptionsError, match="give protocol, and data with its scenes"):
+        Scoring(options, files / "wrong").run_benchmark(files, Workers)
+    assert not (files / "wrong").exists()
+
+
+@pytest.mark.parametrize(
+    ("check", "message"),
+    [
+        (lambda a: ImageOptions(depth="jpg").check(a), "depth must be one of none, png, npy, got 'jpg'"),
+        (lambda a: ComparisonOptions(look="real").check(), "look must be one of area, splats, got 'real'"),
+        (lambda a: ScoringOptions(network="vgg16").check([a]), "network must be one of vgg, alex"),
+        (lambda a: MeshFileOptions(alpha="solid").check(["glb"]), "alpha must be one of auto, blend"),
+        (lambda a: Product(spz_version=5).check(["spz"], [a], a), "spz_version must be one of 3, 4, got 5"),
+        (lambda a: Product(origin="world").check(["glb"], [a], a), "origin must be 'keep', 'local' or three"),
+        (lambda a: placed(few_splats(), "world"), "origin must be 'keep', 'local' or three"),
+        (lambda a: ChainOptions(format="fbx").check(), "format must be one of glb"),
+        (lambda a: PictureOptions(lights="moon").scene_options(a), "lights must be one of sun, noon"),
+        (lambda a: LayingOptions(colors="red").check(), "colors must be one of auto, texture"),
+    ],
+)
+def test_words_that_no_option_has_are_refused_before_the_work(check, message):
+    with pytest.raises(ValueError, match=message):
+        check(Path("a.png"))
 
 
 def test_a_page_shows_a_file(files):

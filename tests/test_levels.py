@@ -234,6 +234,12 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
     assert "--resume continues it, --force starts again" in capsys.readouterr().err
     assert run(splats, "-o", out, "--no-tune", "--width", 80, "--levels", 2, "--resume") == 2
     assert "was started with --width 64, not 80" in capsys.readouterr().err
+    record = tmp_path / "chain.partial" / "config.toml"
+    kept = record.read_text()
+    record.write_text(kept.replace('command = "levels"', 'command = "tiles"'))
+    assert run(splats, "-o", out, *QUICK, "--resume") == 2
+    assert "is not of this command" in capsys.readouterr().err
+    record.write_text(kept)
     assert run(splats, "-o", out, *QUICK, "--resume") == 0
     assert (out / "level_0.glb").stat().st_mtime_ns == first
     assert (out / "level_1.glb").is_file()

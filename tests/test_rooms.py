@@ -13,11 +13,14 @@ ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 13
 LOWEST = (
     *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options", "_origin"),
-    *("_toml", "_words", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
+    *("_toml", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
 )
 """Rooms that import no other room."""
 FLOORS = (
-    ("_json", "_option_values", "binding", "camera", "cluster", "draw_order", "gaussians", "mesh_joining"),
+    (
+        *("_json", "_option_values", "_words", "binding", "camera", "cluster", "draw_order", "gaussians"),
+        "mesh_joining",
+    ),
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),

@@ -132,7 +132,7 @@ class Setting:
         if value is None and self.optional:
             return
         if self.choices and value not in self.choices:
-            raise ValueError(f"{self.name} must be one of {', '.join(self.choices)}, got {value!r}")
+            raise ValueError(f"{self.name} must be one of {', '.join(map(str, self.choices))}, got {value!r}")
         if bool in self.kinds and not isinstance(value, bool):
             raise ValueError(f"{self.name} must be True or False, got {value!r}")
         if limits is not None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from meshsplats.errors import OptionValueError
+
 NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "white": (1.0, 1.0, 1.0),
     "black": (0.0, 0.0, 0.0),
@@ -13,7 +15,8 @@ NAMED_COLORS: dict[str, tuple[float, float, float]] = {
 
 
 def parse_up(text: str) -> np.ndarray:
-    """(3,) direction from ``-y``, ``+z``, ``x`` or ``x,y,z``. Raises ValueError for anything else."""
+    """(3,) direction from ``-y``, ``+z``, ``x`` or ``x,y,z``, the value of an option ``up``.
+    OptionValueError for anything else."""
     axis = text.lower().lstrip("+-")
     if axis in ("x", "y", "z") and len(text) <= 2:
         direction = np.zeros(3)
@@ -21,7 +24,9 @@ def parse_up(text: str) -> np.ndarray:
         return direction
     numbers = _numbers(text)
     if numbers is None or not any(numbers):
-        raise ValueError(f"--up must be an axis such as -y or z, or three numbers x,y,z, got {text!r}")
+        raise OptionValueError(
+            f"``up`` must be an axis such as -y or z, or three numbers x,y,z, got {text!r}"
+        )
     return np.array(numbers)
 
 
@@ -39,7 +44,8 @@ def direction_in_words(direction: np.ndarray) -> str:
 
 
 def parse_color(text: str) -> tuple[float, float, float]:
-    """RGB in [0, 1] from a name, ``#rrggbb`` or ``r,g,b``. Raises ValueError for anything else."""
+    """RGB in [0, 1] from a name, ``#rrggbb`` or ``r,g,b``, the value of an option ``background``.
+    OptionValueError for anything else."""
     if text.lower() in NAMED_COLORS:
         return NAMED_COLORS[text.lower()]
     if text.startswith("#") and len(text) == 7 and all(c in "0123456789abcdefABCDEF" for c in text[1:]):
@@ -47,8 +53,8 @@ def parse_color(text: str) -> tuple[float, float, float]:
         return red, green, blue
     numbers = _numbers(text)
     if numbers is None or not all(0 <= v <= 1 for v in numbers):
-        raise ValueError(
-            f"--background must be {', '.join(NAMED_COLORS)}, #rrggbb, or r,g,b from 0 to 1, got {text!r}"
+        raise OptionValueError(
+            f"``background`` must be {', '.join(NAMED_COLORS)}, #rrggbb, or r,g,b from 0 to 1, got {text!r}"
         )
     return numbers
 

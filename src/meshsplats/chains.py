@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from meshsplats._files.atomic import in_words, replace_folder, write_text
+from meshsplats._options import check_options
 from meshsplats.errors import OptionsError
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions, make_config
@@ -73,6 +74,7 @@ class ChainOptions:
 
     def check(self) -> None:
         """OptionsError for options that are out of range or have no effect."""
+        check_options(self)
         if self.levels < 1:
             raise OptionsError(f"``levels`` must be at least 1, got {self.levels}")
         if self.max_splats is not None and self.max_splats < 1:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from meshsplats._files.atomic import together
-from meshsplats._options import Advanced, changed
+from meshsplats._options import Advanced, changed, check_options
 from meshsplats._words import optional_up
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
@@ -31,6 +31,7 @@ from meshsplats.formats.gaussians import save_gaussian_blocks, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh_blocks
 from meshsplats.formats.outputs import (
     WantedOrigin,
+    check_origin,
     check_outputs,
     check_splat_endings,
     scaled,
@@ -138,6 +139,8 @@ class Product:
             raise OptionValueError(f"``fidelity`` must be a number of views, at least 1, got {self.fidelity}")
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise OptionValueError(f"``scale`` must be a number above 0, got {self.scale}")
+        check_options(self)
+        check_origin(self.origin)
         optional_up(self.up)
         if self.stream:
             self._check_stream(kinds, inputs)

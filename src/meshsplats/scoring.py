@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from meshsplats._options import check_options
 from meshsplats._origin import shared_origin
 from meshsplats._words import optional_color
 from meshsplats.cameras.files import load_cameras
@@ -102,6 +103,7 @@ class ScoringOptions:
     def check(self, meshes: Sequence[Path]) -> None:
         """OptionsError for options that contradict each other or have no effect, ValueError for values out of
         range. ``meshes``: what is scored; with ``protocol``, the folder of the scenes."""
+        check_options(self)
         optional_color(self.background)
         if self.amplify <= 0 or self.strips < 0:
             raise OptionValueError("``amplify`` must be positive and ``strips`` >= 0")
@@ -151,9 +153,11 @@ class Scoring:
     def run(self, paths: Sequence[Path], *, force: bool = False) -> Report:
         """Scores the meshes at ``paths`` and writes the files of them. ``force``: in place of older ones.
 
-        Raises what ``check_outputs`` raises, and FileFormatError for splats in place of a mesh.
+        Raises what ``ScoringOptions.check`` and ``check_outputs`` raise, and FileFormatError for splats in
+        place of a mesh.
         """
         chosen = self.options
+        chosen.check(paths)
         self.check_outputs(force)
         meshes = {name: self._load_mesh(path) for name, path in mesh_names(paths).items()}
         before = None if chosen.before is None else self._load_mesh(chosen.before)
@@ -186,10 +190,11 @@ class Scoring:
         force: bool = False,
     ) -> list[Report]:
         """Scores the scenes of the protocol in the folder ``models``, by ``workers`` of so many threads, and
-        writes the files of each and those of all. ``force``: in place of older ones."""
+        writes the files of each and those of all. ``force``: in place of older ones. Raises as ``run``."""
         chosen = self.options
-        assert chosen.data is not None
-        assert chosen.protocol is not None
+        chosen.check([models])
+        if chosen.protocol is None or chosen.data is None:
+            raise OptionsError("give ``protocol``, and ``data`` with its scenes")
         self.check_outputs(force)
         with workers(self.threads) as found:
             task, prepare = replace(self, threads=found.threads), convert_scene

@@ -409,6 +409,10 @@ def test_an_empty_scene_and_wrong_values_are_refused():
     )
     with pytest.raises(ValueError, match="the scene is empty"):
         find_cameras(nothing)
+    unseen = room(100, 10)
+    unseen = replace(unseen, opacities=np.zeros_like(unseen.opacities))
+    with pytest.raises(ValueError, match="no splat has any opacity"):
+        find_cameras(unseen, anywhere=True)
     with pytest.raises(ValueError, match="count must be at least 1"):
         find_cameras(room(100, 10), 0)
     with pytest.raises(ValueError, match="width and height"):

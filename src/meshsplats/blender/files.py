@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from meshsplats._options import changed
+from meshsplats._options import changed, check_options
 from meshsplats._words import parse_color
 from meshsplats.blender import draw
 from meshsplats.blender.launch import command
@@ -102,6 +102,7 @@ class PictureOptions:
             FileNotFoundError: the environment image is missing.
         """
         suffix = output.suffix.lower()
+        check_options(self)
         self.views.check()
         if suffix and suffix not in _FORMATS:
             known = ", ".join(_FORMATS)

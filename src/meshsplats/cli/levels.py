@@ -133,6 +133,8 @@ class Levels(Command):
             write_configuration(begin_folder(self.output) / CONFIGURATION, "levels", self)
             return
         unfinished = partial_folder(self.output)
-        differ = differences(unfinished / CONFIGURATION, "levels", self, _CHANGEABLE) or {}
+        differ = differences(unfinished / CONFIGURATION, "levels", self, _CHANGEABLE)
+        if differ is None:
+            raise UsageError(f"{unfinished} is not of this command: --force, not --resume, starts again")
         for name, (old, new) in differ.items():
             raise UsageError(f"{unfinished} was started with {flag(name)} {old}, not {new}")

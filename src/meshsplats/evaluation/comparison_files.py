@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import write_text
+from meshsplats._options import check_options
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import convert
@@ -53,6 +54,7 @@ class ComparisonOptions:
     def check(self) -> None:
         """OptionsError for options that contradict each other or have no effect, ValueError for values out of
         range, DeviceError or MissingDependencyError for a device that is not there."""
+        check_options(self)
         if not self.amplify > 0:
             raise OptionValueError(f"``amplify`` must be positive, got {self.amplify}")
         _ = self.draw.color  # which is checked

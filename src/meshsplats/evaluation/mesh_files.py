@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from meshsplats._options import Advanced
+from meshsplats._options import Advanced, check_options
 from meshsplats.camera import Camera
 from meshsplats.conversion.normals import shading_normals
 from meshsplats.draw_order import DrawOrder
@@ -59,6 +59,7 @@ class MeshFileOptions:
             OptionsError: options contradict each other or have no effect.
             ValueError: one is out of range.
         """
+        check_options(self)
         names = [f"mesh.{kind}" for kind in kinds]
         if self.lit and not any(takes(name, "lit") for name in names):
             raise OptionsError(f"``lit`` is for .glb and .usd files: .{kinds[0]} has no material")

@@ -15,7 +15,7 @@ from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
 from meshsplats._origin import lost_detail, sampled
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.errors import FileFormatError, OptionsError, OverwritingError
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, OverwritingError
 from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
 from meshsplats.formats.splat_formats import format_to_write, listed, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
@@ -86,7 +86,9 @@ def scaled(scene: Scene, factor: float | None) -> Scene:
 
 def placed(scene: Scene, origin: WantedOrigin) -> Scene:
     """``scene`` as it is to be written: with its origin ("keep"), without any ("local"), or relative to this
-    point of the world. OptionsError for a point that is too far away for float32."""
+    point of the world. OptionsError for a point that is too far away for float32, OptionValueError for any
+    other word."""
+    check_origin(origin)
     if isinstance(origin, str):
         return scene if origin == "keep" else replace(scene, origin=np.zeros(3))
     scene = scene.relative_to(origin)
@@ -94,6 +96,12 @@ def placed(scene: Scene, origin: WantedOrigin) -> Scene:
     if lost := lost_detail(sampled(places)):
         raise OptionsError(f"``origin``: too far from the scene; relative to that point, {lost}")
     return replace(scene, origin=np.zeros(3))
+
+
+def check_origin(origin: WantedOrigin) -> None:
+    """OptionValueError for a word that ``placed`` does not know."""
+    if isinstance(origin, str) and origin not in ("keep", "local"):
+        raise OptionValueError(f"``origin`` must be 'keep', 'local' or three numbers, got {origin!r}")
 
 
 def check_mesh_suffix(path: Path) -> None:

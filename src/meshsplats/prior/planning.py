@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._options import check_options
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.scene_files import SceneReading
@@ -49,7 +50,8 @@ class LayingOptions:
     """Image for the base's texture coordinates, if its file names none."""
 
     def check(self) -> None:
-        """OptionsError for options without effect."""
+        """OptionsError for options without effect, ValueError for values out of range."""
+        check_options(self)
         if self.texture is not None and self.colors not in ("auto", "texture"):
             raise OptionsError(f"``texture`` has no effect with ``colors`` {self.colors}")
         if self.spacing and self.layers == 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from meshsplats._files.atomic import write_bytes
-from meshsplats._options import changed
+from meshsplats._options import changed, check_options
 from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cluster import Workers, open_workers
@@ -59,6 +59,7 @@ class ImageOptions:
     def check(self, output: Path) -> None:
         """OptionsError for options that contradict each other or have no effect, ValueError for values out of
         range, DeviceError or MissingDependencyError for a device that is not there."""
+        check_options(self)
         self.views.check()
         color, draw = self.draw.color, self.draw
         if output.suffix.lower() != ".png" and output.suffix:

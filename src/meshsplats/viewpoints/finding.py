@@ -122,7 +122,7 @@ def find_cameras(
         anywhere: look for views also where the scene is an object.
         threads: at most this many; all processors by default.
 
-    Raises ValueError for an empty cloud or a value out of its range.
+    Raises ValueError for an empty cloud, one that is invisible from within, or a value out of its range.
     """
     need(GaussianCloud, cloud=cloud)
     if len(cloud) == 0:
@@ -139,6 +139,8 @@ def find_cameras(
         kind, confidence = kind_from_outside(cloud, first_up, threads)
         if kind == "object" and not anywhere:
             return _around(cloud, confidence, given, count, width, height)
+        if not cloud.opacities.any():
+            raise ValueError("no splat has any opacity: there is nothing to look at")
         sample = Sample(cloud, first_up, threads)
         places = find_places(sample)
         scene = _within(sample, places, kind, confidence, given)
