@@ -21,7 +21,14 @@ from meshsplats.cluster import Workers
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews, check_photographs
-from meshsplats.edits import BakingOptions, Callbacks, SimplifyOptions, bake_file, clean_file, simplify_file
+from meshsplats.edits import (
+    BakingOptions,
+    EditCallbacks,
+    SimplifyOptions,
+    bake_file,
+    clean_file,
+    simplify_file,
+)
 from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.evaluation.comparison_files import ComparisonOptions, save_comparison
 from meshsplats.evaluation.mesh_files import MeshFileOptions
@@ -238,7 +245,7 @@ def test_floaters_are_taken_out_of_a_file(files):
 
 def test_splats_of_a_file_are_merged(files):
     noted = []
-    callbacks = Callbacks(record=noted.append, draw=lambda cloud, path: noted.append(len(cloud)))
+    callbacks = EditCallbacks(record=noted.append, draw=lambda cloud, path: noted.append(len(cloud)))
     made = simplify_file(files / "s.ply", files / "out.ply", SimplifyOptions(share=0.5), callbacks)
     assert (made.read, len(made.kept), len(ms.load_gaussians(files / "out.ply"))) == (40, 20, 20)
     assert noted == [files / "out.ply.config.toml", 20]

@@ -1,4 +1,4 @@
-"""Directions and colours as users write them: options of commands, and what is printed."""
+"""Directions and colours as users write them, and counts: options of commands, and what is printed."""
 
 from __future__ import annotations
 
@@ -70,3 +70,8 @@ def _numbers(text: str) -> tuple[float, float, float] | None:
     except ValueError:
         return None
     return (x, y, z) if np.isfinite([x, y, z]).all() else None
+
+
+def plural(count: int, noun: str) -> str:
+    """``1 view``, ``1,200 views``."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")

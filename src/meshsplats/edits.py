@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import together
+from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.conversion import bake_filter, simplify
@@ -155,7 +156,7 @@ class Simplified:
 
 
 @dataclass(frozen=True)
-class Callbacks:
+class EditCallbacks:
     """What a program does for files of splats that appear together with its own."""
 
     place: Place = lambda scene: scene
@@ -169,7 +170,7 @@ def simplify_file(
     source: Path,
     output: Path,
     options: SimplifyOptions,
-    callbacks: Callbacks | None = None,
+    callbacks: EditCallbacks | None = None,
     *,
     reading: SceneReading | None = None,
     threads: int | None = None,
@@ -186,7 +187,7 @@ def simplify_file(
 
     Raises what ``SimplifyOptions.check`` and ``check_outputs`` raise, and FileFormatError for a mesh.
     """
-    own = callbacks or Callbacks()
+    own = callbacks or EditCallbacks()
     check_splat_endings(written_ending(output.name))
     options.check()
     preview, config = beside(output, PREVIEW), beside(output, CONFIGURATION)
@@ -236,7 +237,7 @@ class Baked:
         count, first = len(self.cameras), self.cameras[0]
         parts = [f"a filter of {self.filter_px2:g} px^2"] * (self.filter_px2 > 0)
         parts += [f"colours of degree {self.degree}"] * (self.degree > 0)
-        views = f"{count:,} view{'s'[: count != 1]} of {first.width} x {first.height}"
+        views = f"{plural(count, 'view')} of {first.width} x {first.height}"
         return f"{' and '.join(parts)} for {views}"
 
 

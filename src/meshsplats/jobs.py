@@ -13,11 +13,12 @@ from pathlib import Path
 from meshsplats._files.atomic import refuse_existing
 from meshsplats._files.locks import lock_of, locked
 from meshsplats.errors import FileFormatError, OptionsError, OverwritingError
-from meshsplats.formats.mesh_formats import mesh_format_to_write, mesh_suffixes, written_mesh_suffixes
+from meshsplats.formats.mesh_formats import mesh_format_to_write, mesh_suffixes
 from meshsplats.formats.outputs import (
     CONFIGURATION,
     PREVIEW,
     beside,
+    check_mesh_suffix,
     check_outputs,
     file_of,
     recorded_options,
@@ -184,12 +185,8 @@ def formats_of(output: Path, formats: Sequence[str], *, folder: bool, as_splats:
             where = f"``output`` {output.with_suffix('')}"
             raise OptionsError(f"several inputs or formats need a folder: {where}, say")
         return formats or (("ply",) if as_splats else ("glb",))
-    if not as_splats and mesh_format_to_write(output) is None:
-        known = ", ".join(written_mesh_suffixes())
-        raise OptionsError(
-            f"``output`` must end in {known}, got {output.name!r}; for a folder, name the formats:"
-            " ``formats`` glb"
-        )
+    if not as_splats:
+        check_mesh_suffix(output, "; for a folder, name the formats: ``formats`` glb")
     return ()
 
 

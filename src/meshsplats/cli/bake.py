@@ -10,9 +10,10 @@ from typing import Annotated
 
 import tyro
 
+from meshsplats._words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
-from meshsplats.cli.common import plural, size_of, written
+from meshsplats.cli.common import size_of, written
 from meshsplats.cli.images import ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.edits import BakingOptions, bake_file

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from meshsplats._words import plural
 from meshsplats.blender.files import PictureOptions, PictureRun, Pictures
 from meshsplats.blender.options import LightOptions
 from meshsplats.blender.plan import Lines, where
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
-from meshsplats.cli.common import PartOptions, SplatOptions, named, plural
+from meshsplats.cli.common import PartOptions, SplatOptions, named
 from meshsplats.cli.images import ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.progress import InBar, terminal_bar

@@ -135,10 +135,6 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], left: int =
     Console().print(table)
 
 
-def plural(count: int, noun: str) -> str:
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
-
-
 def draw_preview(
     scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None, **how: Any
 ) -> None:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options, of_presets, usage_errors
@@ -22,7 +23,6 @@ from meshsplats.cli.common import (
     again,
     draw_preview,
     named,
-    plural,
     say_origin,
     size_of,
     track,

@@ -9,9 +9,10 @@ from typing import Annotated
 
 import tyro
 
+from meshsplats._words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import plural, say_origin, size_of, track
+from meshsplats.cli.common import say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
 from meshsplats.formats.outputs import placed
 from meshsplats.mesh import SplatMesh

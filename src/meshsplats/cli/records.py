@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ def differences(
 
 
 def in_plain_words(command: Command, differ: Mapping[str, tuple[Any, Any]]) -> str:
-    """``differences`` in a line."""
+    """``differences`` in a line, values as they are typed."""
 
     def shown(value: Any) -> str:
         return (
@@ -69,10 +69,7 @@ def in_plain_words(command: Command, differ: Mapping[str, tuple[Any, Any]]) -> s
             else " ".join(map(str, value if isinstance(value, list) else [value]))
         )
 
-    return ", ".join(
-        f"{spelled(type(command), key)} was {shown(old)} and is {shown(new)}"
-        for key, (old, new) in differ.items()
-    )
+    return ", ".join(_compared(command, differ, shown))
 
 
 def changes_since(path: Path, name: str, command: Command, idle: Collection[str] = ()) -> str | None:
@@ -81,10 +78,7 @@ def changes_since(path: Path, name: str, command: Command, idle: Collection[str]
     differ = differences(path, name, command, idle)
     if differ is None:
         return None
-    found = [
-        f"{spelled(type(command), key)} was {_shown(old)} and is {_shown(new)}"
-        for key, (old, new) in sorted(differ.items())
-    ]
+    found = _compared(command, dict(sorted(differ.items())), _shown)
     version, today = toml.load(path).get("version"), meshsplats.__version__
     if version != today:
         found.append(f"MeshSplats was {version} and is {today}")
@@ -98,6 +92,16 @@ def _same(folder: Path, a: Any, b: Any) -> bool:
     if isinstance(a, str) and isinstance(b, str):
         return a == b or os.path.realpath(folder / a) == os.path.realpath(folder / b)
     return bool(a == b)
+
+
+def _compared(
+    command: Command, differ: Mapping[str, tuple[Any, Any]], shown: Callable[[Any], str]
+) -> list[str]:
+    """A clause for each of the options that ``differ``, with values as they are ``shown``."""
+    return [
+        f"{spelled(type(command), key)} was {shown(old)} and is {shown(new)}"
+        for key, (old, new) in differ.items()
+    ]
 
 
 def _shown(value: Any) -> str:

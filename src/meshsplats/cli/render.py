@@ -9,9 +9,10 @@ from typing import Annotated
 
 import tyro
 
+from meshsplats._words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
-from meshsplats.cli.common import ClusterOptions, PartOptions, SplatOptions, named, plural, track
+from meshsplats.cli.common import ClusterOptions, PartOptions, SplatOptions, named, track
 from meshsplats.cli.images import DrawOptions, ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration

@@ -13,7 +13,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, draw_preview, named, written
 from meshsplats.cli.records import write_configuration
-from meshsplats.edits import Callbacks, SimplifyOptions, simplify_file
+from meshsplats.edits import EditCallbacks, SimplifyOptions, simplify_file
 
 
 @as_cli_options(presets=False)
@@ -47,7 +47,7 @@ class Simplify(Command):
             self.input,
             self.output,
             self.merging,
-            Callbacks(
+            EditCallbacks(
                 place=partial(written, origin=self.origin),
                 record=lambda path: write_configuration(path, "simplify", self),
                 draw=draw_preview,

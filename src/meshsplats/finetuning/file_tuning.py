@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from meshsplats._options import Advanced
+from meshsplats._words import plural
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.selection import choose_splats
@@ -197,7 +198,7 @@ class FileTuning:
             triangles = len(mesh.faces)
             return Trained(mesh, mesh, {"triangles": triangles, "cells": count}, f"{triangles:,} triangles")
 
-        summary = f"{len(scene):,} splats in {count:,} cell{'s'[: count != 1]}"
+        summary = f"{len(scene):,} splats in {plural(count, 'cell')}"
         return Plan(None, dataset, summary, background, optimise)
 
     def _trained(self, tuned: on_splats.Tuned, config: FinetuneConfig) -> Trained:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import in_words
+from meshsplats._words import plural
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.finetuning.baseline import SizeScores
@@ -68,7 +69,7 @@ class Plan:
         if needed is None and self.mesh is not None:
             needed = check_memory(self.mesh, dataset, cache_bytes=cache_bytes)
         camera, count = dataset.train[0].camera, len(dataset.train)
-        text = f"{self.summary}; {count:,} training view{'s'[: count != 1]}, {len(dataset.test)} held out"
+        text = f"{self.summary}; {plural(count, 'training view')}, {len(dataset.test)} held out"
         text += f", of {camera.width} x {camera.height} pixels"
         if needed is not None:
             free = available_memory()

@@ -104,11 +104,11 @@ def check_origin(origin: WantedOrigin) -> None:
         raise OptionValueError(f"``origin`` must be 'keep', 'local' or three numbers, got {origin!r}")
 
 
-def check_mesh_suffix(path: Path) -> None:
-    """OptionsError if no mesh can be written under this name."""
+def check_mesh_suffix(path: Path, remedy: str = "") -> None:
+    """OptionsError, which ends with the ``remedy``, if no mesh can be written under this name."""
     if mesh_format_to_write(path) is None:
         known = ", ".join(written_mesh_suffixes())
-        raise OptionsError(f"``output`` must end in {known}, got {path.name!r}")
+        raise OptionsError(f"``output`` must end in {known}, got {path.name!r}{remedy}")
 
 
 def check_splat_endings(*kinds: str) -> None:

@@ -17,7 +17,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.rendering.api import Rendering, render_splats
-from meshsplats.viewpoints.thinning import ByPlace, largest, sizes_of
+from meshsplats.viewpoints.thinning import ByPlace, largest, sizes_of, without_harmonics
 
 SAMPLE = 50_000
 """Number of splats that panoramas show."""
@@ -76,7 +76,7 @@ class AllSplats:
 
     def __init__(self, cloud: GaussianCloud, threads: int | None) -> None:
         step = -(-len(cloud) // MOST)
-        self.cloud = cloud if step == 1 else _every(cloud, step)
+        self.cloud = cloud if step == 1 else without_harmonics(cloud, slice(None, None, step))
         self.threads, self.wider = threads, float(step) ** 0.5
         self.sizes = sizes_of(self.cloud.scales)
         self.reach = REACH * self.wider * largest(self.cloud.scales)
@@ -278,19 +278,6 @@ def merit(log_angle: np.ndarray, natural: float, finer: float) -> np.ndarray:
     off = log_angle - np.log(natural)
     bell = np.exp(-0.5 * (off / np.where(off < 0, finer, 0.8)) ** 2)
     return bell / (1 + (np.exp(log_angle) / COARSE) ** 2)
-
-
-def _every(cloud: GaussianCloud, step: int) -> GaussianCloud:
-    """Every so many splats of a cloud, without the harmonics that only colours need: most of its memory."""
-    rows = slice(None, None, step)
-    return GaussianCloud(
-        cloud.means[rows],
-        cloud.quaternions[rows],
-        cloud.scales[rows],
-        cloud.opacities[rows],
-        cloud.sh[rows, :1],
-        cloud.kernel,
-    )
 
 
 def _normals(cloud: GaussianCloud) -> np.ndarray:

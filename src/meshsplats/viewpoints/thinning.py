@@ -29,6 +29,18 @@ def sizes_of(scales: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(middle, 0) * most) + np.finfo(np.float32).tiny
 
 
+def without_harmonics(cloud: GaussianCloud, rows: slice | np.ndarray) -> GaussianCloud:
+    """Some splats of a cloud, without the harmonics that only colours need: most of its memory."""
+    return GaussianCloud(
+        cloud.means[rows],
+        cloud.quaternions[rows],
+        cloud.scales[rows],
+        cloud.opacities[rows],
+        cloud.sh[rows, :1],
+        cloud.kernel,
+    )
+
+
 class ByPlace:
     """Chooses the splats of a large scene that panoramas show, anew for each place.
 
@@ -43,28 +55,28 @@ class ByPlace:
         rng = np.random.default_rng(0)
         likely = probabilities(sizes_of(cloud.scales) * cloud.opacities, POOL)
         rows = np.flatnonzero(rng.random(len(cloud)) < likely)
-        self.pool = replace(cloud.take(rows), sh=cloud.sh[rows, :1])
+        self.pool = without_harmonics(cloud, rows)
         self.stands_for = 1 / likely[rows]
         """How many splats each of the pool stands for."""
         self.size = sizes_of(self.pool.scales).astype(np.float64)
         self.area = (self.size**2 * self.pool.opacities * self.stands_for).astype(np.float32)
         self.lot = rng.random(len(rows), np.float32)
-        self.thickness = -largest(-self.pool.scales)[:, None]
 
     def seen_from(self, place: np.ndarray, near: float) -> tuple[GaussianCloud, np.ndarray]:
         """The splats to show from ``place`` (3,), widened; and their sizes (k,) before that."""
         x, y, z = (self.pool.means[:, k] - np.float32(place[k]) for k in range(3))
         angle = self.area / np.maximum(x * x + y * y + z * z, np.float32(near) ** 2)
-        likely = np.clip(angle * _factor(angle[::SOME], self.most / len(angle)), LEAST_LIKELY, 1)
+        likely = probabilities(angle, self.most)
         rows = np.flatnonzero(self.lot < likely)
         thin = self.pool.take(rows)
         wider = (self.stands_for[rows] / likely[rows]).astype(np.float32)[:, None] ** 0.5
-        scales = np.where(thin.scales > self.thickness[rows], thin.scales * wider, thin.scales)
+        thickness = -largest(-thin.scales)[:, None]
+        scales = np.where(thin.scales > thickness, thin.scales * wider, thin.scales)
         return replace(thin, scales=scales), self.size[rows]
 
 
 def probabilities(value: np.ndarray, count: int) -> np.ndarray:
-    """(n,) float64 probabilities in proportion to ``value`` (n,), with a sum of about ``count``."""
+    """(n,) probabilities in proportion to ``value`` (n,), with a sum of about ``count``."""
     if count >= len(value):
         return np.ones(len(value))
     likely: np.ndarray = np.clip(value * _factor(value[::SOME], count / len(value)), LEAST_LIKELY, 1)
