@@ -17,6 +17,8 @@ _views = {}
 Only a view that turns has its splats sorted, or two viewports would do so in turn for ever."""
 _wanted = {}
 """By scene: the direction that its splats are to be sorted for, or None for no sorting."""
+_shown = {}
+"""By scene: the direction that its splats were sorted for last."""
 
 
 def has_splats(scene):
@@ -53,7 +55,7 @@ def before_drawing():
 
 
 def _want(scene, view):
-    _wanted[scene.name] = view
+    _wanted[scene.session_uid] = view
     if not bpy.app.timers.is_registered(sort):
         bpy.app.timers.register(sort, first_interval=0)
 
@@ -81,9 +83,11 @@ def sort():
     from meshsplats.blender.inside import far_to_near
 
     start = time.perf_counter()
-    for name, view in _wanted.items():
-        scene = bpy.data.scenes.get(name)
-        for obj in far_to_near.sorted_objects(scene) if scene is not None else []:
+    for scene in bpy.data.scenes:
+        if scene.session_uid not in _wanted:
+            continue
+        _shown[scene.session_uid] = view = _wanted[scene.session_uid]
+        for obj in far_to_near.sorted_objects(scene):
             far_to_near.look(far_to_near.modifier_of(obj), view)
     _wanted.clear()
     bpy.context.view_layer.update()
@@ -108,16 +112,38 @@ def after_frame(scene, depsgraph):
 
 @persistent
 def drop_copies(*_):
-    """Before a file is saved, and when another one or another state of it was loaded: no sorted copies."""
+    """Before a file is saved, and when another one was loaded: no sorted copies."""
     _views.clear()
+    _shown.clear()
+    _drop_copies()
+
+
+def _drop_copies():
     if any(map(has_splats, bpy.data.scenes)):
         from meshsplats.blender.inside import far_to_near
 
         far_to_near.drop_copies()
 
 
+@persistent
+def after_undo(*_):
+    """When another state of the file was loaded, with copies of then and splats sorted for a view of then:
+    they are sorted for that of now before it is drawn. Viewports that have not turned ask for nothing
+    more."""
+    _drop_copies()
+    for scene in bpy.data.scenes:
+        if has_splats(scene) and scene.session_uid in _shown:
+            _want(scene, _shown[scene.session_uid])
+    sort()  # leaves it to the timer while an image is rendered
+
+
 _handle = None
-_DROP = ("save_pre", "load_post", "undo_post", "redo_post")
+_HANDLERS = {
+    "save_pre": drop_copies,
+    "load_post": drop_copies,
+    "undo_post": after_undo,
+    "redo_post": after_undo,
+}
 
 
 def register():
@@ -125,14 +151,14 @@ def register():
     _handle = bpy.types.SpaceView3D.draw_handler_add(before_drawing, (), "WINDOW", "PRE_VIEW")
     bpy.app.handlers.depsgraph_update_post.append(after_update)
     bpy.app.handlers.frame_change_post.append(after_frame)
-    for name in _DROP:
-        getattr(bpy.app.handlers, name).append(drop_copies)
+    for name, handler in _HANDLERS.items():
+        getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister():
     global _handle
-    for name in _DROP:
-        getattr(bpy.app.handlers, name).remove(drop_copies)
+    for name, handler in _HANDLERS.items():
+        getattr(bpy.app.handlers, name).remove(handler)
     bpy.app.handlers.frame_change_post.remove(after_frame)
     bpy.app.handlers.depsgraph_update_post.remove(after_update)
     bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")

@@ -21,7 +21,16 @@ from mathutils import Matrix
 from meshsplats import bind, convert, load_gaussians, look_at, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender import subject
-from meshsplats.blender.inside import adjusting, baking, materials, meshes, objects, stand_ins, views
+from meshsplats.blender.inside import (
+    adjusting,
+    baking,
+    far_to_near,
+    materials,
+    meshes,
+    objects,
+    stand_ins,
+    views,
+)
 from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
@@ -198,6 +207,55 @@ def test_an_import_is_one_step_that_can_be_undone(ball, extension, tmp_path, mon
     assert sorted(bpy.data.objects.keys()) == ["ball"]
     bpy.ops.ed.redo()
     assert sorted(bpy.data.objects.keys()) == after == ["ball", "ball.001"]
+
+
+def test_undo_and_redo_show_splats_far_to_near_at_once(ball, extension, monkeypatch):
+    """Sorted for the view as it is now before it is drawn again, not for that of another state, and once."""
+    sorting, name = sys.modules["blender_extension.sorting"], ball.name
+    region_data = SimpleNamespace(view_perspective="PERSP", view_matrix=None)
+    space, looked = SimpleNamespace(shading=SimpleNamespace(type="MATERIAL")), []
+    look = far_to_near.look
+    monkeypatch.setattr(far_to_near, "look", lambda one, view: looked.append(view) or look(one, view))
+
+    def drawn_from(direction):
+        """Draws a viewport, and sorts if it asks for that."""
+        region_data.view_matrix = [None, None, direction]
+        region = SimpleNamespace(as_pointer=lambda: 1)
+        context = SimpleNamespace(
+            scene=bpy.context.scene, region=region, space_data=space, region_data=region_data
+        )
+        with monkeypatch.context() as patch:
+            patch.setattr(sorting, "bpy", SimpleNamespace(context=context, app=bpy.app))
+            sorting.before_drawing()
+        sorting.sort()
+
+    def assert_far_to_near(direction):
+        bpy.context.view_layer.update()
+        obj = bpy.data.objects[name]
+        data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        faces, own = meshes.triangles(data)[0], meshes.triangles(obj.data)[0]
+        splat_of = np.empty(len(obj.data.vertices), int)
+        splat_of[own] = meshes.owners(obj.data)[:, None]
+        local = np.array(direction) @ np.array(obj.matrix_world)[:3, :3]
+        owner, heights = splat_of[faces[:, 0]], meshes.face_middles(data) @ local
+        starts = np.flatnonzero(np.diff(owner, prepend=-1))
+        means = np.add.reduceat(heights, starts) / np.diff(starts, append=len(owner))
+        assert (np.diff(means) >= -1e-5).all()
+
+    drawn_from((0, 0, 1))
+    bpy.ops.object.meshsplats_adjust("EXEC_DEFAULT", True, brightness=0.5)
+    drawn_from((0, 0.6, 0.8))
+    for step in (bpy.ops.ed.undo, bpy.ops.ed.redo, bpy.ops.ed.undo):
+        looked.clear()
+        step()
+        assert looked == [(0, 0.6, 0.8)]
+        assert_far_to_near((0, 0.6, 0.8))
+        drawn_from((0, 0.6, 0.8))
+        assert len(looked) == 1
+    extension.unregister()
+    extension.register()
+    handlers = [h for hs in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post) for h in hs]
+    assert [h.__name__ for h in handlers if h.__module__ == sorting.__name__] == ["after_undo"] * 2
 
 
 @pytest.mark.parametrize("lit", [False, True])
