@@ -70,7 +70,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, priors, views
+        from meshsplats.blender.inside import objects, priors, sources, views
 
         objs = []
         for result in work.results:
@@ -83,6 +83,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
             for obj, path in zip(made, result.level_paths or (result.path,), strict=True):
                 obj.meshsplats.path = path
                 copy_choices(obj.meshsplats, self)
+                sources.mark(obj)
             if result.views:
                 origin = result.prepared[0]["origin"]
                 views.remember(made[0], [view.relative_to(origin) for view in result.views])

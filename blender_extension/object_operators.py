@@ -6,13 +6,24 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
-from .work import CloudWork, LightWork, Modal, Work, follow_shading, own_warnings, settle, take_over, waiting
+from .work import (
+    AgainWork,
+    CloudWork,
+    LightWork,
+    Modal,
+    follow_shading,
+    own_warnings,
+    settle,
+    take_over,
+    waiting,
+)
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
 
 class ConvertAgain(Modal, bpy.types.Operator):
-    """Convert the file of the active object again, with the settings shown"""
+    """Convert the file of the active object again, with the settings shown. Where it was edited or joined
+    with others since, its own splats are converted, so that nothing of that is lost"""
 
     bl_idname = "object.meshsplats_convert_again"
     bl_label = "Convert Again"
@@ -24,41 +35,57 @@ class ConvertAgain(Modal, bpy.types.Operator):
         return obj is not None and bool(obj.meshsplats.path) and not obj.meshsplats.busy
 
     def execute(self, context):
-        from meshsplats.blender.inside import levels, objects
+        from meshsplats.blender.inside import levels, objects, sources
 
         source = context.object.meshsplats
         self._active = context.object.name
-        self._names = {}  # of the object and the other levels of its chain, by file
-        for obj in levels.with_levels(context.object):
-            if obj.meshsplats.path:
-                copy_choices(obj.meshsplats, source)
-                obj.meshsplats.busy = not bpy.app.background
-                self._names[bpy.path.abspath(obj.meshsplats.path)] = obj.name
+        self._names, paths, own, views = [], {}, {}, {}  # by name: of the object and its chain's other levels
         self._was_lit = objects.is_lit(context.object)
-        choices = {name: getattr(source, name) for name in CHOICES}
-        return self.begin(context, Work(self._names, choices | {"fast": context.scene.meshsplats_fast}))
+        for obj in levels.with_levels(context.object):
+            if not obj.meshsplats.path:
+                continue
+            if sources.is_as_made(obj):
+                paths[obj.name] = bpy.path.abspath(obj.meshsplats.path)
+            else:
+                try:
+                    sources.check_own(obj)
+                    own[obj.name] = objects.as_splat_mesh(obj)
+                except ValueError as error:
+                    self.report({"ERROR"}, str(error))
+                    return {"CANCELLED"}
+            views[obj.name] = objects.views_within(obj)
+            self._names.append(obj.name)
+        for name in self._names:
+            obj = bpy.data.objects[name]
+            copy_choices(obj.meshsplats, source)
+            obj.meshsplats.busy = not bpy.app.background
+        choices = {name: getattr(source, name) for name in CHOICES} | {"fast": context.scene.meshsplats_fast}
+        return self.begin(context, AgainWork(paths, own, views, choices))
 
     def cancelled(self):
-        for name in self._names.values():
+        for name in self._names:
             obj = bpy.data.objects.get(name)
             if obj is not None:
                 obj.meshsplats.busy = False
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects
+        from meshsplats.blender.inside import objects, sources
 
         self.cancelled()
         for result in work.results:
-            obj = bpy.data.objects.get(self._names[result.path])
+            obj = bpy.data.objects.get(result.name)
             if obj is not None:
                 objects.replace_mesh(obj, result.prepared[0])
+                if result.path:
+                    sources.mark(obj)
         obj = bpy.data.objects.get(self._active)
         if obj is None:
             self.report({"WARNING"}, "MeshSplats: the object is gone")
-        else:
-            if objects.is_lit(obj) != self._was_lit:
-                follow_shading(self, context.scene, not self._was_lit)
-            self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
+            return
+        if objects.is_lit(obj) != self._was_lit:
+            follow_shading(self, context.scene, not self._was_lit)
+        edited = ", of its splats as they were edited or joined" if self._active in work.own else ""
+        self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles{edited}")
 
 
 class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):

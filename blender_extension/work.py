@@ -154,10 +154,10 @@ class Work:
         found = default_views(cloud, Path(path), VIEWS if opening is None else 1, side=(400, 400))
         return tuple(found[0]) if found else ()
 
-    def _converted(self, cloud, up=None):
+    def _converted(self, cloud, up=None, **options):
         from meshsplats.conversion import convert
 
-        options = {"max_triangles": self.choices["max_triangles"] or None}
+        options["max_triangles"] = self.choices["max_triangles"] or None
         if self.choices["min_opacity"] > 0:
             options["min_opacity"] = self.choices["min_opacity"]
         if self.choices["shading"] == "lit":
@@ -192,6 +192,29 @@ class CloudWork(Work):
         self._at(index, "converting")
         mesh = self._converted(self._cloud, self._up)
         return Result("", path, (self._ready(mesh, index, 1.0),))
+
+
+class AgainWork(Work):
+    """Converts objects again, by their names: files from ``paths``, or, of objects that were edited or joined
+    since, the splats of their meshes ``own``. ``views`` are those within places, where they are known."""
+
+    def __init__(self, paths, own, views, choices):
+        super().__init__([*paths, *own], choices)
+        self.own = own
+        self._files, self._views_of = paths, views
+
+    def _one(self, name, index):
+        from meshsplats.blender.inside import sources
+
+        views = self._views_of[name]
+        if name in self._files:
+            path = self._files[name]
+            return Result(path, name, (self._prepared(path, index, 1.0, views)[0],))
+        self._at(index, "converting")
+        cloud = sources.own_splats(self.own[name], name)
+        # They are as wide as their fans, which the first conversion has made wider and shrunk.
+        mesh = self._converted(cloud, footprint="none", shrink_faint=False)
+        return Result("", name, (self._ready(mesh, index, 1.0, views),))
 
 
 class LightWork(Work):

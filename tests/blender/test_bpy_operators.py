@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import sys
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +13,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
+from _blender_extension import registered
 from _blender_scenes import ball_splats
 from mathutils import Matrix
 
@@ -35,19 +34,11 @@ from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
 
-ROOT = Path(__file__).parents[2]
-
 
 @pytest.fixture(scope="module")
 def extension():
-    sys.path.insert(0, str(ROOT))
-    try:
-        module = importlib.import_module("blender_extension")
-        module.register()
+    with registered() as module:
         yield module
-        module.unregister()
-    finally:
-        sys.path.remove(str(ROOT))
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from meshsplats.blender.inside import (
     meshes,
     priors,
     rendering,
+    sources,
     stand_ins,
     versions,
     views,
@@ -146,12 +147,14 @@ def count_layers(objs: Iterable[Any]) -> int:
 
 def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
     """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay."""
-    old = obj.data
+    old, as_made = obj.data, sources.is_as_made(obj)
     prepared = prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
     obj.data = _data(prepared, old.name)
     far_to_near.add(obj, viewport=False)
     stand_ins.remove(obj)
     _give_stand_in(obj, prepared)
+    if as_made:
+        sources.mark(obj)
     if old.users == 0:
         bpy.data.meshes.remove(old)
 

@@ -1,0 +1,66 @@
+"""Whether a splat mesh is still what its file gave, and the splats that it consists of if it is not."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+from meshsplats.blender.inside import meshes, priors, stand_ins
+from meshsplats.conversion.recovery import recover_splats
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+MADE = "meshsplats_made"
+"""Property of an object: what ``_state`` was when its mesh was made from its file."""
+
+
+def mark(obj: Any) -> None:
+    """Remembers that the mesh of ``obj`` is what its file gave."""
+    obj[MADE] = _state(obj)
+
+
+def is_as_made(obj: Any) -> bool:
+    """Whether the mesh of ``obj`` is what its file gave, and was not cut, joined with others, reshaped or
+    painted since."""
+    return bool(obj.get(MADE) == _state(obj))
+
+
+def _state(obj: Any) -> str:
+    """Shape and colours; of a mesh prior, whose base moves it, the counts alone."""
+    data = obj.data
+    if priors.base_of(obj) is not None:
+        return f"{len(data.vertices)} {len(data.polygons)}"
+    colors = b""
+    if meshes.COLOR in data.attributes:
+        colors = meshes.read_colors(data, meshes.COLOR).tobytes()
+    return f"{stand_ins.shape(data)} {zlib.crc32(colors):08x}"
+
+
+def check_own(obj: Any) -> None:
+    """Raises ValueError if the splats of ``obj`` cannot be converted instead of its file."""
+    if priors.base_of(obj) is not None:
+        raise ValueError(_refusal(obj.name, "its splats hang on a base, which another conversion would lose"))
+
+
+def own_splats(mesh: SplatMesh, name: str) -> GaussianCloud:
+    """The splats of ``mesh``, all of them, for another conversion; ``name`` is that of its object.
+
+    Raises:
+        ValueError: some of it is no whole splat, which would be lost.
+    """
+    try:
+        cloud, whole = recover_splats(mesh)
+    except ValueError as error:
+        raise ValueError(_refusal(name, str(error))) from None
+    cut = int((~whole).sum())
+    if cut:
+        parts = "a part of it is no whole splat" if cut == 1 else f"{cut:,} parts of it are no whole splats"
+        raise ValueError(_refusal(name, f"{parts}, which another conversion would lose"))
+    return cloud
+
+
+def _refusal(name: str, reason: str) -> str:
+    return (
+        f"{name} was edited or joined since its import, and {reason}."
+        " Import its files again with these settings, and edit or join them then"
+    )
