@@ -11,6 +11,7 @@ from conftest import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 
+from meshsplats import convert
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.framing import front_axes, guess_up, scene_bounds, weighted_quantile
@@ -220,6 +221,21 @@ def test_a_single_point_is_framed(points):
     pixels, depth = camera.project(points)
     np.testing.assert_allclose(pixels, [[400, 400]] * len(points), atol=1e-3)
     assert (depth > camera.near).all()
+
+
+@pytest.mark.parametrize("options", [{}, {"mode": "flat"}])
+def test_a_mesh_is_framed_as_its_splats(options):
+    """Its rims, where nothing is seen, do not count, and the reach of its splats does."""
+    rng = np.random.default_rng(0)
+    spread = rng.uniform((-1, -3, -0.5), (1, 3, 0.5), (600, 3))
+    turns, sizes = rng.normal(size=(600, 4)), rng.uniform(0.05, 0.3, (600, 3))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    cloud = GaussianCloud(spread, turns, sizes, rng.uniform(0.6, 1, 600), np.zeros((600, 1, 3)))
+    mesh = convert(cloud, **options)
+    before, after = (orbit(scene, 4, elevation=30) for scene in (cloud, mesh))
+    middle = scene_bounds(cloud).center
+    for a, b in zip(before, after, strict=True):
+        assert np.linalg.norm(a.center - b.center) < 0.02 * np.linalg.norm(a.center - middle)
 
 
 def test_one_splat_is_framed_by_its_size():
