@@ -8,18 +8,21 @@ import numpy as np
 import pytest
 from _blender_scenes import ball_splats
 
-from meshsplats import GaussianCloud, convert, orbit, render
+from meshsplats import GaussianCloud, convert, orbit, render, save_gaussians, save_mesh
 from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
 from meshsplats.blender import subject
+from meshsplats.blender.files import PictureOptions, PictureRun
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
 from meshsplats.blender.subject import ground_height, prepare
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import shading_normals
+from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.viewpoints.finding import FoundCameras
 
 
 @pytest.mark.slow
@@ -53,6 +56,46 @@ def test_places_are_lit_by_what_is_seen_from_within(monkeypatch):
     assert counts == [3, 1]
     assert seen[0] == [*given, *found]
     assert subject.lit_subject(replace(mesh, face_splat=None, filter_px2=0), given)[0]["n"] == 1
+    options = SceneOptions(light=LightOptions(), within=tuple(orbit(mesh, 5)))
+    assert prepare(mesh, given, options, 8)[0]["n"] == 6, "views are not looked for where they are known"
+
+
+def test_a_place_is_searched_once_for_its_images_and_the_light_on_it(tmp_path, monkeypatch):
+    """In the splats of the file, not in what was made of them, and first for the most views."""
+    cloud = ball_splats(300)[0]
+    save_gaussians(cloud, tmp_path / "place.ply")
+    asked, drawn = [], []
+
+    def find_cameras(cloud, count, **options):
+        asked.append((cloud, count, options["up"]))
+        cameras = tuple(orbit(cloud, count, width=options["width"]))
+        return FoundCameras("place", 1.0, np.array([0, -1.0, 0]), 1.0, 0.0, 1.0, cameras)
+
+    def draw(mesh, cameras, *, options, images, **_):
+        drawn.append((cameras, options.within))
+        for image in images:
+            image.touch()
+        return {}
+
+    monkeypatch.setattr("meshsplats.viewpoints.showing.find_cameras", find_cameras)
+    monkeypatch.setattr("meshsplats.blender.files.draw", draw)
+    monkeypatch.setattr("meshsplats.blender.files.command", lambda executable: None)
+    for options, counts in (
+        (PictureOptions(lit=True), [24, 1]),
+        (PictureOptions(fast=True, views=SceneViews(up="z")), [24, 1]),
+        (PictureOptions(fast=True, views=SceneViews(azimuth=10)), [24]),
+        (PictureOptions(), [1]),
+    ):
+        asked.clear()
+        PictureRun(tmp_path / "place.ply", tmp_path / "image.png", options).save(force=True)
+        assert [count for _, count, _ in asked] == counts
+        assert all(scene is asked[0][0] and len(scene) == 300 for scene, *_ in asked)
+        assert len({str(up) for *_, up in asked}) == 1
+        assert (0 if drawn[-1][1] is None else len(drawn[-1][1])) == (24 if options.is_lit else 0)
+    save_mesh(convert(cloud), tmp_path / "object.npz")
+    monkeypatch.setattr(subject, "default_views", lambda *_, **__: None)
+    PictureRun(tmp_path / "object.npz", tmp_path / "image.png", PictureOptions(lit=True)).save(force=True)
+    assert drawn[-1][1] == (), "it was looked at"
 
 
 def ball_field(count: int = 24, radius: float = 8.0) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from meshsplats._options import changed, check_options
-from meshsplats._words import parse_color
+from meshsplats._words import parse_color, parse_up
 from meshsplats.blender import draw
 from meshsplats.blender.launch import command
 from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
@@ -21,6 +21,7 @@ from meshsplats.blender.options import (
     SceneOptions,
 )
 from meshsplats.blender.plan import in_words
+from meshsplats.blender.subject import views_within
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import convert
@@ -197,6 +198,11 @@ class PictureRun:
         scene, *coarser = [outline(tileset)] if tileset else self._scenes(chain)
         count = 1 if suffix else 60
         views = chosen.chosen_views()
+        if options.light is not None and not tileset:
+            # Before the cameras, so that these are some of them: one search is enough for both.
+            up = None if views.up is None else parse_up(views.up)
+            within = views_within(scene, self.source, up=up, threads=chosen.threads)
+            options = replace(options, within=tuple(within))
         cameras = views.make(scene, self.source, count=count, side=800, film=not suffix, say=self.say)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise OptionsError(f"{len(cameras):,} views do not fit one {suffix}: give ``output`` a folder")

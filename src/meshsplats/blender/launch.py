@@ -297,7 +297,7 @@ def _plain_camera(camera: Camera) -> dict[str, Any]:
 
 
 def _plain_options(options: SceneOptions) -> dict[str, Any]:
-    plain = asdict(options)
+    plain = asdict(replace(options, within=None))  # Blender gets what was made of them
     if options.light is not None and options.light.hdri is not None:
         plain["light"]["hdri"] = os.path.abspath(options.light.hdri)
     return plain

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from meshsplats._options import Advanced, Range, check_options
+from meshsplats.camera import Camera
 
 Engine = Literal["cycles", "eevee"]
 Ground = Literal["plane", "catcher", "none"]
@@ -139,6 +140,8 @@ class SceneOptions:
     """At most this many; default: all processors."""
     fast: bool = False
     """Lit: a rougher surface, colours and light, for a preview."""
+    within: tuple[Camera, ...] | None = None
+    """Lit: views of a place from within, for light on it; none of an object. None: they are looked for."""
 
     @property
     def effort(self) -> Effort:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.conversion.normals import shading_normals, typical_spacing
 from meshsplats.conversion.recovery import splats_of
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
@@ -91,7 +93,12 @@ def prepare(
         arrays["harmonics"] = harmonics
     if options.light is not None:
         lit, of_light = lit_subject(
-            mesh, cameras, effort=options.effort, threads=options.threads, announce=announce
+            mesh,
+            cameras,
+            within=options.within,
+            effort=options.effort,
+            threads=options.threads,
+            announce=announce,
         )
         if "light_points" in lit:
             points, normals = lit["light_points"] @ up, lit["light_normals"] @ up
@@ -144,7 +151,7 @@ def lit_subject(
     where they are None; an object has none."""
     mesh = mesh.plain
     announce("colours")
-    cameras = [*cameras, *(_views_within(mesh, threads) if within is None else within)]
+    cameras = [*cameras, *(views_within(mesh, threads=threads) if within is None else within)]
     lit, self_shadow = lit_arrays(mesh, cameras, effort=effort, threads=threads, announce=announce)
     arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
     if mesh.binding is None:
@@ -154,11 +161,18 @@ def lit_subject(
     return arrays, facts
 
 
-def _views_within(mesh: SplatMesh, threads: int | None) -> Sequence[Camera]:
-    """Views from within a place, found in the splats of ``mesh``; none of an object, or without splats. From
-    around it, one sees walls from behind, and the noise that no photograph saw."""
-    cloud = splats_of(mesh)
-    views = cloud and default_views(cloud, None, VIEWS, side=(400, 400), threads=threads)
+def views_within(
+    scene: GaussianCloud | SplatMesh,
+    source: Path | None = None,
+    *,
+    up: np.ndarray | None = None,
+    threads: int | None = None,
+) -> list[Camera]:
+    """Views of a place from within, those of its folder ``source`` or found in its splats; none of an object,
+    or without splats. From around it, one sees walls from behind, and the noise that no photograph saw.
+    ``up``: (3,) direction, where the user names it."""
+    cloud = splats_of(scene)
+    views = cloud and default_views(cloud, source, VIEWS, side=(400, 400), up=up, threads=threads)
     return views[0] if views else []
 
 
