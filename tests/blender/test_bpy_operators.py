@@ -295,6 +295,7 @@ def test_fast_light_is_made_carefully_when_asked(ball, extension):
     assert (ball[objects.ROUGH], panel.light_warning(bpy.context.scene, ball)) == (True, "")
     assert objects.needs_light(ball)
     assert not objects.needs_light(ball, fast=True)
+    assert bpy.context.scene.cycles.denoising_input_passes == "RGB"
     rough = len(baking.places_of(ball)[0])
     bpy.ops.scene.meshsplats_bake_light(live=True, only_active=True)
     assert not materials.shows_baked(material)

@@ -83,6 +83,7 @@ def test_lit_file_has_everything_in_named_collections(tmp_path):
     assert image.packed_file is not None
     assert tuple(image.size) == (8, 4)
     assert scene.cycles.samples == 5
+    assert scene.cycles.denoising_input_passes == "RGB", "it is a preview"
     assert 64 <= scene.cycles.transparent_max_bounces < 1024
     data = bpy.data.objects["Splats"].data
     assert data.materials[0].name == "Splats, lit"

@@ -312,3 +312,20 @@ def test_a_blender_that_cannot_denoise_takes_more_samples(empty, monkeypatch):
         assert (empty.cycles.use_denoising, empty.cycles.samples) == (can, samples)
         rendering.lit_settings(empty, "cycles", samples=16, denoise=False)
         assert (empty.cycles.use_denoising, empty.cycles.samples) == (False, 16)
+
+
+def test_previews_are_denoised_in_less_time(empty):
+    """And careful images after them as before."""
+    if not hasattr(empty.cycles, "denoising_quality"):
+        pytest.skip("this Blender has one quality")
+    found = []
+    for preview in (False, True, False):
+        rendering.lit_settings(empty, "cycles", samples=4, limit=100, denoise=True)
+        if preview:
+            rendering.preview_settings(empty)
+        cycles = empty.cycles
+        found.append(
+            (cycles.denoising_input_passes, cycles.denoising_quality, cycles.min_transparent_bounces)
+        )
+    careful = ("RGB_ALBEDO_NORMAL", "HIGH", 16)
+    assert found == [careful, ("RGB", "FAST", 8), careful]

@@ -96,6 +96,7 @@ def test_named_lights_and_what_is_said_instead():
     [
         (0, SceneOptions(light=LightOptions(), samples=10, threads=2), (1e6 * 10 * 20.3e-6 + 8) / 2),
         (8, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 223e-6 + 8),
+        (0, SceneOptions(light=LightOptions(), threads=1, denoise=True, fast=True), 1e6 * 205e-6 + 3.25),
         (0, SceneOptions(threads=1), 1e6 * 10 * 19.3e-6),
         (8, SceneOptions(threads=1), 1e6 * 10 * (19.3e-6 + 8 * 1.4e-6)),
         (0, SceneOptions(engine="eevee"), None),

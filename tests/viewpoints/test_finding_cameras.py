@@ -151,6 +151,20 @@ def test_a_scene_is_searched_once_for_views_of_all_sizes(monkeypatch):
     assert np.linalg.norm(around.center - within.center) > 0.1
 
 
+def test_an_object_is_looked_at_from_outside_once(monkeypatch):
+    looked = []
+    look = lambda *arguments: looked.append(arguments) or ("object", 1.0)  # noqa: E731
+    monkeypatch.setattr("meshsplats.viewpoints.finding.kind_from_outside", look)
+    cloud = room(500, 100)
+    for count in (1, 24, 1):
+        assert find_cameras(cloud, count).kind == "object"
+    assert len(looked) == 1
+    find_cameras(cloud, 1, up=(0, 0, 1))
+    cloud.means[:, 0] *= 2  # changed in place
+    find_cameras(cloud, 1, up=(0, 0, 1))
+    assert len(looked) == 3
+
+
 @pytest.mark.slow
 def test_cameras_move_with_the_scene(found):
     # A quarter turn around the vertical (the default of up stays) and a power of two round nothing.

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from meshsplats.blender.launch import Progress
 
 PHASES = {
-    "colours": (2.0, 20.0, 0.2),
+    "colours": (2.0, 20.0, 0.25),
     "normals": (0.5, 5.0, 0.7),
-    "surface": (3.0, 6.0, 0.3),
+    "surface": (3.0, 6.0, 0.5),
     "building the scene": (0.5, 1.0, 1.0),
     "light": (2.0, 3.0, 0.2),
 }
@@ -63,7 +63,8 @@ def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | N
     lit = options.light is not None
     layer = 1.1e-6 + (0 if lit else 0.14e-6 * ahead.get("harmonics", 0))
     ray = layer * ahead["mean_layers"] + 8.3e-9 * ahead["mean_square_layers"] + (1e-6 if lit else 0)
-    pixel = ray * ahead["samples"] + (20e-6 if options.denoise else 0)
+    denoising = (2e-6 if options.fast else 20e-6) if options.denoise else 0.0
+    pixel = ray * ahead["samples"] + denoising
     busy = pixel * ahead["pixels"] + 1e-6 * ahead["triangles"]
     return (busy + sum(phase_seconds(ahead, options).values())) / (options.threads or processors())
 

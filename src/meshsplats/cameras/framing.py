@@ -14,7 +14,6 @@ from meshsplats._cells import Cells
 from meshsplats._kinds import need_array
 from meshsplats.camera import Camera
 from meshsplats.errors import StraysWarning
-from meshsplats.face_splats import FaceSplats
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -168,16 +167,24 @@ def _sample_of_splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarr
     counts = splats.counts[rows]
     first = np.cumsum(counts) - counts
     faces = np.arange(counts.sum()) + np.repeat(splats.starts[rows] - first, counts)
-    some = FaceSplats(mesh.faces[faces], np.repeat(np.arange(len(rows)), counts), len(mesh.vertices))
-    centers = some.centers(mesh.vertices, mesh.colors[:, 3])
-    opacities = mesh.colors[some.faces, 3].astype(np.float64)
-    peaks = np.maximum.reduceat(opacities.max(axis=1), some.starts)
-    away = mesh.vertices[some.faces] - centers[some.of_face][:, None]
-    _, axes = np.linalg.eigh(some.sums(np.einsum("fki,fkj->fij", away, away)))
-    share = opacities / np.maximum(peaks, 1e-12)[some.of_face][:, None]
-    away *= np.minimum(1, _REACH / np.maximum(1 - share, 1e-12))[:, :, None]
-    along = np.abs(np.einsum("fki,fij->fkj", away, axes[some.of_face])).max(axis=1)
-    return centers, peaks, np.sort(np.maximum.reduceat(along, some.starts), axis=1)[:, 1]
+    corners, each, start = mesh.faces[faces].ravel(), 3 * counts, 3 * first
+    opacities = mesh.colors[corners, 3].astype(np.float64)
+    peaks = np.maximum.reduceat(opacities, start)
+    places = mesh.vertices[corners].T.astype(np.float64)  # columns are summed far faster than rows
+    weights = opacities + 1e-6
+    centers = np.add.reduceat(weights * places, start, axis=1) / np.add.reduceat(weights, start)
+    away = places - np.repeat(centers, each, axis=1)
+    moments = np.empty((len(rows), 3, 3))
+    for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):
+        moments[:, i, j] = np.add.reduceat(away[i] * away[j], start)
+    _, axes = np.linalg.eigh(moments)  # reads the lower half
+    share = opacities / np.repeat(np.maximum(peaks, 1e-12), each)
+    away *= np.minimum(1, _REACH / np.maximum(1 - share, 1e-12))
+    reach = np.empty((3, len(rows)))
+    for k, axis in enumerate(np.ascontiguousarray(axes.transpose(2, 1, 0))):
+        along = sum(away[i] * np.repeat(axis[i], each) for i in range(3))
+        reach[k] = np.maximum.reduceat(np.abs(along), start)
+    return np.ascontiguousarray(centers.T), peaks, np.sort(reach, axis=0)[1]
 
 
 def warn_of_strays(scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.ndarray, size: float) -> None:

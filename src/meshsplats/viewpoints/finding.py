@@ -78,12 +78,15 @@ class FoundCameras:
         return f"{what} ({sure}); up {x} {y} {z} ({told}); views {self.extent:.3g} units deep"
 
 
+_Key = tuple[bytes, bytes | None]
+"""Of splats as they were, and of a given up."""
+
+
 @dataclass(frozen=True)
 class _Search:
     """What a search within a scene found, for images of any size and any smaller number of views."""
 
-    key: tuple[bytes, bytes | None]
-    """Of the splats as they were, and of a given up."""
+    key: _Key
     wanted: int
     """Number of views that were looked for."""
     is_place: bool
@@ -95,6 +98,8 @@ class _Search:
 
 _searched: WeakKeyDictionary[GaussianCloud, _Search] = WeakKeyDictionary()
 """The last search within each scene that is in use: commands ask for views of several sizes and numbers."""
+_outsides: WeakKeyDictionary[GaussianCloud, tuple[_Key, tuple[Kind | None, float]]] = WeakKeyDictionary()
+"""And what it looked like from outside, also where it is an object, in which nothing is searched."""
 
 
 def find_cameras(
@@ -136,7 +141,7 @@ def find_cameras(
     key, wanted = (_fingerprint(cloud), None if given is None else given.tobytes()), min(count, MOST)
     found = _searched.get(cloud)
     if found is None or found.key != key or found.wanted < wanted or not (anywhere or found.is_place):
-        kind, confidence = kind_from_outside(cloud, first_up, threads)
+        kind, confidence = _from_outside(cloud, key, first_up, threads)
         if kind == "object" and not anywhere:
             return _around(cloud, confidence, given, count, width, height)
         if not cloud.opacities.any():
@@ -190,6 +195,16 @@ def _told_up(
     """The direction that the caller or the cloud names, or None; and the one to begin with."""
     given = unit_up(up) if up is not None else None if cloud.up is None else guess_up(cloud)
     return given, guess_up(cloud) if given is None else given
+
+
+def _from_outside(
+    cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int | None
+) -> tuple[Kind | None, float]:
+    """As ``kind_from_outside``, which looks once at splats that did not change."""
+    known = _outsides.get(cloud)
+    if known is None or known[0] != key:
+        known = _outsides[cloud] = key, kind_from_outside(cloud, up, threads)
+    return known[1]
 
 
 def _around(

@@ -15,6 +15,9 @@ _FEW = 16
 """Layers that every ray passes in denoised images. On playbot at 240 x 135 pixels, 16 samples: 4.8 instead of
 6.6 s, and 26.6 instead of 26.8 dB."""
 
+_FEWER = 8
+"""And those of previews."""
+
 
 def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
     """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view
@@ -69,6 +72,7 @@ def lit_settings(
     cycles.caustics_reflective = False
     cycles.caustics_refractive = False
     cycles.use_denoising = denoise
+    versions.set_if_there(cycles, denoising_input_passes="RGB_ALBEDO_NORMAL", denoising_quality="HIGH")
     # The light tree skips lights behind a triangle, though its smoothed normal may face them.
     cycles.use_light_tree = False
     # Denoised, rays that have lost most of their light may end at random, which halves the time.
@@ -76,6 +80,13 @@ def lit_settings(
     scene.eevee.taa_render_samples = samples
     scene.render.filter_size = 1.5
     versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=raytracing)
+
+
+def preview_settings(scene: Any) -> None:
+    """After ``lit_settings``, for previews: denoises by the image alone, in a fifth of the time and as well,
+    as the light on splats was denoised when it was baked; more rays may end early."""
+    versions.set_if_there(scene.cycles, denoising_input_passes="RGB", denoising_quality="FAST")
+    scene.cycles.min_transparent_bounces = min(scene.cycles.min_transparent_bounces, _FEWER)
 
 
 def _layers(scene: Any, limit: int, least: int | None = None) -> None:

@@ -148,6 +148,8 @@ def build(
             raytracing=light.mirror or light.glass,
             exposure=light.exposure,
         )
+        if options.fast:
+            rendering.preview_settings(scene)
     catcher = light is not None and light.ground == "catcher"
     scene.render.film_transparent = options.background is None or catcher
     if options.threads is not None:

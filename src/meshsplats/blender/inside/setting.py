@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, meshes, objects, scene, stage, views
+from meshsplats.blender.inside import baking, meshes, objects, rendering, scene, stage, views
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import CAREFUL, FAST, LIGHTS, LightOptions
 from meshsplats.blender.subject import ground_height, lowest
@@ -63,6 +63,8 @@ def set_up(
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
     objects.render_settings(view, objs, True, light)
+    if fast:
+        rendering.preview_settings(view)
     baking.bake(view, objs, samples=(FAST if fast else CAREFUL).samples)
     return light
 
