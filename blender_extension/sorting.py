@@ -131,9 +131,16 @@ def after_undo(*_):
     they are sorted for that of now before it is drawn. Viewports that have not turned ask for nothing
     more."""
     _drop_copies()
-    for scene in bpy.data.scenes:
-        if has_splats(scene) and scene.session_uid in _shown:
-            _want(scene, _shown[scene.session_uid])
+    scenes = [s for s in bpy.data.scenes if _shown.get(s.session_uid) is not None and has_splats(s)]
+    if not scenes:
+        return
+    from meshsplats.blender.inside import far_to_near
+
+    for scene in scenes:
+        _want(scene, _shown[scene.session_uid])
+        for obj in far_to_near.sorted_objects(scene):  # what follows need not sort
+            far_to_near.modifier_of(obj).show_viewport = False
+    bpy.context.view_layer.update()  # where objects are is known from here on
     sort()  # leaves it to the timer while an image is rendered
 
 

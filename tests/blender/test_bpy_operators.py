@@ -27,6 +27,7 @@ from meshsplats.blender.inside import (
     materials,
     meshes,
     objects,
+    sorted_copies,
     stand_ins,
     views,
 )
@@ -241,6 +242,7 @@ def test_undo_and_redo_show_splats_far_to_near_at_once(ball, extension, monkeypa
         step()
         assert looked == [(0, 0.6, 0.8)]
         assert_far_to_near((0, 0.6, 0.8))
+        assert sorted_copies.of(far_to_near.modifier_of(bpy.data.objects[name])) is not None, "nodes need not"
         drawn_from((0, 0.6, 0.8))
         assert len(looked) == 1
     extension.unregister()

@@ -60,7 +60,7 @@ class PictureOptions:
     """Light the splats (``lit``) by an afternoon sun, the default, a high sun in a clear sky, clouds, or two
     large lamps. The options under "light" change them."""
     fast: bool = False
-    """A lit preview in a third of the time (``lit``): up to 30,000 splats, 4 samples, rough light and colours."""
+    """A quick lit preview (``lit``): up to 30,000 splats, 4 samples, rough light and colours."""
     light: LightOptions = field(default_factory=LightOptions)
     background: str = "white"
     """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
