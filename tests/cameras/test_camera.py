@@ -11,7 +11,8 @@ from conftest import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats import convert
+from meshsplats import bind, convert
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.framing import front_axes, guess_up, scene_bounds, weighted_quantile
@@ -236,6 +237,13 @@ def test_a_mesh_is_framed_as_its_splats(options):
     middle = scene_bounds(cloud).center
     for a, b in zip(before, after, strict=True):
         assert np.linalg.norm(a.center - b.center) < 0.02 * np.linalg.norm(a.center - middle)
+
+
+def test_a_mesh_prior_is_framed_by_its_triangles():
+    """Its splats are the faces of its base: two, whose centres are no points of a sample."""
+    corners = np.array([[-1.0, -2, 0], [1, -2, 0], [1, 0, 0], [-1, 0, 0]])
+    prior = bind(BaseMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), triangles=200).mesh
+    np.testing.assert_allclose(scene_bounds(prior).center, (0, -1, 0), atol=0.05)
 
 
 def test_one_splat_is_framed_by_its_size():

@@ -48,6 +48,10 @@ _REACH = 0.7
 """Two standard deviations of a splat, as a share of the way from the centre of its triangles to corners
 without any opacity: 0.64 and 0.8 in the fans of ``convert``, with 4 and 8 sides."""
 
+_LARGEST = 100
+"""Triangles of a splat, on average, up to which it counts as one point: those of a mesh prior are the faces
+of its base."""
+
 STRAY = 10_000.0
 """Distance from the subject, and size, in its radii, from which on splats are strays. In captures that were
 tried, floaters are at most 1,100 radii away."""
@@ -135,8 +139,9 @@ class _Extent(NamedTuple):
 
 def _sample(scene: Framable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(k, 3) points, (k,) weights and (k,) sizes of a sample of a scene, float64."""
-    if isinstance(scene, SplatMesh) and scene.face_splat is not None and len(scene.faces):
-        return _sample_of_splats(scene)
+    if isinstance(scene, SplatMesh) and scene.face_splat is not None:
+        if 0 < len(scene.faces) <= _LARGEST * len(scene.splats):
+            return _sample_of_splats(scene)
     if isinstance(scene, GaussianCloud):
         points, weights = scene.means, scene.opacities
     elif isinstance(scene, SplatMesh):
