@@ -139,9 +139,8 @@ class _Extent(NamedTuple):
 
 def _sample(scene: Framable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(k, 3) points, (k,) weights and (k,) sizes of a sample of a scene, float64."""
-    if isinstance(scene, SplatMesh) and scene.face_splat is not None:
-        if 0 < len(scene.faces) <= _LARGEST * len(scene.splats):
-            return _sample_of_splats(scene)
+    if isinstance(scene, SplatMesh) and _has_small_splats(scene):
+        return _sample_of_splats(scene)
     if isinstance(scene, GaussianCloud):
         points, weights = scene.means, scene.opacities
     elif isinstance(scene, SplatMesh):
@@ -163,6 +162,10 @@ def _sample(scene: Framable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if weights.sum() == 0:
         weights = np.ones(len(points))
     return points, weights, sizes
+
+
+def _has_small_splats(mesh: SplatMesh) -> bool:
+    return mesh.face_splat is not None and 0 < len(mesh.faces) <= _LARGEST * len(mesh.splats)
 
 
 def _sample_of_splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
