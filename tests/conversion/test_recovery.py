@@ -120,3 +120,16 @@ def test_meshes_that_cannot_be_splats():
     alone = SplatMesh(np.eye(3), [[0, 1, 2]], np.ones((3, 4)), face_splat=[0])
     with pytest.raises(ValueError, match="none of the splats has all its triangles"):
         recover_splats(alone)
+
+
+def test_converted_again_round_splats_have_the_same_triangles():
+    """Their principal axes may be any."""
+    rng = np.random.default_rng(0)
+    turns = rng.normal(size=(60, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    sizes = np.tile(rng.uniform(0.1, 0.3, (60, 1)), 3)
+    sizes[30:, 0] *= 2  # round across
+    cloud = GaussianCloud(rng.normal(size=(60, 3)), turns, sizes, np.full(60, 0.5), np.zeros((60, 1, 3)))
+    mesh = convert(cloud)
+    again = convert(recover_splats(mesh)[0], footprint="none", shrink_faint=False)
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=2e-3)

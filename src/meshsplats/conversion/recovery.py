@@ -18,6 +18,8 @@ from meshsplats.mesh import SplatMesh
 THICKNESS = 0.02
 """Standard deviation across a flat fan, as a share of the smaller one in it: viewers need one above 0."""
 _CHUNK = 1 << 14
+_SQUARE = 1e-3
+"""Cosine between two axes, and share of the largest one, up to which axes of triangles are those of a splat."""
 _FAINT = 1e-6
 """Weight of a corner of opacity 0 in a mean of colours."""
 
@@ -116,8 +118,18 @@ def _fitted(mesh: SplatMesh, shape: Shape, index: np.ndarray) -> tuple[np.ndarra
 
 def _principal(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviations (k, 3), largest first, and rotations (k, 3, 3) to the world of Gaussians that are
-    round ones mapped by ``axes`` (k, 3, 3)."""
+    round ones mapped by ``axes`` (k, 3, 3). Where several will do, as for a round splat, those along its
+    triangles, so that another conversion makes the same of it."""
     _, sizes, turns = np.linalg.svd(axes)
+    lengths = np.linalg.norm(axes, axis=2)
+    own = axes / np.maximum(lengths, 1e-300)[:, :, None]
+    own[:, 2] = np.where(lengths[:, 2:] > 0, own[:, 2], np.cross(own[:, 0], own[:, 1]))
+    apart = np.abs(np.einsum("kij,klj->kil", own, own) - np.eye(3)).max(axis=(1, 2))
+    along = (apart < _SQUARE) & (np.diff(lengths, axis=1) <= _SQUARE * lengths[:, :1]).all(axis=1)
+    for i in (1, 2):  # those that are alike stay in their order
+        alike = np.abs(lengths[:, i] - lengths[:, i - 1]) <= _SQUARE * lengths[:, 0]
+        lengths[alike, i] = lengths[alike, i - 1]
+    turns[along], sizes[along] = own[along], lengths[along]
     rotations = turns.transpose(0, 2, 1)
     rotations[np.linalg.det(rotations) < 0, :, 2] *= -1
     sizes[:, 1] = np.maximum(sizes[:, 1], 1e-3 * sizes[:, 0])
