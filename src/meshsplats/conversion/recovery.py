@@ -19,7 +19,7 @@ THICKNESS = 0.02
 """Standard deviation across a flat fan, as a share of the smaller one in it: viewers need one above 0."""
 _CHUNK = 1 << 14
 _SQUARE = 1e-3
-"""Cosine between two axes, and share of the largest one, up to which axes of triangles are those of a splat."""
+"""Cosine between axes, and share of the largest one, up to which those of triangles are those of a splat."""
 _FAINT = 1e-6
 """Weight of a corner of opacity 0 in a mean of colours."""
 
