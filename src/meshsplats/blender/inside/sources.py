@@ -5,6 +5,8 @@ from __future__ import annotations
 import zlib
 from typing import Any
 
+import numpy as np
+
 from meshsplats.blender.inside import meshes, priors, stand_ins
 from meshsplats.conversion.recovery import recover_splats
 from meshsplats.gaussians import GaussianCloud
@@ -22,7 +24,7 @@ def mark(obj: Any) -> None:
 def is_as_made(obj: Any) -> bool:
     """Whether the mesh of ``obj`` is what its file gave, and was not cut, joined with others, reshaped or
     painted since."""
-    return bool(obj.get(MADE) == _state(obj))
+    return MADE in obj and bool(obj[MADE] == _state(obj))
 
 
 def _state(obj: Any) -> str:
@@ -30,10 +32,12 @@ def _state(obj: Any) -> str:
     data = obj.data
     if priors.base_of(obj) is not None:
         return f"{len(data.vertices)} {len(data.polygons)}"
-    colors = b""
-    if meshes.COLOR in data.attributes:
-        colors = meshes.read_colors(data, meshes.COLOR).tobytes()
-    return f"{stand_ins.shape(data)} {zlib.crc32(colors):08x}"
+    colors = np.empty(0, np.float32)
+    attribute = data.color_attributes.get(meshes.COLOR)  # which edits may have moved to another domain
+    if attribute is not None:
+        colors = np.empty(4 * len(attribute.data), np.float32)
+        attribute.data.foreach_get("color", colors)
+    return f"{stand_ins.shape(data)} {zlib.crc32(colors.tobytes()):08x}"
 
 
 def check_own(obj: Any) -> None:
