@@ -66,3 +66,7 @@ class DeviceError(RuntimeError):
 
 class ClusterError(RuntimeError):
     """The workers of a cluster are lost; what finished tasks have written stays."""
+
+
+class OtherRunError(ValueError):
+    """The checkpoint to resume from belongs to another run; the message names the differences."""

@@ -21,10 +21,9 @@ from meshsplats.cli import main
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DataWarning, MissingDependencyError
+from meshsplats.errors import DataWarning, MissingDependencyError, OtherRunError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
-from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.config import HARMONICS_RATE
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.phase import Moment

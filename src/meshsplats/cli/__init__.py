@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug, as_json = "--debug" in arguments, "--json" in arguments
     try:
         with warnings.catch_warnings(), _signals_raise():
-            code = _answer(name) if name not in COMMANDS else _run(name, _plain(arguments[1:]))
+            code = _answer(name) if name not in COMMANDS else _run(name, arguments[1:])
             sys.stdout.flush()
             return code
     except SystemExit as stop:  # help, or an error in the arguments, has been printed
@@ -141,7 +141,8 @@ def _run(name: str, arguments: list[str]) -> int:
     warnings.simplefilter("always", DataWarning)
     warnings.showwarning = show
 
-    with _standard_input_as_file(_joined(arguments)) as words:
+    words = _joined([word for word in arguments if word != "--debug"])
+    with _standard_input_as_file(words) as words:
         return _execute(name, words)
 
 
@@ -197,10 +198,6 @@ def _answer(name: str) -> int:
         print(f"meshsplats {meshsplats.__version__}")
         return OK
     return _unknown(name)
-
-
-def _plain(arguments: list[str]) -> list[str]:
-    return [argument for argument in arguments if argument != "--debug"]
 
 
 def _joined(arguments: list[str]) -> list[str]:

@@ -309,7 +309,7 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
     hidden = [] if everything or not common else [name for name in flags if name not in common]
     shown = _described(command, [name for name in flags if name not in hidden], flags)
     with suppress(SystemExit):
-        tyro.cli(shown, prog=prog, args=["--help"], config=_MARKERS)
+        tyro.cli(shown, prog=prog, args=["--help"], config=_PARSED)
     others = [name for name, option in options.items() if not option.has_flag]
     notes = [f"{len(hidden)} more options: --help-all."] if hidden else []
     if command.CONFIGURABLE:

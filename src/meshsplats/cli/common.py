@@ -8,21 +8,24 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import tyro
 
+from meshsplats._files import atomic
 from meshsplats._origin import in_words
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.messages import flag, one_line, say
-from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from meshsplats.camera import Camera
+    from meshsplats.cluster import Workers
 
 T = TypeVar("T")
 Placed = TypeVar("Placed", GaussianCloud, SplatMesh, BaseMesh, GaussianCloud | SplatMesh)
@@ -59,6 +62,8 @@ class ClusterOptions:
     @contextmanager
     def workers(self, threads: int | None) -> Iterator[Workers]:
         """The workers, for the length of the block; ``threads``: maximum number of threads."""
+        from meshsplats.cluster import open_workers
+
         with open_workers(self.cluster, threads) as found:
             if self.cluster is not None:
                 say(f"cluster: {found}")
@@ -154,6 +159,4 @@ def named(path: Path) -> str:
 
 def size_of(path: Path) -> str:
     """Size of a file in words: 3.2 MB."""
-    from meshsplats._files.atomic import in_words
-
-    return in_words(path.stat().st_size)
+    return atomic.in_words(path.stat().st_size)

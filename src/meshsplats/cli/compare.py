@@ -15,9 +15,8 @@ from meshsplats.cli.images import DrawOptions, ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.scene_views import WAYS_OF_VIEWS
-from meshsplats.evaluation.comparison_files import ComparisonOptions, save_comparison
+from meshsplats.evaluation.options import ComparisonOptions
 from meshsplats.formats.outputs import CONFIGURATION
-from meshsplats.rendering.looks import comparison_in_words
 
 
 @as_cli_options(presets=False)
@@ -51,6 +50,9 @@ class Compare(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.evaluation.comparison_files import save_comparison
+        from meshsplats.rendering.looks import comparison_in_words
+
         made = save_comparison(
             self.splats,
             self.mesh,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -14,8 +14,9 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
-from meshsplats.formats.outputs import placed
-from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from meshsplats.mesh import SplatMesh
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Deform(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.formats.outputs import placed
         from meshsplats.prior.planning import pose_files, posed_files
 
         start, count = time.perf_counter(), len(self.base)

@@ -15,11 +15,8 @@ from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, print_table, track
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
-from meshsplats.evaluation.report import SSIM_CONVENTION
-from meshsplats.evaluation.results import notes
-from meshsplats.evaluation.strips import score_table
+from meshsplats.file_options import ScoringOptions
 from meshsplats.formats.outputs import CONFIGURATION
-from meshsplats.scoring import Scoring, ScoringOptions
 
 Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 
@@ -57,6 +54,11 @@ class Evaluate(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.evaluation.report import SSIM_CONVENTION
+        from meshsplats.evaluation.results import notes
+        from meshsplats.evaluation.strips import score_table
+        from meshsplats.scoring import Scoring
+
         self.how.check(self.mesh)
         here = self.cluster.cluster is None  # workers share a terminal
         if self.how.protocol is None and not here:

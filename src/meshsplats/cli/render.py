@@ -17,7 +17,7 @@ from meshsplats.cli.images import DrawOptions, ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.scene_views import WAYS_OF_VIEWS
-from meshsplats.renders.saving import ImageOptions, ImageRun
+from meshsplats.renders.options import ImageOptions
 
 
 @as_cli_options(presets=False)
@@ -54,6 +54,8 @@ class Render(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.renders.saving import ImageRun
+
         start = time.perf_counter()
         run = ImageRun(self.input, self.output, self.images, say, self.cluster.workers)
         made = run.save(force=self.force, progress=lambda items, count: track(items, "rendering", count))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 import numpy as np
 
 from meshsplats._options import Advanced, Range, With, check_names, check_options
-from meshsplats.rendering.looks import Look
+from meshsplats.choices import Look
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -10,11 +10,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Literal
 
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, pinholes, undistort
 from meshsplats.datasets.views import ImageCache, ViewImage
 from meshsplats.errors import DataWarning, FileFormatError
@@ -244,11 +244,6 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 Taken = list[tuple[Camera, PhotoFile]]
 """The views made from one photograph: one, or the six of a panorama."""
-
-
-Missing = Literal["few", "error", "skip"]
-"""What missing images mean: an error, or that their views are left out; few: left out if under a half."""
-Masks = Literal["count", "subject"]
 
 
 @dataclass

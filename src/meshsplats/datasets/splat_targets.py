@@ -20,9 +20,10 @@ from meshsplats.cameras.placing import (
     inside_cameras,
     outside_cameras,
 )
+from meshsplats.choices import Look
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.looks import Look, check_look, draw_splats
+from meshsplats.rendering.looks import check_look, draw_splats
 from meshsplats.viewpoints.finding import find_cameras
 
 Placement = Literal["auto", "object", "surrounded", "inside", "found"]

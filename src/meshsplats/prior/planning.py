@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._options import check_options
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.scene_files import SceneReading
@@ -25,41 +24,10 @@ from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.bind import LAYERS, Source, bind
+from meshsplats.prior.laying import bind
 from meshsplats.prior.model import load_prior
+from meshsplats.prior.options import LayingOptions
 from meshsplats.prior.training import train_prior
-
-
-@dataclass(frozen=True)
-class LayingOptions:
-    """Splats on the base."""
-
-    triangles: int = 1
-    """Triangles on each face, in each layer: 1 to 256; square numbers avoid T-junctions."""
-    by_area: bool = False
-    """Take ``triangles`` as the mean, with more on larger faces."""
-    layers: int = LAYERS
-    """Layers of triangles on each face: 1 to 16."""
-    spacing: float | None = None
-    """Distance between layers along the base's normals, scene units; below 0 inwards; 0: all layers lie in
-    the base. Default: inwards, all layers together 1/30 of the diagonal of the base's box."""
-    colors: Source = "auto"
-    """Initial colours: the base's texture, its vertex colours, or the images that see a point most squarely;
-    auto: the first of these that exists."""
-    texture: Path | None = None
-    """Image for the base's texture coordinates, if its file names none."""
-
-    def check(self) -> None:
-        """OptionsError for options without effect, ValueError for values out of range."""
-        check_options(self)
-        if self.texture is not None and self.colors not in ("auto", "texture"):
-            raise OptionsError(f"``texture`` has no effect with ``colors`` {self.colors}")
-        if self.spacing and self.layers == 1:
-            raise OptionsError("``spacing`` has no effect with one layer; give ``layers``")
-
-    def load_base(self, path: Path) -> BaseMesh:
-        """The base mesh at ``path``, with its textures where colours come from them."""
-        return load_base(path, texture=self.texture, textures=self.colors in ("auto", "texture"))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -15,11 +15,11 @@ from meshsplats.datasets.views import View
 from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.model import MeshPrior
+from meshsplats.prior.options import LAYERS, Source
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 from meshsplats.prior.shells import DepthViews, render_depth_views
 from meshsplats.surfaces.color_projection import colors_from_views
 
-Source = Literal["auto", "texture", "vertices", "views", "grey"]
 MAX_LAYERS = 16
 MAX_TRIANGLES = 50_000_000
 LAYER_OPACITY = 0.1
@@ -29,8 +29,6 @@ SHELL_OPACITY = 0.3
 FAINT = 0.005
 """Maximum initial opacity of shells that protrude through the base: almost invisible, but unlike 0 it has a
 gradient."""
-LAYERS = 6
-"""Default number of layers."""
 SHELLS_DEPTH = 1 / 30
 """Default depth of all shells together, relative to the diagonal of the base's bounding box."""
 
