@@ -67,10 +67,10 @@ def check_folder(folder: Path, *, resume: bool = False, replace_old: bool = Fals
     if folder.exists() and not (folder / TABLE).is_file():
         raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
     if resume and not (unfinished / CONFIGURATION).is_file():
-        raise FileNotFoundError(f"nothing to resume in {unfinished}: leave out --resume to start again")
+        raise FileNotFoundError(f"nothing to resume in {unfinished}: leave out ``resume`` to start again")
     if unfinished.exists() and not resume and not replace_old:
         raise FileExistsError(
-            f"{unfinished} is left from an earlier run: --resume continues it, --force starts again"
+            f"{unfinished} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
         )
 
 

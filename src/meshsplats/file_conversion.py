@@ -68,7 +68,7 @@ class Converter:
         if kind == "cameras" or (kind == "mesh" and product.as_splats):
             raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
         if product.stream and kind == "mesh":
-            raise FileFormatError(f"{job.source}: a mesh; --stream is for splats")
+            raise FileFormatError(f"{job.source}: a mesh; ``stream`` is for splats")
         if product.stream:
             return self._splats_in_blocks(job) if product.as_splats else self._mesh_in_blocks(job, cameras)
         if product.as_splats:

@@ -198,7 +198,7 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
     if mesh.sh_degree:
         found["harmonics_drawn_by"] = HARMONICS_DRAWN_BY
         found["others_show"] = (
-            f"{BASE}; bake --colors makes means of views" if mesh.plain_colors is None else PLAIN
+            f"{BASE}; meshsplats bake makes means of views" if mesh.plain_colors is None else PLAIN
         )
     if mesh.binding is not None:
         base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"

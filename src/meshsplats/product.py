@@ -169,7 +169,7 @@ class Product:
         if kind == "splats" and self.files.alpha == "hybrid":
             raise OptionsError(
                 f"{job.shown} holds splats: ``alpha`` hybrid is for a mesh with solid triangles, as finetune"
-                " --opacity cutoff --soft-share makes"
+                " makes with ``opacity`` cutoff and ``soft_share``"
             )
         if kind != "mesh":
             return

@@ -138,7 +138,7 @@ class Scoring:
         found, order = self.options.reading.load_scene(path), self.options.order
         if not isinstance(found, SplatMesh):
             raise FileFormatError(
-                f"{path}: splats, not a mesh; give them with --splats, or convert them first"
+                f"{path}: splats, not a mesh; give them with ``splats``, or convert them first"
             )
         return found if order is None else replace(found, order=order)
 

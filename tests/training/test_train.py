@@ -646,7 +646,7 @@ def test_bad_input_is_refused_before_the_work(ball, tmp_path):
         train_config(point_share=0.1)
     with pytest.raises(TypeError, match="did you mean 'max_splats'"):
         train_config(max_splat=3)
-    with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out --resume"):
+    with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out ``resume``"):
         train(ball, train_config(steps=1), run=RunOptions(tmp_path / "none", resume=True))
 
 
@@ -744,7 +744,7 @@ def test_memory_is_estimated_up_front(ball, monkeypatch):
     from meshsplats.finetuning import memory
 
     monkeypatch.setattr(memory, "available_memory", lambda: 10**8)
-    with pytest.raises(MemoryError, match=r"training 100,000 fans on 23 images needs about .*--max-splats"):
+    with pytest.raises(MemoryError, match=r"training 100,000 fans on 23 images needs about .*``max_splats``"):
         train(ball, train_config(steps=1))
 
 

@@ -189,7 +189,7 @@ def refuse_existing(paths: Iterable[str | os.PathLike[str]], force: bool) -> Non
     if taken:
         more = f" (and {len(taken) - 1} more)" if len(taken) > 1 else ""
         raise FileExistsError(
-            errno.EEXIST, f"the output exists already{more}; give --force to overwrite it", taken[0]
+            errno.EEXIST, f"the output exists already{more}; give ``force`` to overwrite it", taken[0]
         )
     if _promised is not None:
         _promised.update(real)
@@ -255,7 +255,7 @@ def _place_new(temporary: Path, target: Path, shown: str) -> None:
 def _written_meanwhile(shown: str) -> FileExistsError:
     return FileExistsError(
         errno.EEXIST,
-        "another process has written this output meanwhile; give another name, or --force to overwrite it",
+        "another process has written this output meanwhile; give another name, or ``force`` to overwrite it",
         shown,
     )
 

@@ -14,6 +14,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 from meshsplats.cli.messages import (
     DISK_FULL,
@@ -30,6 +31,7 @@ from meshsplats.cli.messages import (
     print_json_error,
     read_from_standard_input,
     say,
+    write_options,
 )
 from meshsplats.errors import ClusterError, DeviceError
 
@@ -148,11 +150,12 @@ def _run(name: str, arguments: list[str]) -> int:
 
 def _execute(name: str, words: list[str]) -> int:
     from meshsplats._files.atomic import promises_kept
-    from meshsplats.cli.arguments import parse, usage_errors
+    from meshsplats.cli.arguments import parse, spelled, usage_errors
 
     module, _, attribute = COMMANDS[name][0].partition(":")
     kind = getattr(importlib.import_module(module), attribute)
-    with usage_errors(kind), promises_kept():
+    write_options(partial(spelled, kind))
+    with usage_errors(), promises_kept():
         return parse(kind, f"meshsplats {name}", words).execute() or OK
 
 

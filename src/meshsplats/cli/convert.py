@@ -163,7 +163,7 @@ class Convert(Command):
         codes, skipped = [], 0
         for job in track(todo, "converting", len(todo)):
             try:
-                with usage_errors(type(self)):
+                with usage_errors():
                     result = self._convert(job, cameras)
                 skipped += result["skipped"]
                 self._print_line(result, job)

@@ -370,7 +370,7 @@ class Album:
         if self.missing and refused:
             raise FileFormatError(
                 f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
-                f" ({_first(self.missing)}){self._near()}; --missing skip (missing='skip') leaves them out"
+                f" ({_first(self.missing)}){self._near()}; ``missing`` skip leaves them out"
             )
         near = self._near() if self.missing else ""
         for names, text in (

@@ -82,7 +82,9 @@ class SceneReading:
 
         kind = identify(path)
         if kind == "cameras":
-            raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
+            raise FileFormatError(
+                f"{path}: a JSON file; expected splats or a mesh (``cameras`` takes cameras)"
+            )
         if kind == "splats":
             return self.load(path, up=up)
         self.refuse_for(path)

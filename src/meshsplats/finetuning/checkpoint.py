@@ -73,7 +73,7 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no checkpoint at {path}: leave out --resume to begin anew")
+        raise FileNotFoundError(f"no checkpoint at {path}: leave out ``resume`` to begin anew")
     arrays, texts = load_safetensors(path, only_texts=only_header)
     try:
         header = json.loads(texts.get(_KEY, ""))

@@ -225,7 +225,7 @@ def _cell_scene(
 def _warn_of_the_rest(image: ViewImage) -> None:
     if image.alpha is None and image.mask is None:
         warnings.warn(
-            "--crop with photographs that have neither masks nor alpha: they still show what is cropped,"
+            "``crop`` with photographs that have neither masks nor alpha: they still show what is cropped,"
             " which will be baked into the rest; to get a part, crop the tuned mesh",
             DataWarning,
             stacklevel=2,

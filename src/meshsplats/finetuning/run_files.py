@@ -61,16 +61,16 @@ class RunFiles:
 
         checkpoint = self.folder / (RECORD if self.in_cells else CHECKPOINT)
         if resume and not checkpoint.is_file():
-            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to start again")
+            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out ``resume`` to start again")
         for left in (self.folder / CHECKPOINT, self.folder / RECORD):
             if left.exists() and not (resume or force):
                 raise FileExistsError(
-                    f"{left} is left from an earlier run: --resume continues it, --force starts again"
+                    f"{left} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
                 )
         if resume and self.mesh.exists() and not force:
             raise FileExistsError(
                 f"{self.mesh} exists: the run has ended, or there was one before;"
-                " --resume --force continues it and overwrites the mesh"
+                " ``resume`` and ``force`` continue it and overwrite the mesh"
             )
         check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
 

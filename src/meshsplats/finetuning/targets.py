@@ -139,9 +139,9 @@ class Targets:
                 origin=scene.origin,
             )
             if not dataset.train:
-                raise ValueError(
+                raise OptionValueError(
                     f"{self.data}: all its {len(dataset.test)} views are held out, so there is nothing to"
-                    " train on; --test-every 0 holds none out"
+                    " train on; ``test_every`` 0 holds none out"
                 )
             return dataset
         if isinstance(scene, SplatMesh):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshsplats.choices import Masks, Missing
-from meshsplats.errors import OptionsError
+from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import BACKGROUNDS
 from meshsplats.finetuning.targets import check_cache
 from meshsplats.training.config import TrainConfig
@@ -77,9 +77,9 @@ class PhotographOptions:
             masks=self.masks,
         )
         if len(dataset.train) < 2:
-            raise ValueError(
+            raise OptionValueError(
                 f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
-                " are needed to train on (--test-every 0 holds none out)"
+                " are needed to train on (``test_every`` 0 holds none out)"
             )
         if config.background in BACKGROUNDS:
             found = Background(BACKGROUNDS[config.background], "given")
@@ -100,7 +100,9 @@ class PhotographOptions:
         dataset, background = self.load(folder, config)
         mask = dataset.train[0].mask
         if mask is not None and mask.mean() < 0.5:
-            say("masks leave most pixels out, which may become anything: --masks subject cuts out an object")
+            say(
+                "masks leave most pixels out, which may become anything: ``masks`` subject cuts out an object"
+            )
         points = load_points(folder, origin=dataset.origin)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 
