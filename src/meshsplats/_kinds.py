@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -143,6 +144,12 @@ def require_path(name: str, value: object, instead: Mapping[str, str] | None = N
     """``need_path`` for one argument, or a part of one, by its ``name``."""
     if not isinstance(value, (str, os.PathLike)):
         raise TypeError(_message(name, "a path", "path", value, instead or {}))
+
+
+def as_path(name: str, value: object) -> Path:
+    """The path that the argument ``name`` gives; TypeError for what names no file or folder."""
+    require_path(name, value)
+    return Path(value)  # type: ignore[arg-type]
 
 
 def need_array(

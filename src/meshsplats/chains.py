@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import in_words, replace_folder, write_text
+from meshsplats._kinds import as_path
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.file_options import ChainOptions
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
@@ -87,7 +89,7 @@ def begin_folder(folder: Path) -> Path:
 
 def make_chain(
     cloud: GaussianCloud,
-    folder: Path,
+    folder: str | os.PathLike[str],
     options: ChainOptions | None = None,
     config: FinetuneConfig | None = None,
     *,
@@ -109,6 +111,7 @@ def make_chain(
 
     Raises Interrupted after Ctrl-C in a level, whose predecessors stay, and what ``plan_levels`` raises.
     """
+    folder = as_path("folder", folder)
     chosen, unfinished = options or ChainOptions(), partial_folder(folder)
     chain = planned(chosen, len(cloud))
     unfinished.mkdir(exist_ok=True)

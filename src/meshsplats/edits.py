@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import warnings
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import together
+from meshsplats._kinds import as_path
 from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
@@ -65,8 +67,8 @@ class Cleaned:
 
 
 def clean_file(
-    source: Path,
-    output: Path,
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     rules: CleaningRules | None = None,
     *,
     reading: SceneReading | None = None,
@@ -87,6 +89,7 @@ def clean_file(
         threads: at most this many; all processors by default.
         force: replace files that are there.
     """
+    source, output = as_path("source", source), as_path("output", output)
     preview = beside(output, PREVIEW)
     check_outputs([preview] if preview_only else [output, preview], force, inputs=[source])
     with warnings.catch_warnings():
@@ -136,8 +139,8 @@ class EditCallbacks:
 
 
 def simplify_file(
-    source: Path,
-    output: Path,
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     options: SimplifyOptions,
     callbacks: EditCallbacks | None = None,
     *,
@@ -156,6 +159,7 @@ def simplify_file(
 
     Raises what ``SimplifyOptions.check`` and ``check_outputs`` raise, and FileFormatError for a mesh.
     """
+    source, output = as_path("source", source), as_path("output", output)
     own = callbacks or EditCallbacks()
     check_splat_endings(written_ending(output.name))
     options.check()
@@ -199,8 +203,8 @@ class Baked:
 
 
 def bake_file(
-    source: Path,
-    output: Path,
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     options: BakingOptions,
     *,
     place: Place = lambda scene: scene,
@@ -212,6 +216,7 @@ def bake_file(
     ``place`` makes of it the mesh that is written; ``say`` gets a line about the views. ValueError where
     there is nothing to bake.
     """
+    source, output = as_path("source", source), as_path("output", output)
     check_mesh_suffix(output)
     options.views.check()
     check_outputs([output], force, inputs=[source])

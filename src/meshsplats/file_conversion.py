@@ -38,7 +38,7 @@ from meshsplats.product import Product
 
 
 @dataclass(frozen=True)
-class Callbacks:
+class ConversionCallbacks:
     """What a program does for the converter of its files."""
 
     load: Callable[[Path], GaussianCloud]
@@ -60,7 +60,7 @@ class Converter:
     it has some."""
 
     product: Product
-    callbacks: Callbacks
+    callbacks: ConversionCallbacks
 
     def made(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``. Returns counts, scores and seconds, for JSON."""

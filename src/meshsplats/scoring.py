@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._kinds import as_path
 from meshsplats._origin import shared_origin
 from meshsplats._words import optional_color
 from meshsplats.cameras.files import load_cameras
@@ -56,16 +58,19 @@ class Scoring:
     threads: int | None = None
     progress: Progress | None = None
 
-    def run(self, paths: Sequence[Path], *, force: bool = False) -> Report:
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", as_path("folder", self.folder))
+
+    def run(self, paths: Sequence[str | os.PathLike[str]], *, force: bool = False) -> Report:
         """Scores the meshes at ``paths`` and writes the files of them. ``force``: in place of older ones.
 
         Raises what ``ScoringOptions.check`` and ``check_outputs`` raise, and FileFormatError for splats in
         place of a mesh.
         """
-        chosen = self.options
-        chosen.check(paths)
+        chosen, files = self.options, [as_path(f"paths[{i}]", path) for i, path in enumerate(paths)]
+        chosen.check(files)
         self.check_outputs(force)
-        meshes = {name: self._load_mesh(path) for name, path in mesh_names(paths).items()}
+        meshes = {name: self._load_mesh(path) for name, path in mesh_names(files).items()}
         before = None if chosen.before is None else self._load_mesh(chosen.before)
         splats = None if chosen.splats is None else chosen.reading.load(chosen.splats)
         known = [each for each in (splats, *meshes.values(), before) if each is not None]
@@ -79,7 +84,7 @@ class Scoring:
             optional_color(chosen.background),
             None if chosen.data is None else dataset,
             {name: scene for name, scene in scenes.items() if scene is not None},
-            chosen.splats or (paths[0] if paths else None),
+            chosen.splats or (files[0] if files else None),
             self.threads,
         )
         if chosen.data is None and splats is not None:

@@ -107,7 +107,7 @@ def warnings_kept() -> Iterator[list[str]]:
         warnings.showwarning = show
 
 
-def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:
+def track(items: Iterable[T], total: int, label: str) -> Iterable[T]:
     """``items`` with a progress bar on stderr, where that is a terminal."""
     if not sys.stderr.isatty():
         yield from items

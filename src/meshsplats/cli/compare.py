@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -60,7 +61,7 @@ class Compare(Command):
             self.how,
             force=self.force,
             say=say,
-            progress=lambda views, count: track(views, "comparing", count),
+            progress=partial(track, label="comparing"),
         )
         write_configuration(self.output / CONFIGURATION, "compare", self)
         scores, result = made.scores, made.result

@@ -161,7 +161,7 @@ class Convert(Command):
         """Does every job, also after failures; a full disk ends them. Returns the exit code: that of the
         failures if they are all of one kind."""
         codes, skipped = [], 0
-        for job in track(todo, "converting", len(todo)):
+        for job in track(todo, len(todo), "converting"):
             try:
                 with usage_errors():
                     result = self._convert(job, cameras)
@@ -203,11 +203,11 @@ class Convert(Command):
 
     def _made(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``; counts, scores and seconds."""
-        from meshsplats.file_conversion import Callbacks, Converter
+        from meshsplats.file_conversion import ConversionCallbacks, Converter
 
         if not (self.product.as_splats or self.product.stream):
             self.product.check_kind(job, self.reading)
-        callbacks = Callbacks(
+        callbacks = ConversionCallbacks(
             load=partial(self.reading.load, up=self.product.up),
             stream=self._opened,
             place=partial(written, origin=self.product.origin),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -64,7 +64,9 @@ class Evaluate(Command):
         if self.how.protocol is None and not here:
             raise UsageError("--cluster is for the scenes of --protocol")
         start = time.perf_counter()
-        scoring = Scoring(self.how, self.output, self.threads, _progress if here else None)
+        scoring = Scoring(
+            self.how, self.output, self.threads, partial(track, label="scoring") if here else None
+        )
         if self.how.protocol is None:
             reports = [scoring.run(self.mesh, force=self.force)]
         else:
@@ -78,7 +80,3 @@ class Evaluate(Command):
             *notes(reports),
             f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/",
         )
-
-
-def _progress(views: Iterable[Any], count: int) -> Iterable[Any]:
-    return track(views, "scoring", count)

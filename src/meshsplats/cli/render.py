@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -58,7 +59,7 @@ class Render(Command):
 
         start = time.perf_counter()
         run = ImageRun(self.input, self.output, self.images, say, self.cluster.workers)
-        made = run.save(force=self.force, progress=lambda items, count: track(items, "rendering", count))
+        made = run.save(force=self.force, progress=partial(track, label="rendering"))
         files, cameras = made.files, made.cameras
         write_configuration(files.config, "render", self, made.record)
         seconds = time.perf_counter() - start

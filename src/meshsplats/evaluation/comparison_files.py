@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import write_text
+from meshsplats._kinds import as_path
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import convert
@@ -40,9 +42,9 @@ class SavedComparison:
 
 
 def save_comparison(
-    splats: Path,
-    mesh: Path | None,
-    folder: Path,
+    splats: str | os.PathLike[str],
+    mesh: str | os.PathLike[str] | None,
+    folder: str | os.PathLike[str],
     options: ComparisonOptions,
     *,
     force: bool = False,
@@ -60,13 +62,14 @@ def save_comparison(
     Raises what ``ComparisonOptions.check`` and ``check_outputs`` raise, and FileFormatError for a file of
     another kind.
     """
+    splats, folder = as_path("splats", splats), as_path("folder", folder)
     options.check()
     cloud = cropped(options.reading.load(splats), options.part.crop)
     photographs = options.views.photographs(cloud.origin)
     cameras = options.views.make(cloud, splats, count=8, side=400, photographs=photographs, say=say)
     strips = view_names(len(cameras))
     check_outputs([folder / name for name in (*strips, RESULTS, CAMERAS, CONFIGURATION)], force, folder)
-    made = _mesh(mesh, cloud, cameras, options)
+    made = _mesh(None if mesh is None else as_path("mesh", mesh), cloud, cameras, options)
     start, draw = time.perf_counter(), options.draw
     background = choose_background(draw.color, photographs, {"splats": cloud}, splats, draw.threads)
     samples = draw.samples or mesh_samples(options.look, made, cameras)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import write_bytes
+from meshsplats._kinds import as_path
 from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cluster import Workers, open_workers
@@ -77,6 +78,10 @@ class ImageRun:
     options: ImageOptions = field(default_factory=ImageOptions)
     say: Callable[[str], object] = say_nothing
     workers: Callable[[int | None], AbstractContextManager[Workers]] = in_this_process
+
+    def __post_init__(self) -> None:
+        for name in ("source", "output"):
+            object.__setattr__(self, name, as_path(name, getattr(self, name)))
 
     def save(
         self, *, force: bool = False, progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None
