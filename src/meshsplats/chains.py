@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from meshsplats._files.atomic import in_words, replace_folder, write_text
+from meshsplats._files.atomic import in_words, replace_folder, write_json
 from meshsplats._kinds import as_path
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.file_options import ChainOptions
@@ -125,7 +125,7 @@ def make_chain(
             with on_level(number, level) as show:
                 row, splats = _made(cloud, splats, waiting, path, chosen, config, place, show)
             waiting = []
-            write_text(records[-1], json.dumps(row, indent=1, allow_nan=False) + "\n")
+            write_json(records[-1], row)
         rows.append(json.loads(records[-1].read_text(encoding="utf-8")))
     table = {
         "source": source,
@@ -137,7 +137,7 @@ def make_chain(
     }
     for record in records:
         record.unlink()
-    write_text(unfinished / TABLE, json.dumps(table, indent=1, allow_nan=False) + "\n")
+    write_json(unfinished / TABLE, table)
     replace_folder(unfinished, folder)
     return table
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import secrets
@@ -171,6 +172,11 @@ def write_bytes(path: str | os.PathLike[str], content: bytes | memoryview) -> No
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Writes ``text`` to ``path`` as UTF-8, whole or not at all."""
     write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: str | os.PathLike[str], content: object) -> None:
+    """Writes ``content`` to ``path`` as JSON, whole or not at all. ValueError for numbers that JSON lacks."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def refuse_existing(paths: Iterable[str | os.PathLike[str]], force: bool) -> None:

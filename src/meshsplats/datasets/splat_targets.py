@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._kinds import need, need_all
+from meshsplats._kinds import need, need_all, need_choice
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.placing import (
     ALL_ELEVATIONS,
@@ -101,8 +101,7 @@ def splat_dataset(
     need_all(Camera, cameras=cameras, optional=True)
     if len(cloud) == 0:
         raise ValueError("the scene is empty: there is nothing to make images of")
-    if placement not in get_args(Placement):
-        raise ValueError(f"placement must be one of {', '.join(get_args(Placement))}, got {placement!r}")
+    need_choice(Placement, placement=placement)
     if train < 1 or test < 0:
         raise ValueError(f"there must be at least 1 training view and 0 test views, got {train} and {test}")
     if not 1 <= width <= MAX_SIDE or not (height is None or 1 <= height <= MAX_SIDE):

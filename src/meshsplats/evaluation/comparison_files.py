@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -10,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from meshsplats._files.atomic import write_text
+from meshsplats._files.atomic import write_json
 from meshsplats._kinds import as_path
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
@@ -104,7 +103,7 @@ def save_comparison(
         "seconds": round(time.perf_counter() - start, 3),
         **comparison.to_dict(),
     }
-    write_text(folder / RESULTS, json.dumps(result, indent=1, allow_nan=False) + "\n")
+    write_json(folder / RESULTS, result)
     save_cameras(cameras, folder / CAMERAS, origin=cloud.origin)
     return SavedComparison(comparison, background, result)
 

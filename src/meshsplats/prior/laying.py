@@ -8,7 +8,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._kinds import need, need_all
+from meshsplats._kinds import need, need_all, need_choice
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
@@ -209,8 +209,7 @@ def _color_source(base: BaseMesh, colors: Source, views: Sequence[View]) -> Sour
         "views": len(views) > 0,
         "grey": True,
     }
-    if colors not in get_args(Source):
-        raise ValueError(f"colors must be one of {', '.join(get_args(Source))}, got {colors!r}")
+    need_choice(Source, colors=colors)
     if colors == "auto":
         return next(name for name in get_args(Source) if available.get(name))
     if not available[colors]:
