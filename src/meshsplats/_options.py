@@ -21,12 +21,12 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
+from numbers import Real
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import numpy as np
-
 M = TypeVar("M")
-NUMBERS = (int, float, np.integer, np.floating)
+NUMBERS = (Real,)
+"""Numbers of Python and of NumPy, which is not imported for help."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
-
-MAX_SIDE = 1 << 15
-"""Largest image side in pixels."""
+from meshsplats.choices import MAX_SIDE
 
 NEAR_SHARE = 0.002
 """Depth of the near plane of a camera that names none, as a share of the distance from which on the scene

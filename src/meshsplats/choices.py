@@ -1,4 +1,4 @@
-"""Words that options of several rooms take."""
+"""Words and numbers that options of several rooms take."""
 
 from __future__ import annotations
 
@@ -17,3 +17,6 @@ Missing = Literal["few", "error", "skip"]
 
 Masks = Literal["count", "subject"]
 """What masks of images mean: only pixels inside of them count, or they cut out a subject."""
+
+MAX_SIDE = 1 << 15
+"""Largest image side in pixels."""

@@ -7,9 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
+from typing import TYPE_CHECKING, Literal
 
 from meshsplats._options import check_options
 from meshsplats._words import optional_color
@@ -21,6 +19,14 @@ from meshsplats.finetuning.config import FinetuneConfig, make_config
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.outputs import MeshEnding
 from meshsplats.order import Order
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    Direction = Sequence[float] | np.ndarray
+else:
+    Direction = Sequence[float]  # whoever asks for the types of fields needs no NumPy
+
 
 MINUTES = 2.0
 """Default length of the fine-tuning of a level."""
@@ -93,7 +99,7 @@ class ChainOptions:
     """In which triangles are blended and tuned; None: that of the meshes and of the configuration."""
     sh_degree: int | None = None
     """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
-    up: Sequence[float] | np.ndarray | None = None
+    up: Direction | None = None
     """Direction that points up in the world; None: that of the splats."""
     threads: int | None = None
     """Maximum number of threads; None: all processors."""

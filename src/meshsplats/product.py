@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
-
 from meshsplats._options import Advanced, changed, check_options
 from meshsplats._words import optional_up
 from meshsplats.choices import Look
@@ -25,6 +23,8 @@ from meshsplats.formats.outputs import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from meshsplats.camera import Camera
     from meshsplats.datasets.scene_files import SceneReading
     from meshsplats.jobs import Job

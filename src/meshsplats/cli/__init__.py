@@ -14,7 +14,6 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 
 from meshsplats.cli.messages import (
     DISK_FULL,
@@ -154,7 +153,7 @@ def _execute(name: str, words: list[str]) -> int:
 
     module, _, attribute = COMMANDS[name][0].partition(":")
     kind = getattr(importlib.import_module(module), attribute)
-    write_options(partial(spelled, kind))
+    write_options(lambda name: spelled(kind, name))
     with usage_errors(), promises_kept():
         return parse(kind, f"meshsplats {name}", words).execute() or OK
 

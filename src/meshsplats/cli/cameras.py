@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import tyro
 
 from meshsplats._words import optional_up
@@ -17,6 +16,8 @@ from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import UsageError, command_line, say
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from meshsplats.viewpoints.finding import FoundCameras
 
 

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import tyro
 
 from meshsplats._words import plural
@@ -237,8 +236,7 @@ class Convert(Command):
     def _opening(self, cloud: GaussianCloud, source: Path, given: Sequence[Camera] | None) -> Camera | None:
         from meshsplats.viewpoints.showing import default_views
 
-        found = default_views(cloud, source, 1, up=self.product.direction, given=given or None)
-        if found is None:
+        if (found := default_views(cloud, source, 1, up=self.product.direction, given=given or None)) is None:
             return None
         say(found[1])
         return found[0][0] if found[0] else None
@@ -253,6 +251,7 @@ class Convert(Command):
         self.finish(result, *self._lines(result, job, cameras), indent=None)
 
     def _lines(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> list[str]:
+        from meshsplats._origin import zero_origin
         from meshsplats.evaluation.viewers import AlphaChoice
         from meshsplats.file_conversion import seen_from
 
@@ -276,7 +275,7 @@ class Convert(Command):
         if result["preview"]:
             lines.append(f"preview: {result['preview']}")
         if result.get("converted") is not None and self.product.files.compression == "none":
-            lines.append(f"next: {self._next(seen_from(cameras, job.source, np.zeros(3)))}")
+            lines.append(f"next: {self._next(seen_from(cameras, job.source, zero_origin()))}")
         return lines
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
 from meshsplats._options import Range, check_options
 
 
@@ -35,6 +33,8 @@ class CleaningRules:
     def __post_init__(self) -> None:
         check_options(self)
         if self.crop is not None:
+            import numpy as np
+
             low, high = np.array(self.crop[:3]), np.array(self.crop[3:])
             if not (np.isfinite(self.crop).all() and (low < high).all()):
                 raise ValueError(f"crop must be x0 y0 z0 x1 y1 z1 with x0 < x1 and so on, got {self.crop}")

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE, MAX_SKEW
+from meshsplats.camera import MAX_SKEW
+from meshsplats.choices import MAX_SIDE
 from meshsplats.datasets.image_files import Frame, Shelf
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
-
 from meshsplats._options import Advanced, Help, changed
 from meshsplats._words import direction_in_words
 from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.formats.splat_formats import listed, y_up_suffixes
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from meshsplats.formats.streaming import SplatStream
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.mesh import SplatMesh

@@ -7,20 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-
 from meshsplats._options import Help, Range, changed, check_options
 from meshsplats._words import parse_up
-from meshsplats.camera import MAX_SIDE, Camera
-from meshsplats.choices import Masks, Missing
+from meshsplats.choices import MAX_SIDE, Masks, Missing
 from meshsplats.errors import OptionsError
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from meshsplats.camera import Camera
     from meshsplats.datasets.views import Dataset
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.mesh import SplatMesh
 
-Origin = Sequence[float] | np.ndarray
+    Origin = Sequence[float] | np.ndarray
+
 MissingOfData = Annotated[
     Missing, Help("With ``data``: missing images are left out; few: if fewer than half are missing.")
 ]
@@ -187,6 +188,8 @@ class SceneViews:
         fov = self.fov
         if self.focal_length is not None:
             shorter = 36 * min(1.0, lens["height"] / lens["width"])
+            import numpy as np
+
             fov = float(np.degrees(2 * np.arctan(shorter / (2 * self.focal_length))))
         if self.look_around is not None:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
@@ -200,7 +203,7 @@ class SceneViews:
                 say(found[1])
                 return found[0]
         lens["fov"] = 45.0 if fov is None else fov
-        target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
+        target = None if self.look_at is None else self.look_at - scene.origin
         lens |= {"distance": self.distance, "target": target}
         if self.dome is not None:
             return dome(scene, self.dome, **lens)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from meshsplats._kinds import need, need_all, need_choice
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.camera import Camera
 from meshsplats.cameras.placing import (
     ALL_ELEVATIONS,
     DISTANCES,
@@ -20,7 +20,7 @@ from meshsplats.cameras.placing import (
     inside_cameras,
     outside_cameras,
 )
-from meshsplats.choices import Look
+from meshsplats.choices import MAX_SIDE, Look
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.looks import check_look, draw_splats

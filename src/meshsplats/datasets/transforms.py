@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats._json import read_json
-from meshsplats.camera import MAX_SIDE, from_opengl
+from meshsplats.camera import from_opengl
+from meshsplats.choices import MAX_SIDE
 from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable, leads_out
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import DataWarning, FileFormatError

@@ -9,7 +9,8 @@ import numpy as np
 
 from meshsplats._core import library, structures
 from meshsplats._core.library import check_threads
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.camera import Camera
+from meshsplats.choices import MAX_SIDE
 from meshsplats.mesh import Triangles, checked_filter
 from meshsplats.order import checked_order
 

@@ -10,7 +10,6 @@ from meshsplats._options import changed, check_options
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.errors import OptionsError
-from meshsplats.mesh import checked_cutoff
 from meshsplats.rendering.drawing import DrawingOptions
 
 
@@ -59,6 +58,8 @@ class ImageOptions:
         if self.as_splats and self.depth != "none":
             raise OptionsError("``depth`` is that of a mesh: leave out ``as_splats``")
         if self.cutoff is not None:
+            from meshsplats.mesh import checked_cutoff
+
             checked_cutoff(self.cutoff)
             if self.as_splats:
                 raise OptionsError("``cutoff`` is for a mesh: leave out ``as_splats``")

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE, OPENGL, Camera
+from meshsplats.camera import OPENGL, Camera
+from meshsplats.choices import MAX_SIDE
 from meshsplats.formats._orientation import HALF_TURN_Z
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.scene import placed_nodes
