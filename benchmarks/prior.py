@@ -24,7 +24,8 @@ from meshsplats.finetuning.loss import DefaultLoss
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
-from meshsplats.prior import bind, prior_config
+from meshsplats.prior import bind
+from meshsplats.prior.options import prior_config
 
 FORMS = (
     "layers=1",

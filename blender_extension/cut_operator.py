@@ -185,7 +185,7 @@ class CleanSplats(bpy.types.Operator):
 
     def execute(self, context):
         from meshsplats.blender.inside import cutting
-        from meshsplats.conversion.cleaning import CleaningRules
+        from meshsplats.conversion.cleaning_rules import CleaningRules
 
         obj = context.object
         # Blender's numbers have single precision, and its defaults are to be those of the rules.

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 
 import meshsplats as ms
+from meshsplats.choices import Look
 from meshsplats.demo_scene import make_scene
-from meshsplats.rendering.looks import Look
 
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 cameras = ms.dome(cloud, 6, width=240, height=240)

@@ -10,8 +10,9 @@ from _splats import few_splats
 
 import meshsplats as ms
 from meshsplats.evaluation.mesh_files import MeshFileOptions
-from meshsplats.file_conversion import Callbacks, Converter, Product, seen_from
+from meshsplats.file_conversion import ConversionCallbacks, Converter, seen_from
 from meshsplats.jobs import jobs
+from meshsplats.product import Product
 
 
 def record(job):
@@ -19,7 +20,7 @@ def record(job):
         path.write_text("noted")
 
 
-PLAIN = Callbacks(
+PLAIN = ConversionCallbacks(
     load=ms.load_gaussians,
     stream=ms.stream_gaussians,
     place=lambda scene: scene,

@@ -16,33 +16,32 @@ from _splats import few_splats
 import meshsplats as ms
 from meshsplats._options import Help, settings
 from meshsplats.blender.files import PictureOptions
-from meshsplats.chains import ChainOptions, LevelTuning, make_chain, table_in_words
+from meshsplats.chains import make_chain, table_in_words
 from meshsplats.cluster import Workers
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules
+from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews, check_photographs
-from meshsplats.edits import (
-    BakingOptions,
-    EditCallbacks,
-    SimplifyOptions,
-    bake_file,
-    clean_file,
-    simplify_file,
-)
+from meshsplats.edits import EditCallbacks, bake_file, clean_file, simplify_file
 from meshsplats.errors import OptionsError, OptionValueError
-from meshsplats.evaluation.comparison_files import ComparisonOptions, save_comparison
+from meshsplats.evaluation.comparison_files import save_comparison
 from meshsplats.evaluation.mesh_files import MeshFileOptions
-from meshsplats.file_conversion import Product
-from meshsplats.finetuning.file_tuning import FileTuning, StartOptions
+from meshsplats.evaluation.options import ComparisonOptions
+from meshsplats.file_options import BakingOptions, ChainOptions, LevelTuning, ScoringOptions, SimplifyOptions
+from meshsplats.finetuning.file_tuning import FileTuning
 from meshsplats.finetuning.plans import RunResult
 from meshsplats.finetuning.run import RunOptions
 from meshsplats.finetuning.setup import Setup
+from meshsplats.finetuning.start_options import StartOptions
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.outputs import check_mesh_suffix, check_splat_endings, placed
+from meshsplats.inspection import describe
 from meshsplats.jobs import formats_of
-from meshsplats.prior.planning import LayingOptions, PriorTraining, pose_files, posed_files
-from meshsplats.renders.saving import ImageOptions, ImageRun
-from meshsplats.scoring import Scoring, ScoringOptions
+from meshsplats.prior.options import LayingOptions
+from meshsplats.prior.planning import PriorTraining, pose_files, save_poses
+from meshsplats.product import Product
+from meshsplats.renders.options import ImageOptions
+from meshsplats.renders.saving import ImageRun
+from meshsplats.scoring import Scoring
 from meshsplats.surfaces.files import SurfaceFileOptions
 from meshsplats.surfaces.options import SurfaceOptions
 from meshsplats.tiles.options import TilingOptions
@@ -357,7 +356,12 @@ def test_priors_need_options_that_agree(tmp_path):
     for name, factor in (("a", 1.0), ("b", 2.0)):
         save_base(replace(base, vertices=base.vertices * np.float32(factor)), tmp_path / f"{name}.ply")
     bases = [tmp_path / "a.ply", tmp_path / "b.ply"]
-    (one, first), (two, second) = posed_files(prior, bases, tmp_path / "p.npz")
+    (tmp_path / "there.npz").touch()
+    with pytest.raises(FileExistsError):  # when it is called
+        save_poses(prior, bases[:1], tmp_path / "there.npz")
+    poses: list[ms.SplatMesh] = []
+    one, two = save_poses(prior, bases, tmp_path / "p.npz", place=lambda mesh: poses.append(mesh) or mesh)
+    first, second = poses
     assert [one, two] == pose_files(tmp_path / "p.npz", 2)
     np.testing.assert_allclose(second.vertices, 2 * first.vertices, atol=1e-5)
     np.testing.assert_array_equal(ms.load_mesh(two).vertices, second.vertices)
@@ -368,3 +372,37 @@ def test_priors_need_options_that_agree(tmp_path):
         PriorTraining(tmp_path / "a.ply", tmp_path / "p.obj", *given).check()
     with pytest.raises(OptionsError, match="give photographs with data, or splats with splats"):
         PriorTraining(tmp_path / "a.ply", tmp_path / "p.npz", *given).check()
+
+
+def test_functions_of_files_take_paths_of_any_kind(files, monkeypatch):
+    """Text as well as ``Path``, as ``load_gaussians`` does; anything else is named at once."""
+    ply, mesh, folder = (files / name for name in ("s.ply", "m.npz", "texts"))
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    assert clean_file(str(ply), "clean.ply").preview == Path("clean.ply.preview.png")
+    simplify_file(str(ply), "few.ply", SimplifyOptions(count=5, no_preview=True))
+    views = SceneViews(width=16)
+    bake_file(str(mesh), "baked.npz", BakingOptions(views=views, filter_px2=0.3))
+    save_comparison(str(ply), str(mesh), "compared", ComparisonOptions(views=replace(views, orbit=1)))
+    ImageRun(str(ply), "image.png", ImageOptions(views=views)).save()
+    Scoring(ScoringOptions(splats=ply, strips=0, cameras=Path("image.png.cameras.json")), "scores").run(
+        [str(mesh)]
+    )
+    assert describe(str(ply))["kind"] == "splats"
+    made = ("clean.ply", "few.ply", "baked.npz", "compared", "image.png", "scores")
+    assert all(Path(name).exists() for name in made)
+    before = sorted(folder.iterdir())
+    for call in (
+        lambda: clean_file(1, "a.ply"),
+        lambda: simplify_file(ply, None, SimplifyOptions(count=5)),
+        lambda: bake_file(ms.load_mesh(mesh), "a.npz", BakingOptions()),
+        lambda: save_comparison(ply, mesh, 2, ComparisonOptions()),
+        lambda: ImageRun(ms.load_gaussians(ply), "a.png"),
+        lambda: Scoring(ScoringOptions(), 3),
+        lambda: describe(ms.load_mesh(mesh)),
+        lambda: save_poses(mesh, [4], "a.npz"),
+        lambda: make_chain(ms.load_gaussians(ply), 5),
+    ):
+        with pytest.raises(TypeError, match="must be a path, got "):
+            call()
+    assert sorted(folder.iterdir()) == before

@@ -88,7 +88,7 @@ def test_a_mesh_says_whether_its_colours_depend_on_the_view(tmp_path):
     assert "Blender unlit" in found["harmonics_drawn_by"]
     assert found["others_show"] == "plain colours, the mean of views"
     save_mesh(replace(mesh, plain_colors=None), tmp_path / "m.glb")
-    assert "degree 0; bake --colors" in describe(tmp_path / "m.glb")["others_show"]
+    assert "degree 0; meshsplats bake" in describe(tmp_path / "m.glb")["others_show"]
     save_mesh(mesh.of_degree(0), tmp_path / "m.glb")
     found = describe(tmp_path / "m.glb")
     assert (found["sh_degree"], found["plain_colors"], found["colors_above_white"]) == (0, False, False)

@@ -11,9 +11,10 @@ import pytest
 from _stock_viewer import stock_image
 
 from meshsplats import ConversionOptions, convert, load_mesh, orbit, psnr, render, save_gaussians, simplify
-from meshsplats.chains import ChainOptions, make_chain
+from meshsplats.chains import make_chain
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
+from meshsplats.file_options import ChainOptions
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.levels import (

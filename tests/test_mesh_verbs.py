@@ -11,7 +11,7 @@ from _priors import bumpy
 
 from meshsplats import Camera, SplatMesh, render
 from meshsplats.binding import ArrayField, Binding
-from meshsplats.prior.bind import bind
+from meshsplats.prior.laying import bind
 
 LENGTHS = (2, 3, 1, 4)
 """Triangles of four splats."""

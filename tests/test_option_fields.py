@@ -23,7 +23,7 @@ from meshsplats._options import (
     settings,
 )
 from meshsplats.blender.options import LightOptions, SceneOptions
-from meshsplats.conversion.cleaning import CleaningRules
+from meshsplats.conversion.cleaning_rules import CleaningRules
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.finetuning import FinetuneConfig, RunOptions
 from meshsplats.tiles.building import TileOptions

@@ -12,8 +12,8 @@ import meshsplats
 ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 13
 LOWEST = (
-    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options", "_origin"),
-    *("_toml", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
+    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_lazy", "_options"),
+    *("_origin", "_toml", "choices", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
 )
 """Rooms that import no other room."""
 FLOORS = (
@@ -28,7 +28,7 @@ FLOORS = (
     ("conversion", "datasets"),
     ("evaluation", "surfaces"),
     ("finetuning", "jobs", "viewer"),
-    ("levels", "prior", "tiles", "training"),
+    ("file_options", "levels", "prior", "product", "tiles", "training"),
     ("blender", "chains", "edits", "file_conversion", "inspection", "installation", "renders", "scoring"),
     ("cli",),
     ("__main__",),

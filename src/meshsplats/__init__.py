@@ -49,7 +49,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.images.writing import save_image
     from meshsplats.mesh import SplatMesh
     from meshsplats.prior import MeshPrior, load_prior, train_prior
-    from meshsplats.prior.bind import bind
+    from meshsplats.prior.laying import bind
     from meshsplats.rendering import Rendering, render, render_splats
     from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
@@ -99,7 +99,7 @@ _HOME = {
     "meshsplats.images.writing": ("save_image",),
     "meshsplats.mesh": ("SplatMesh",),
     "meshsplats.prior": ("MeshPrior", "load_prior", "train_prior"),
-    "meshsplats.prior.bind": ("bind",),
+    "meshsplats.prior.laying": ("bind",),
     "meshsplats.rendering": ("Rendering", "render", "render_splats"),
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.ordering": ("drawing_order",),

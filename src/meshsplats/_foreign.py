@@ -84,7 +84,7 @@ def foreign(path: Path, head: bytes) -> str:
     Its name decides first, as the formats of many programs are the same inside."""
     name = path.name.lower()
     if _MODEL.fullmatch(name):
-        return "a part of COLMAP's sparse model; commands take the folder of the data set with --data"
+        return "a part of COLMAP's sparse model; commands take the folder of the data set with ``data``"
     if name.endswith(_TORCH):
         return checkpoint(path)
     for kind in _KINDS:
@@ -157,7 +157,7 @@ def foreign_archive(path: Path, names: Sequence[str]) -> str:
     images = sum(name.lower().endswith(IMAGE_SUFFIXES) for name in names)
     if images and suffix != ".sog":
         return (
-            f"a zip archive with {images} images: unpack it; commands take the folder with --data, and"
+            f"a zip archive with {images} images: unpack it; commands take the folder with ``data``, and"
             " 'meshsplats train' makes a mesh of it"
         )
     return ""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TypeVar
+from pathlib import Path
+from typing import TypeVar, get_args
 
 import numpy as np
 
@@ -143,6 +144,25 @@ def require_path(name: str, value: object, instead: Mapping[str, str] | None = N
     """``need_path`` for one argument, or a part of one, by its ``name``."""
     if not isinstance(value, (str, os.PathLike)):
         raise TypeError(_message(name, "a path", "path", value, instead or {}))
+
+
+def need_choice(words: object, *, optional: bool = False, **given: object) -> None:
+    """ValueError unless the arguments ``given`` are among the ``words``, a ``Literal``.
+
+    Args:
+        words: the type.
+        optional: None will do, too.
+        given: the arguments by name.
+    """
+    for name, value in given.items():
+        if value not in get_args(words) and not (optional and value is None):
+            raise ValueError(f"{name} must be one of {', '.join(get_args(words))}, got {value!r}")
+
+
+def as_path(name: str, value: object) -> Path:
+    """The path that the argument ``name`` gives; TypeError for what names no file or folder."""
+    require_path(name, value)
+    return Path(value)  # type: ignore[arg-type]
 
 
 def need_array(

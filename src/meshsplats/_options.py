@@ -15,18 +15,18 @@ import ast
 import difflib
 import inspect
 import math
-import textwrap
+import sys
 import types
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
+from numbers import Real
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import numpy as np
-
 M = TypeVar("M")
-NUMBERS = (int, float, np.integer, np.floating)
+NUMBERS = (Real,)
+"""Numbers of Python and of NumPy, which is not imported for help."""
 
 
 @dataclass(frozen=True)
@@ -189,16 +189,24 @@ def docstrings(kind: type) -> dict[str, str]:
     field, which Python itself does not keep."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
-        try:
-            source = textwrap.dedent(inspect.getsource(base))
-        except (OSError, TypeError):  # made at run time, or built in
-            continue
-        for node, text in pairwise(ast.parse(source).body[0].body):  # type: ignore[attr-defined]
+        source = _classes(base.__module__).get(base.__qualname__)
+        for node, text in pairwise(source.body if source else ()):
             if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
                 continue
             if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
                 found[node.target.id] = " ".join(str(text.value.value).split())
     return found
+
+
+@cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    """The classes in the source of a module by their names; none where there is no source. A module is parsed
+    once for all of its classes, which takes much of the time of a help text."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except (OSError, TypeError, KeyError):  # made at run time, or built in
+        return {}
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
 def check_options(

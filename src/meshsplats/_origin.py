@@ -104,6 +104,6 @@ def need_one_origin(records: Mapping[str, Any]) -> None:
             )
 
 
-def in_words(origin: np.ndarray) -> str:
+def in_words(origin: Iterable[float]) -> str:
     """``origin`` as text that ``float`` reads back exactly, without digits that say nothing."""
     return " ".join(repr(int(x)) if x == int(x) and abs(x) < 1e15 else repr(float(x)) for x in origin)

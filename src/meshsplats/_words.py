@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from typing import TYPE_CHECKING
 
 from meshsplats.errors import OptionValueError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "white": (1.0, 1.0, 1.0),
@@ -17,6 +21,8 @@ NAMED_COLORS: dict[str, tuple[float, float, float]] = {
 def parse_up(text: str) -> np.ndarray:
     """(3,) direction from ``-y``, ``+z``, ``x`` or ``x,y,z``, the value of an option ``up``.
     OptionValueError for anything else."""
+    import numpy as np
+
     axis = text.lower().lstrip("+-")
     if axis in ("x", "y", "z") and len(text) <= 2:
         direction = np.zeros(3)
@@ -37,6 +43,8 @@ def optional_up(text: str | None) -> np.ndarray | None:
 
 def direction_in_words(direction: np.ndarray) -> str:
     """An axis, or three numbers, as ``parse_up`` takes them."""
+    import numpy as np
+
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) > 1 - 1e-6:
         return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
@@ -69,7 +77,7 @@ def _numbers(text: str) -> tuple[float, float, float] | None:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         return None
-    return (x, y, z) if np.isfinite([x, y, z]).all() else None
+    return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
 
 
 def plural(count: int, noun: str) -> str:

@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
-
-MAX_SIDE = 1 << 15
-"""Largest image side in pixels."""
+from meshsplats.choices import MAX_SIDE
 
 NEAR_SHARE = 0.002
 """Depth of the near plane of a camera that names none, as a share of the distance from which on the scene
@@ -20,6 +18,10 @@ NEAREST_SHARE = 0.01
 """Share of the scene's points that may lie nearer than that distance: floaters, and splats at the lens."""
 _POINTS = 20_000
 """Number of points to measure at most."""
+MAX_SKEW = 1e-2
+"""How far a rotation may be from orthonormal; less than that is taken for rounding."""
+OPENGL = np.array([1.0, -1.0, -1.0])
+"""Turns OpenGL's y and z axes, up and backwards, to those of OpenCV, and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,11 +166,33 @@ class Camera:
         with np.errstate(over="ignore"):  # points right at the camera, beside the image
             return np.stack([self.fx * x / beyond + self.cx, self.fy * y / beyond + self.cy]).T, z
 
+    def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the world ``points`` (n, 3) that project into the image, as in ``project``: their indices (k,),
+        columns (k,) and rows (k,) of the pixels, and depths (k,)."""
+        positions, depth = self.project(points)
+        shown = np.flatnonzero(self.in_image(positions))
+        column, row = positions[shown].T.astype(np.intp)
+        return shown, column, row, depth[shown]
+
     def in_image(self, positions: np.ndarray) -> np.ndarray:
         """(n,) bool: which of ``positions`` (n, 2), as from ``project``, lie in the image."""
         x, y = positions.T
         with np.errstate(invalid="ignore"):  # NaN lies nowhere
             return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+def from_opengl(matrix: np.ndarray) -> np.ndarray | None:
+    """(4, 4) world to camera in OpenCV's axes of a ``matrix`` (3 or 4, 4), camera to world in those of
+    OpenGL; None where that is no rotation and translation, but scales, shears or mirrors."""
+    axes = matrix[:3, :3]
+    if np.abs(axes.T @ axes - np.eye(3)).max() > MAX_SKEW or np.linalg.det(axes) < 0:
+        return None
+    left, _, right = np.linalg.svd(axes)
+    rotation = (left @ right * OPENGL).T
+    result = np.eye(4)
+    result[:3, :3] = rotation
+    result[:3, 3] = -rotation @ matrix[:3, 3]
+    return result
 
 
 def hiding_near_plane(cameras: Sequence[Camera], points: np.ndarray) -> str:

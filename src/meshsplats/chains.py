@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-
-from meshsplats._files.atomic import in_words, replace_folder, write_text
-from meshsplats._options import check_options
-from meshsplats.errors import OptionsError
+from meshsplats._files.atomic import in_words, replace_folder, write_json
+from meshsplats._kinds import as_path
 from meshsplats.evaluation.viewers import choose_alpha
-from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions, make_config
-from meshsplats.formats.mesh_formats import takes
+from meshsplats.file_options import ChainOptions
+from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.formats.outputs import CONFIGURATION, MeshEnding, check_outputs
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import (
     SAMPLES,
@@ -36,83 +34,19 @@ from meshsplats.levels import (
     views_to_score,
 )
 from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
 from meshsplats.rendering.looks import comparison_in_words
 
 TABLE = "levels.json"
-MINUTES = 2.0
-"""Default length of the fine-tuning of a level."""
 OnLevel = Callable[[int, Level], AbstractContextManager[Callable[[Progress], None] | None]]
 
 
-@dataclass(frozen=True)
-class ChainOptions:
-    """The meshes of a chain and their files."""
-
-    levels: int = 4
-    """Number of meshes."""
-    factor: Literal[2, 4] = 4
-    """Splats of each level per splat of the next: 4, for half the size on the screen, or 2."""
-    width: int = 800
-    """Screen size of the finest level: side in pixels of images that just hold the subject."""
-    max_splats: int | None = None
-    """Maximum number of splats of the finest level. Default: all."""
-    format: MeshEnding = "glb"
-    """File format of the meshes."""
-    alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
-    """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
-    not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
-    cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
-    order: Order | None = None
-    """In which triangles are blended and tuned; None: that of the meshes and of the configuration."""
-    sh_degree: int | None = None
-    """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
-    up: Sequence[float] | np.ndarray | None = None
-    """Direction that points up in the world; None: that of the splats."""
-    threads: int | None = None
-    """Maximum number of threads; None: all processors."""
-
-    def check(self) -> None:
-        """OptionsError for options that are out of range or have no effect."""
-        check_options(self)
-        if self.levels < 1:
-            raise OptionsError(f"``levels`` must be at least 1, got {self.levels}")
-        if self.max_splats is not None and self.max_splats < 1:
-            raise OptionsError(f"``max_splats`` must be at least 1, got {self.max_splats}")
-        if self.alpha not in ("auto", "opaque") and not takes(f"level.{self.format}", "alpha"):
-            raise OptionsError(f"``alpha`` {self.alpha} is for .glb files, not .{self.format}")
-
-    def plan(self, splats: int) -> list[Level]:
-        """The levels of so many ``splats`` (``plan_levels``). ValueError for orders that contradict each
-        other."""
-        if self.alpha == "ordered" and self.order not in (None, "fragment"):
-            raise ValueError("alpha 'ordered' has an order of its own: leave out order")
-        most = splats if self.max_splats is None else min(self.max_splats, splats)
-        return plan_levels(most, self.levels, factor=self.factor, width=self.width)
-
-
-@dataclass(frozen=True)
-class LevelTuning:
-    """How long each level is fine-tuned."""
-
-    no_tune: bool = False
-    """Convert only: seconds in place of minutes."""
-    minutes: float | None = None
-    """Length of the fine-tuning of each level. Default: 2."""
-    steps: int | None = None
-    """Length of the fine-tuning of each level, in place of ``minutes``."""
-
-    def config(self) -> FinetuneConfig | None:
-        """The configuration for ``make_chain``. OptionsError for lengths that contradict each other."""
-        if self.no_tune and (self.minutes is not None or self.steps is not None):
-            raise OptionsError("``minutes`` and ``steps`` have no effect with ``no_tune``")
-        if self.minutes is not None and self.steps is not None:
-            raise OptionsError("give ``minutes`` or ``steps``, not both")
-        if self.no_tune:
-            return None
-        if self.steps is not None:
-            return make_config("default", steps=self.steps)
-        return make_config("default", minutes=MINUTES if self.minutes is None else self.minutes)
+def planned(options: ChainOptions, splats: int) -> list[Level]:
+    """The levels of so many ``splats`` (``plan_levels``). ValueError for orders that contradict each
+    other."""
+    if options.alpha == "ordered" and options.order not in (None, "fragment"):
+        raise ValueError("alpha 'ordered' has an order of its own: leave out order")
+    most = splats if options.max_splats is None else min(options.max_splats, splats)
+    return plan_levels(most, options.levels, factor=options.factor, width=options.width)
 
 
 def partial_folder(folder: Path) -> Path:
@@ -135,10 +69,10 @@ def check_folder(folder: Path, *, resume: bool = False, replace_old: bool = Fals
     if folder.exists() and not (folder / TABLE).is_file():
         raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
     if resume and not (unfinished / CONFIGURATION).is_file():
-        raise FileNotFoundError(f"nothing to resume in {unfinished}: leave out --resume to start again")
+        raise FileNotFoundError(f"nothing to resume in {unfinished}: leave out ``resume`` to start again")
     if unfinished.exists() and not resume and not replace_old:
         raise FileExistsError(
-            f"{unfinished} is left from an earlier run: --resume continues it, --force starts again"
+            f"{unfinished} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
         )
 
 
@@ -155,7 +89,7 @@ def begin_folder(folder: Path) -> Path:
 
 def make_chain(
     cloud: GaussianCloud,
-    folder: Path,
+    folder: str | os.PathLike[str],
     options: ChainOptions | None = None,
     config: FinetuneConfig | None = None,
     *,
@@ -177,8 +111,9 @@ def make_chain(
 
     Raises Interrupted after Ctrl-C in a level, whose predecessors stay, and what ``plan_levels`` raises.
     """
+    folder = as_path("folder", folder)
     chosen, unfinished = options or ChainOptions(), partial_folder(folder)
-    chain = chosen.plan(len(cloud))
+    chain = planned(chosen, len(cloud))
     unfinished.mkdir(exist_ok=True)
     rows, records = [], []
     splats, waiting = cloud, list[Level]()  # splats that are merged further, and for which levels
@@ -190,7 +125,7 @@ def make_chain(
             with on_level(number, level) as show:
                 row, splats = _made(cloud, splats, waiting, path, chosen, config, place, show)
             waiting = []
-            write_text(records[-1], json.dumps(row, indent=1, allow_nan=False) + "\n")
+            write_json(records[-1], row)
         rows.append(json.loads(records[-1].read_text(encoding="utf-8")))
     table = {
         "source": source,
@@ -202,7 +137,7 @@ def make_chain(
     }
     for record in records:
         record.unlink()
-    write_text(unfinished / TABLE, json.dumps(table, indent=1, allow_nan=False) + "\n")
+    write_json(unfinished / TABLE, table)
     replace_folder(unfinished, folder)
     return table
 

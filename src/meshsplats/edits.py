@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import together
+from meshsplats._kinds import as_path
 from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.conversion import bake_filter, simplify
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove, save_strip
+from meshsplats.conversion.cleaning import Findings, find, remove, save_strip
+from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
 from meshsplats.conversion.surroundings import floaters
 from meshsplats.datasets.scene_files import SceneReading
-from meshsplats.datasets.scene_views import MissingOfData, SceneViews, cameras_named, check_photographs
-from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, StraysWarning
+from meshsplats.datasets.scene_views import cameras_named
+from meshsplats.errors import FileFormatError, OptionValueError, StraysWarning
 from meshsplats.evaluation.viewers import alpha_for_viewers
+from meshsplats.file_options import BakingOptions, SimplifyOptions
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.formats.outputs import (
@@ -63,8 +67,8 @@ class Cleaned:
 
 
 def clean_file(
-    source: Path,
-    output: Path,
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     rules: CleaningRules | None = None,
     *,
     reading: SceneReading | None = None,
@@ -85,6 +89,7 @@ def clean_file(
         threads: at most this many; all processors by default.
         force: replace files that are there.
     """
+    source, output = as_path("source", source), as_path("output", output)
     preview = beside(output, PREVIEW)
     check_outputs([preview] if preview_only else [output, preview], force, inputs=[source])
     with warnings.catch_warnings():
@@ -111,39 +116,6 @@ def clean_file(
 
 
 @dataclass(frozen=True)
-class SimplifyOptions:
-    """How many splats are left, and from where they will be seen."""
-
-    count: int | None = None
-    """Number of splats to keep."""
-    share: float | None = None
-    """Share of the splats to keep, above 0 to 1: 0.25 keeps a quarter."""
-    cameras: Path | None = None
-    """Cameras that the splats will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
-    folder that has one. Detail finer than their pixels goes first. Default: those of the input if it is a
-    model folder, else images of 1000 pixels that hold the subject."""
-    data: Path | None = None
-    """Data set of photographs, in place of ``cameras``: the cameras of its training views."""
-    missing: MissingOfData = "few"
-    no_preview: bool = False
-    """Write no preview."""
-
-    def check(self) -> None:
-        """OptionsError for options that contradict each other or are out of range."""
-        if (self.count is None) == (self.share is None):
-            raise OptionsError("give ``count`` or ``share``, one of them")
-        if self.count is not None and self.count < 1:
-            raise OptionsError(f"``count`` must be at least 1, got {self.count}")
-        if self.share is not None and not 0 < self.share <= 1:
-            raise OptionsError(f"``share`` must be above 0 and at most 1, got {self.share}")
-        check_photographs(self.data, self.missing, self.cameras)
-
-    def wanted(self, splats: int) -> int:
-        """How many of so many ``splats``."""
-        return self.count or max(1, round((self.share or 0) * splats))
-
-
-@dataclass(frozen=True)
 class Simplified:
     """Splats that were merged."""
 
@@ -167,8 +139,8 @@ class EditCallbacks:
 
 
 def simplify_file(
-    source: Path,
-    output: Path,
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     options: SimplifyOptions,
     callbacks: EditCallbacks | None = None,
     *,
@@ -187,6 +159,7 @@ def simplify_file(
 
     Raises what ``SimplifyOptions.check`` and ``check_outputs`` raise, and FileFormatError for a mesh.
     """
+    source, output = as_path("source", source), as_path("output", output)
     own = callbacks or EditCallbacks()
     check_splat_endings(written_ending(output.name))
     options.check()
@@ -211,18 +184,6 @@ def simplify_file(
 
 
 @dataclass(frozen=True)
-class BakingOptions:
-    """For which views a mesh is baked, and what."""
-
-    views: SceneViews = field(default_factory=SceneViews)
-    colors: bool = False
-    """Replace colours that depend on the view by their mean over these views, for programs that show them the
-    same from everywhere."""
-    filter_px2: float | None = None
-    """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""
-
-
-@dataclass(frozen=True)
 class Baked:
     """A mesh that was baked."""
 
@@ -242,8 +203,8 @@ class Baked:
 
 
 def bake_file(
-    source: Path,
-    output: Path,
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
     options: BakingOptions,
     *,
     place: Place = lambda scene: scene,
@@ -255,6 +216,7 @@ def bake_file(
     ``place`` makes of it the mesh that is written; ``say`` gets a line about the views. ValueError where
     there is nothing to bake.
     """
+    source, output = as_path("source", source), as_path("output", output)
     check_mesh_suffix(output)
     options.views.check()
     check_outputs([output], force, inputs=[source])

@@ -6,7 +6,24 @@ import re
 from collections.abc import Callable
 
 
-class FileFormatError(ValueError):
+class NamingOptions:
+    """Base of errors and warnings that may name options: in double backquotes, so that programs can show them
+    in their own way, as flags of a command line say. ``str`` shows the bare names."""
+
+    def __str__(self) -> str:
+        return self.spelled(str)
+
+    def spelled(self, how: Callable[[str], str]) -> str:
+        """The message with the names of options as ``how`` shows them."""
+        return with_options(super().__str__(), how)
+
+
+def with_options(text: str, how: Callable[[str], str]) -> str:
+    """``text`` with the names of options in double backquotes as ``how`` shows them."""
+    return re.sub(r"``(\w+)``", lambda match: how(match[1]), text)
+
+
+class FileFormatError(NamingOptions, ValueError):
     """A file that cannot be read: broken, truncated, hostile or of another format."""
 
 
@@ -14,16 +31,8 @@ class OverwritingError(ValueError):
     """An output would replace a file that is read, or another output."""
 
 
-class OptionValueError(ValueError):
-    """A value of an option that is out of range. Names of options stand in double backquotes in the message,
-    so that programs can show them in their own way, as flags of a command line say."""
-
-    def __str__(self) -> str:
-        return self.spelled(str)
-
-    def spelled(self, how: Callable[[str], str]) -> str:
-        """The message with the names of options as ``how`` shows them."""
-        return re.sub("``(.+?)``", lambda match: how(match[1]), super().__str__())
+class OptionValueError(NamingOptions, ValueError):
+    """A value of an option that is out of range."""
 
 
 class OptionsError(OptionValueError):
@@ -40,7 +49,7 @@ GET_TORCH = (
 """For messages: on Linux, torch from most registries comes with gigabytes of CUDA libraries."""
 
 
-class DataWarning(UserWarning):
+class DataWarning(NamingOptions, UserWarning):
     """Some of the data was left out or altered; the message counts it."""
 
 
@@ -66,3 +75,7 @@ class DeviceError(RuntimeError):
 
 class ClusterError(RuntimeError):
     """The workers of a cluster are lost; what finished tasks have written stays."""
+
+
+class OtherRunError(ValueError):
+    """The checkpoint to resume from belongs to another run; the message names the differences."""

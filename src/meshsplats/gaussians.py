@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from meshsplats._arrays import checked_array, chosen_rows
 from meshsplats._geometry import quaternion_product, quaternions_of, rotation_rows
+from meshsplats._kinds import need_choice
 from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
 
@@ -17,6 +18,11 @@ Kernel = Literal["3dgs", "antialiased", "2dgs"]
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+def constant_harmonics(colors: np.ndarray) -> np.ndarray:
+    """The coefficients of degree 0 of float32 display ``colors``, of any shape."""
+    return (colors - np.float32(0.5)) / np.float32(SH_C0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +77,7 @@ class GaussianCloud:
                     f"opacities must lie in [0, 1], got {opacities.min():.4g} to {opacities.max():.4g}"
                     " (apply the sigmoid to stored logits)"
                 )
-        if self.kernel not in get_args(Kernel):
-            raise ValueError(f"kernel must be one of {', '.join(get_args(Kernel))}, got {self.kernel!r}")
+        need_choice(Kernel, kernel=self.kernel)
         if self.up is not None:
             up = checked_array("up", self.up, np.float32, (3,)).astype(np.float64)
             if not up.any():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._json import read_json
+from meshsplats._kinds import as_path
 from meshsplats._origin import choose_origin
 from meshsplats.camera import Camera
 from meshsplats.cameras.camera_path import is_camera_path
@@ -37,13 +39,14 @@ PLAIN = "plain colours, the mean of views"
 BASE = "the part of degree 0"
 
 
-def describe(path: Path, reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def describe(path: str | os.PathLike[str], reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Findings about ``path``, ready for JSON, first its ``kind``. Lengths are in scene units.
 
     ``reading``: arguments of ``load_gaussians``, for splats.
 
     Raises FileFormatError for a file or folder that is none of these, and OSError.
     """
+    path = as_path("path", path)
     if is_tileset(path):
         return {"kind": "tileset", **_tileset(path)}
     layout = _layout(path)
@@ -198,7 +201,7 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
     if mesh.sh_degree:
         found["harmonics_drawn_by"] = HARMONICS_DRAWN_BY
         found["others_show"] = (
-            f"{BASE}; bake --colors makes means of views" if mesh.plain_colors is None else PLAIN
+            f"{BASE}; meshsplats bake makes means of views" if mesh.plain_colors is None else PLAIN
         )
     if mesh.binding is not None:
         base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"

@@ -13,8 +13,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from meshsplats.camera import Camera
+    from meshsplats.choices import Device
     from meshsplats.mesh import SplatMesh
-    from meshsplats.rendering.engine import Device
 
 
 def examine() -> dict[str, Any]:

@@ -52,7 +52,9 @@ class Job:
         with locked(lock_of(first)) as ours:
             if not ours:
                 raise FileExistsError(
-                    errno.EEXIST, "another process is writing this output; wait, or give --force", str(first)
+                    errno.EEXIST,
+                    "another process is writing this output; wait, or give ``force``",
+                    str(first),
                 )
             yield
 
@@ -137,7 +139,7 @@ class _Old:
     @property
     def remark(self) -> str:
         """The warning of a command that keeps it; empty if none is due."""
-        return f"{self.path}: kept, though {self.doubt}; --force makes it anew" if self.doubt else ""
+        return f"{self.path}: kept, though {self.doubt}; ``force`` makes it anew" if self.doubt else ""
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ class Plan:
 def _taken(paths: Sequence[Path], doubt: str) -> FileExistsError:
     more = f" (and {len(paths) - 1} more)" if len(paths) > 1 else ""
     how = f", {doubt}" if doubt else ""
-    ways = "--force overwrites it, --skip-existing makes only the meshes that are missing"
+    ways = "``force`` overwrites it, ``skip_existing`` makes only the meshes that are missing"
     return FileExistsError(errno.EEXIST, f"the output exists already{more}{how}; {ways}", str(paths[0]))
 
 

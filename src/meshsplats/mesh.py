@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from meshsplats._arrays import checked_array, chosen_rows
+from meshsplats._kinds import need_choice
 from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
@@ -148,9 +149,7 @@ class SplatMesh:
             raise ValueError("up must not be the zero vector")
         # Not rescaled within 1e-6 of unit length: files round-trip bit for bit.
         set_("up", self.up if abs(length - 1) <= 1e-6 else self.up / np.float32(length))
-        if self.blending not in get_args(Blending):
-            known = ", ".join(get_args(Blending))
-            raise ValueError(f"blending must be one of {known}, got {self.blending!r}")
+        need_choice(Blending, blending=self.blending)
         set_("filter_px2", checked_filter(self.filter_px2, self.face_splat))
         checked_order(self.order, self.face_splat)
         attributes = {}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
+
 
 Order = Literal["fragment", "splat"]
 """fragment: the triangles are sorted at every sample. splat: whole splats are, by their centres."""

@@ -5,24 +5,22 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from meshsplats._options import check_options
+from meshsplats._kinds import as_path
 from meshsplats._origin import shared_origin
 from meshsplats._words import optional_color
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Workers
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.scene_files import SceneReading
-from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, check_photographs
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
-from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
+from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.benchmarks import BENCHMARKS, Candidates, convert_scene, run_benchmark
 from meshsplats.evaluation.lpips import load_lpips
@@ -37,104 +35,14 @@ from meshsplats.evaluation.results import (
     save_report,
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names
+from meshsplats.file_options import ScoringOptions
 from meshsplats.finetuning.candidates import tuned_candidates
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs, view_names
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
-from meshsplats.rendering.looks import Look
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
-
-
-@dataclass(frozen=True)
-class ScoringOptions:
-    """What is scored, against what, and how."""
-
-    data: Path | None = None
-    """Data set of photographs; with ``protocol`` the folder of its scenes. Default: images of the splats."""
-    before: Path | None = None
-    """Another mesh to score, such as the one before fine-tuning."""
-    splats: Path | None = None
-    """The splats. With ``data``: scored, too, at SH degree 0 and with all spherical harmonics. Without: their
-    images are the ground truth (also scored at SH degree 0)."""
-    images: Path | None = None
-    """Images by other programs to score, such as Blender: a file for each view, by its name or in order."""
-    cameras: Path | None = None
-    """Without ``data``: cameras. Default: those that finetune holds out."""
-    look: Look = "area"
-    """Without ``data``: kind of ground truth. area: means over each pixel's area, as in programs that take
-    several samples per pixel. splats: images of a 3DGS viewer at this size."""
-    sh_degree: int | None = None
-    """Without ``data``: SH degree of the ground truth. Default: all that are stored."""
-    lpips: tuple[Path, ...] = ()
-    """Weights of LPIPS, files or a folder: torchvision's vgg16-397923af.pth and vgg.pth of the package lpips,
-    or one file of both (see docs/finetuning.md). Default: no LPIPS."""
-    network: Literal["vgg", "alex"] = "vgg"
-    """Network of LPIPS; splatting papers use vgg."""
-    fit_exposure: bool = False
-    """Also score with a gain and an offset per channel, fitted to each image."""
-    samples: int | None = None
-    """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
-    with ``look`` splats."""
-    order: Order | None = None
-    """Order in which the triangles of meshes are blended: exact at every sample, or whole splats by their
-    centres. Default: that of each mesh."""
-    background: str | None = None
-    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs without
-    alpha that of the model folder, else black or white, the one that fits the splats best."""
-    downscale: int | None = None
-    """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
-    test_every: int = 8
-    """Every n-th view is held out, if the data set has no split."""
-    missing: MissingOfData = "few"
-    masks: MasksOfData = "count"
-    protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
-    """Score all scenes of a benchmark as in the paper's Table 1."""
-    tune: Literal["default", "paper"] | None = None
-    """With ``protocol``: first fine-tune each scene on its training views, with this preset."""
-    strips: int = 8
-    """Number of views, spread over all, for which strips and enlarged crops are written."""
-    amplify: float = 4.0
-    """Factor of the error in the strips."""
-    reading: SceneReading = field(default_factory=SceneReading)
-
-    def check(self, meshes: Sequence[Path]) -> None:
-        """OptionsError for options that contradict each other or have no effect, ValueError for values out of
-        range. ``meshes``: what is scored; with ``protocol``, the folder of the scenes."""
-        check_options(self)
-        optional_color(self.background)
-        if self.amplify <= 0 or self.strips < 0:
-            raise OptionValueError("``amplify`` must be positive and ``strips`` >= 0")
-        if self.protocol is not None:
-            if self.data is None or len(meshes) != 1:
-                raise OptionsError(
-                    "``protocol`` needs a folder of meshes or models, and ``data`` with the scenes"
-                )
-            for name in ("before", "splats", "images", "cameras", "sh_degree", "order"):
-                if getattr(self, name) is not None:
-                    raise OptionsError(f"``{name}`` has no effect with ``protocol``")
-            if self.missing != "few":
-                raise OptionsError("``missing`` has no effect with ``protocol``, which needs every image")
-            return
-        if self.tune is not None:
-            raise OptionsError(
-                "``tune`` is for ``protocol``; otherwise use meshsplats finetune, then evaluate"
-            )
-        if len(set(map(os.path.abspath, meshes))) < len(meshes):
-            raise OptionsError("a mesh was given twice")
-        if not meshes and self.images is None and (self.splats is None or self.data is None):
-            raise OptionsError("nothing to score: give a mesh, ``images``, or ``splats`` with ``data``")
-        if self.data is None and self.splats is None:
-            raise OptionsError("nothing to compare with: give ``data``, or ``splats``")
-        of_splats = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
-        for name, value in of_splats.items():
-            if self.data is not None and value not in (None, "area"):
-                raise OptionsError(f"``{name}`` has no effect with ``data``")
-        if self.data is None and self.downscale is not None:
-            raise OptionsError("``downscale`` has no effect without ``data``")
-        check_photographs(self.data, self.missing, masks=self.masks)
 
 
 @dataclass(frozen=True)
@@ -150,16 +58,19 @@ class Scoring:
     threads: int | None = None
     progress: Progress | None = None
 
-    def run(self, paths: Sequence[Path], *, force: bool = False) -> Report:
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", as_path("folder", self.folder))
+
+    def run(self, paths: Sequence[str | os.PathLike[str]], *, force: bool = False) -> Report:
         """Scores the meshes at ``paths`` and writes the files of them. ``force``: in place of older ones.
 
         Raises what ``ScoringOptions.check`` and ``check_outputs`` raise, and FileFormatError for splats in
         place of a mesh.
         """
-        chosen = self.options
-        chosen.check(paths)
+        chosen, files = self.options, [as_path(f"paths[{i}]", path) for i, path in enumerate(paths)]
+        chosen.check(files)
         self.check_outputs(force)
-        meshes = {name: self._load_mesh(path) for name, path in mesh_names(paths).items()}
+        meshes = {name: self._load_mesh(path) for name, path in mesh_names(files).items()}
         before = None if chosen.before is None else self._load_mesh(chosen.before)
         splats = None if chosen.splats is None else chosen.reading.load(chosen.splats)
         known = [each for each in (splats, *meshes.values(), before) if each is not None]
@@ -173,7 +84,7 @@ class Scoring:
             optional_color(chosen.background),
             None if chosen.data is None else dataset,
             {name: scene for name, scene in scenes.items() if scene is not None},
-            chosen.splats or (paths[0] if paths else None),
+            chosen.splats or (files[0] if files else None),
             self.threads,
         )
         if chosen.data is None and splats is not None:
@@ -232,7 +143,7 @@ class Scoring:
         found, order = self.options.reading.load_scene(path), self.options.order
         if not isinstance(found, SplatMesh):
             raise FileFormatError(
-                f"{path}: splats, not a mesh; give them with --splats, or convert them first"
+                f"{path}: splats, not a mesh; give them with ``splats``, or convert them first"
             )
         return found if order is None else replace(found, order=order)
 

@@ -62,7 +62,7 @@ def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
     The functions of a degree span a space that rotations map to itself, so a least-squares fit to values in a
     few directions is exact.
     """
-    directions = _spiral(64)
+    directions = spiral(64)
     before = sh_basis(directions @ orthogonal, degree)[:, 1:]
     matrix = np.linalg.lstsq(sh_basis(directions, degree)[:, 1:], before, rcond=None)[0]
     matrix[np.abs(matrix) < 1e-12] = 0
@@ -115,7 +115,7 @@ def moved_harmonics(harmonics: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(turn @ harmonics, np.float32)
 
 
-def _spiral(count: int) -> np.ndarray:
+def spiral(count: int) -> np.ndarray:
     """(count, 3) unit directions on a Fibonacci spiral."""
     i = np.arange(count) + 0.5
     z, angle = 1 - 2 * i / count, i * np.pi * (1 + 5**0.5)
@@ -123,7 +123,7 @@ def _spiral(count: int) -> np.ndarray:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
-_DIRECTIONS = _spiral(32)
+_DIRECTIONS = spiral(32)
 
 
 def _norm(over: int, under: int) -> float:

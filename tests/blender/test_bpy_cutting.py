@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert
 from meshsplats.blender.inside import cutting, objects, stand_ins
-from meshsplats.conversion.cleaning import FLOATERS
+from meshsplats.conversion.cleaning_rules import FLOATERS
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.gaussians import GaussianCloud
 

@@ -14,7 +14,8 @@ from meshsplats import _toml as toml
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.prior import load_prior, prior_config
+from meshsplats.prior import load_prior
+from meshsplats.prior.options import prior_config
 
 
 @pytest.fixture(scope="module")

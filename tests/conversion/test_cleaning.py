@@ -16,7 +16,8 @@ from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
-from meshsplats.conversion.cleaning import CleaningRules, cropped, find, remove
+from meshsplats.conversion.cleaning import cropped, find, remove
+from meshsplats.conversion.cleaning_rules import CleaningRules
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud

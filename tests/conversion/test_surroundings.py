@@ -13,7 +13,8 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.conversion import convert
-from meshsplats.conversion.cleaning import CleaningRules, find
+from meshsplats.conversion.cleaning import find
+from meshsplats.conversion.cleaning_rules import CleaningRules
 from meshsplats.conversion.surroundings import _as_mesh, _panorama, floaters, without_surroundings
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.evaluation.metrics import psnr

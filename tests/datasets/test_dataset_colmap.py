@@ -298,7 +298,7 @@ def test_held_out_views_are_those_that_are_there(tmp_path):
     (folder / "images/p01.png").unlink()
     (folder / "images/p03.png").unlink()
     with pytest.raises(
-        FileFormatError, match=r"2 of 5 .* \(images/p01\.png, images/p03\.png\).*--missing skip"
+        FileFormatError, match=r"2 of 5 .* \(images/p01\.png, images/p03\.png\).*missing skip"
     ):
         load_dataset(folder, missing="error")
     with pytest.warns(DataWarning, match=r"2 images are missing.*images/p01\.png, images/p03\.png"):

@@ -255,7 +255,7 @@ def test_transforms_take_the_only_file_too(tmp_path):
         (["a.exr"], r"images/a\.exr is there, but \.exr images are not read here"),
         (["b.png"], r"images/b\.png is there, which another image of the file may mean, too"),
         (["../photos/a.jpeg"], r"photos/ has an image of that name: name that folder 'images'"),
-        (["._a.jpg", ".DS_Store"], r"missing \(images/a\.jpg\); --missing skip"),
+        (["._a.jpg", ".DS_Store"], r"missing \(images/a\.jpg\); missing skip"),
     ],
 )
 def test_what_may_be_meant_is_named(tmp_path, files, message):
@@ -470,7 +470,7 @@ def test_cameras_that_are_not_read_are_named_and_not_replaced(tmp_path, name):
     path.write_text(content)
     with pytest.raises(FileFormatError, match=message):
         load_dataset(folder)
-    with pytest.raises(FileFormatError, match=f"{message}.*--estimate-cameras"):
+    with pytest.raises(FileFormatError, match=f"{message}.*estimate_cameras"):
         ensure_cameras(folder)
 
 

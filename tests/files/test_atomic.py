@@ -125,7 +125,7 @@ def test_protected_places(tmp_path):
 def test_existing_outputs_are_refused_unless_forced(tmp_path):
     old, new = tmp_path / "old.glb", tmp_path / "new.glb"
     old.write_bytes(b"")
-    with pytest.raises(FileExistsError, match=r"--force.*old\.glb"):
+    with pytest.raises(FileExistsError, match=r"``force``.*old\.glb"):
         refuse_existing([new, old], force=False)
     with pytest.raises(FileExistsError, match="and 1 more"):
         refuse_existing([old, tmp_path], force=False)

@@ -33,11 +33,10 @@ from meshsplats.datasets.views import Dataset, ImageCache, View, ViewImage
 from meshsplats.datasets.windows import window_of
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import FileFormatError, OtherRunError
 from meshsplats.finetuning import Interrupted, RunOptions, starting_mesh
 from meshsplats.finetuning import cells as in_cells
 from meshsplats.finetuning.cells import CellOptions, CellScene, divide, finetune_cells, waves
-from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.reports import held_out_scores
 from meshsplats.gaussians import GaussianCloud

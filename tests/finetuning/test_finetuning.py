@@ -20,10 +20,10 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DivergenceError, FileFormatError
+from meshsplats.errors import DivergenceError, FileFormatError, OtherRunError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
-from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
+from meshsplats.finetuning.checkpoint import load_checkpoint
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State

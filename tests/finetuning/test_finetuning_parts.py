@@ -239,7 +239,7 @@ def test_memory_is_refused_with_advice(monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: needed)
     assert memory.check_memory(mesh, data) == needed
     monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
-    with pytest.raises(MemoryError, match=r"needs about .* are free: .*--max-splats.*--downscale"):
+    with pytest.raises(MemoryError, match=r"needs about .* are free: .*``max_splats``.*``downscale``"):
         memory.check_memory(mesh, data)
     monkeypatch.setattr(memory, "available_memory", lambda: None)
     memory.check_memory(mesh, data)
@@ -320,7 +320,7 @@ def test_broken_checkpoints_are_refused(tmp_path):
     save_safetensors(path, arrays(), {})
     with pytest.raises(FileFormatError, match="not a checkpoint of meshsplats"):
         load_checkpoint(path)
-    with pytest.raises(FileNotFoundError, match="leave out --resume"):
+    with pytest.raises(FileNotFoundError, match="leave out ``resume``"):
         load_checkpoint(tmp_path / "none")
 
 

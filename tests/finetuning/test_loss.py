@@ -11,9 +11,8 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DivergenceError
+from meshsplats.errors import DivergenceError, OtherRunError
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
-from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.loss import DefaultLoss, Target, loss_name
 from meshsplats.mesh import SplatMesh
 

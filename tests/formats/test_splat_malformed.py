@@ -211,7 +211,7 @@ def test_paths(tmp_path):
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json", "sparse"])
 def test_folders_of_photographs_are_told(tmp_path, name):
     (tmp_path / name).mkdir()
-    with pytest.raises(FileFormatError, match=rf"photographs, not splats \({name} is there\).*--data"):
+    with pytest.raises(FileFormatError, match=rf"photographs, not splats \({name} is there\).*with data"):
         load_gaussians(tmp_path)
 
 

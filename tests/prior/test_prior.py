@@ -18,7 +18,8 @@ from meshsplats.binding import Binding
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
-from meshsplats.prior.bind import LAYERS, SHELLS_DEPTH
+from meshsplats.prior.laying import SHELLS_DEPTH
+from meshsplats.prior.options import LAYERS
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 
 

@@ -21,10 +21,9 @@ from meshsplats.cli import main
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DataWarning, MissingDependencyError
+from meshsplats.errors import DataWarning, MissingDependencyError, OtherRunError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
-from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.config import HARMONICS_RATE
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.phase import Moment
@@ -647,7 +646,7 @@ def test_bad_input_is_refused_before_the_work(ball, tmp_path):
         train_config(point_share=0.1)
     with pytest.raises(TypeError, match="did you mean 'max_splats'"):
         train_config(max_splat=3)
-    with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out --resume"):
+    with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out ``resume``"):
         train(ball, train_config(steps=1), run=RunOptions(tmp_path / "none", resume=True))
 
 
@@ -745,7 +744,7 @@ def test_memory_is_estimated_up_front(ball, monkeypatch):
     from meshsplats.finetuning import memory
 
     monkeypatch.setattr(memory, "available_memory", lambda: 10**8)
-    with pytest.raises(MemoryError, match=r"training 100,000 fans on 23 images needs about .*--max-splats"):
+    with pytest.raises(MemoryError, match=r"training 100,000 fans on 23 images needs about .*``max_splats``"):
         train(ball, train_config(steps=1))
 
 

@@ -156,6 +156,12 @@ def run(name: str, argument: ctypes.Structure) -> None:
         raise ValueError(text)
 
 
+def check_threads(threads: int | None) -> None:
+    """ValueError for what is no number of threads; None: all processors."""
+    if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
+        raise ValueError(f"threads must be at least 1, got {threads!r}")
+
+
 def thread_count(threads: int | None) -> int:
     """``threads``, by default all processors; at most 256."""
     return min(int(threads) if threads else processors(), 256)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import secrets
@@ -173,6 +174,11 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def write_json(path: str | os.PathLike[str], content: object) -> None:
+    """Writes ``content`` to ``path`` as JSON, whole or not at all. ValueError for numbers that JSON lacks."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
 def refuse_existing(paths: Iterable[str | os.PathLike[str]], force: bool) -> None:
     """Raises FileExistsError if one of the outputs ``paths`` exists already, unless ``force``.
 
@@ -189,7 +195,7 @@ def refuse_existing(paths: Iterable[str | os.PathLike[str]], force: bool) -> Non
     if taken:
         more = f" (and {len(taken) - 1} more)" if len(taken) > 1 else ""
         raise FileExistsError(
-            errno.EEXIST, f"the output exists already{more}; give --force to overwrite it", taken[0]
+            errno.EEXIST, f"the output exists already{more}; give ``force`` to overwrite it", taken[0]
         )
     if _promised is not None:
         _promised.update(real)
@@ -255,7 +261,7 @@ def _place_new(temporary: Path, target: Path, shown: str) -> None:
 def _written_meanwhile(shown: str) -> FileExistsError:
     return FileExistsError(
         errno.EEXIST,
-        "another process has written this output meanwhile; give another name, or --force to overwrite it",
+        "another process has written this output meanwhile; give another name, or ``force`` to overwrite it",
         shown,
     )
 

@@ -15,11 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, from_opengl
 from meshsplats.errors import FileFormatError
-
-_MAX_SKEW = 1e-2
-_OPENGL = np.array([1.0, -1, -1])
 
 
 def is_camera_path(content: object) -> bool:
@@ -92,12 +89,7 @@ def _world_to_camera(entry: dict[str, Any], key: str, where: str) -> np.ndarray:
         raise FileFormatError(f"{where}: field {key!r} must be 16 finite numbers, from camera to world")
     matrix = np.vstack([numbers.reshape(-1, 4), [0, 0, 0, 1]])[:4]
     matrix = numbers.reshape(4, 4).T if columns and len(numbers) == 16 else matrix
-    axes = matrix[:3, :3]
-    if np.abs(axes.T @ axes - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(axes) < 0:
+    result = from_opengl(matrix)
+    if result is None:
         raise FileFormatError(f"{where}: field {key!r} is no rotation and translation (it scales or mirrors)")
-    left, _, right = np.linalg.svd(axes)
-    rotation = (left @ right * _OPENGL).T
-    result = np.eye(4)
-    result[:3, :3] = rotation
-    result[:3, 3] = -rotation @ matrix[:3, 3]
     return result

@@ -59,7 +59,7 @@ def load_cameras(
         return [start.relative_to(point)]
     if not isinstance(entries, list):
         other = isinstance(entries, dict) and "frames" in entries
-        what = " with 'frames', a data set: read it with load_dataset or --data" if other else ""
+        what = " with 'frames', a data set: read it with load_dataset or ``data``" if other else ""
         raise FileFormatError(
             f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}{what}"
         )
@@ -112,8 +112,8 @@ def _file_in(folder: Path) -> Path:
     there = [] if path.is_file() else [name for name in names if (folder / name).exists()]
     if there:
         raise FileFormatError(
-            f"{folder}: a data set ({there[0]} is there): read it with load_dataset, or --data in place of"
-            " --cameras"
+            f"{folder}: a data set ({there[0]} is there): read it with load_dataset, or with ``data`` in"
+            " place of ``cameras``"
         )
     return path
 

@@ -30,6 +30,7 @@ from meshsplats.cli.messages import (
     print_json_error,
     read_from_standard_input,
     say,
+    write_options,
 )
 from meshsplats.errors import ClusterError, DeviceError
 
@@ -74,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug, as_json = "--debug" in arguments, "--json" in arguments
     try:
         with warnings.catch_warnings(), _signals_raise():
-            code = _answer(name) if name not in COMMANDS else _run(name, _plain(arguments[1:]))
+            code = _answer(name) if name not in COMMANDS else _run(name, arguments[1:])
             sys.stdout.flush()
             return code
     except SystemExit as stop:  # help, or an error in the arguments, has been printed
@@ -141,17 +142,19 @@ def _run(name: str, arguments: list[str]) -> int:
     warnings.simplefilter("always", DataWarning)
     warnings.showwarning = show
 
-    with _standard_input_as_file(_joined(arguments)) as words:
+    words = _joined([word for word in arguments if word != "--debug"])
+    with _standard_input_as_file(words) as words:
         return _execute(name, words)
 
 
 def _execute(name: str, words: list[str]) -> int:
     from meshsplats._files.atomic import promises_kept
-    from meshsplats.cli.arguments import parse, usage_errors
+    from meshsplats.cli.arguments import parse, spelled, usage_errors
 
     module, _, attribute = COMMANDS[name][0].partition(":")
     kind = getattr(importlib.import_module(module), attribute)
-    with usage_errors(kind), promises_kept():
+    write_options(lambda name: spelled(kind, name))
+    with usage_errors(), promises_kept():
         return parse(kind, f"meshsplats {name}", words).execute() or OK
 
 
@@ -197,10 +200,6 @@ def _answer(name: str) -> int:
         print(f"meshsplats {meshsplats.__version__}")
         return OK
     return _unknown(name)
-
-
-def _plain(arguments: list[str]) -> list[str]:
-    return [argument for argument in arguments if argument != "--debug"]
 
 
 def _joined(arguments: list[str]) -> list[str]:

@@ -9,7 +9,7 @@ import types
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
@@ -18,7 +18,7 @@ import tyro
 from meshsplats import _toml as toml
 from meshsplats._option_values import converted, from_text, short
 from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
-from meshsplats.cli.messages import OK, UsageError, flag, say
+from meshsplats.cli.messages import OK, UsageError, flag, say, with_flags
 from meshsplats.errors import OptionsError, OptionValueError
 
 T = TypeVar("T")
@@ -67,9 +67,9 @@ class Command:
 
     def finish(self, result: Any, *lines: str, indent: int | None = 1) -> None:
         """Prints what came out: ``lines``, or with --json the ``result``."""
-        if getattr(self, "json", False):
-            lines = (json.dumps(result, indent=indent, default=str),)
-        print(*lines, sep="\n", flush=True)
+        as_json = getattr(self, "json", False)
+        shown = [json.dumps(result, indent=indent, default=str)] if as_json else map(with_flags, lines)
+        print(*shown, sep="\n", flush=True)
 
 
 @dataclass(frozen=True)
@@ -165,15 +165,14 @@ def spelled(command: type, name: str) -> str:
 
 
 @contextmanager
-def usage_errors(command: type) -> Iterator[None]:
-    """Within the block, an OptionsError of the library becomes a UsageError, and errors of values have the
-    flags of ``command``."""
+def usage_errors() -> Iterator[None]:
+    """Within the block, an OptionsError of the library becomes a UsageError."""
     try:
         yield
     except OptionsError as error:
-        raise UsageError(error.spelled(partial(spelled, command))) from None
+        raise UsageError(*error.args) from None
     except OptionValueError as error:
-        raise ValueError(error.spelled(partial(spelled, command))) from None
+        raise ValueError(*error.args) from None
 
 
 def as_cli_options(
@@ -309,7 +308,7 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
     hidden = [] if everything or not common else [name for name in flags if name not in common]
     shown = _described(command, [name for name in flags if name not in hidden], flags)
     with suppress(SystemExit):
-        tyro.cli(shown, prog=prog, args=["--help"], config=_MARKERS)
+        tyro.cli(shown, prog=prog, args=["--help"], config=_PARSED)
     others = [name for name, option in options.items() if not option.has_flag]
     notes = [f"{len(hidden)} more options: --help-all."] if hidden else []
     if command.CONFIGURABLE:

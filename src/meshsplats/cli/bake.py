@@ -16,7 +16,7 @@ from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import size_of, written
 from meshsplats.cli.images import ViewOptions
 from meshsplats.cli.messages import say
-from meshsplats.edits import BakingOptions, bake_file
+from meshsplats.file_options import BakingOptions
 
 
 @as_cli_options(presets=False)
@@ -48,6 +48,8 @@ class Bake(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.edits import bake_file
+
         start, place = time.perf_counter(), partial(written, origin=self.origin)
         made = bake_file(self.input, self.output, self.baking, place=place, force=self.force, say=say)
         seconds, count = time.perf_counter() - start, len(made.mesh.faces)

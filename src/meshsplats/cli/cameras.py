@@ -5,23 +5,20 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 import tyro
 
-from meshsplats._files.atomic import together
 from meshsplats._words import optional_up
-from meshsplats.cameras.files import cameras_beside, model_folder
-from meshsplats.cameras.framing import guess_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import UsageError, command_line, say
-from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.viewpoints.finding import FoundCameras, find_cameras
-from meshsplats.viewpoints.sheet import contact_sheet
-from meshsplats.viewpoints.showing import opened_with
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from meshsplats.viewpoints.finding import FoundCameras
 
 
 @dataclass(frozen=True)
@@ -50,8 +47,15 @@ class Cameras(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.cameras.files import save_cameras
+        from meshsplats._files.atomic import together
+        from meshsplats.cameras.files import cameras_beside, model_folder, save_cameras
+        from meshsplats.cameras.framing import guess_up
+        from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
+        from meshsplats.gaussians import GaussianCloud
         from meshsplats.images.writing import save_image
+        from meshsplats.viewpoints.finding import find_cameras
+        from meshsplats.viewpoints.sheet import contact_sheet
+        from meshsplats.viewpoints.showing import opened_with
 
         start = time.perf_counter()
         if self.output.suffix.lower() != ".json":

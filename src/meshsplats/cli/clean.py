@@ -13,7 +13,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import SplatOptions, named, written
 from meshsplats.cli.messages import shown_path
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules
+from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 
 
 @as_cli_options(

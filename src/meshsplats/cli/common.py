@@ -8,24 +8,26 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import numpy as np
 import tyro
 
-from meshsplats._origin import in_words
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
+from meshsplats._files import atomic
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.messages import flag, one_line, say
-from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.formats.outputs import Scene, placed
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from meshsplats.camera import Camera
+    from meshsplats.cluster import Workers
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
 
 T = TypeVar("T")
-Placed = TypeVar("Placed", GaussianCloud, SplatMesh, BaseMesh, GaussianCloud | SplatMesh)
 
 
 @as_cli_options(presets=False)
@@ -59,15 +61,17 @@ class ClusterOptions:
     @contextmanager
     def workers(self, threads: int | None) -> Iterator[Workers]:
         """The workers, for the length of the block; ``threads``: maximum number of threads."""
+        from meshsplats.cluster import open_workers
+
         with open_workers(self.cluster, threads) as found:
             if self.cluster is not None:
                 say(f"cluster: {found}")
             yield found
 
 
-def written(scene: Placed, origin: option.Origin) -> Placed:
+def written(scene: Scene, origin: option.Origin) -> Scene:
     """``placed``; also says where the file will stand in the world."""
-    from meshsplats.formats.outputs import placed
+    from meshsplats.gaussians import GaussianCloud
 
     say_origin(scene.origin, origin, splats=isinstance(scene, GaussianCloud))
     return placed(scene, origin)
@@ -76,13 +80,15 @@ def written(scene: Placed, origin: option.Origin) -> Placed:
 def say_origin(found: np.ndarray, origin: option.Origin, *, splats: bool = False) -> None:
     """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
     ``splats`` does not tell other programs."""
+    from meshsplats._origin import in_words
+
     if origin == "keep" and found.any():
         splats_only = ", in a note of the file: other programs see the splats of .ply and .sog around 0 0 0"
         say(f"origin: {in_words(found)}" + (splats_only if splats else "; --origin local leaves it out"))
     elif origin == "local" and found.any():
         say(f"origin: left out; coordinates are relative to {in_words(found)}")
     elif not isinstance(origin, str):
-        say(f"origin: coordinates are relative to {in_words(np.array(origin))}")
+        say(f"origin: coordinates are relative to {in_words(origin)}")
 
 
 @contextmanager
@@ -102,7 +108,7 @@ def warnings_kept() -> Iterator[list[str]]:
         warnings.showwarning = show
 
 
-def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:
+def track(items: Iterable[T], total: int, label: str) -> Iterable[T]:
     """``items`` with a progress bar on stderr, where that is a terminal."""
     if not sys.stderr.isatty():
         yield from items
@@ -154,6 +160,4 @@ def named(path: Path) -> str:
 
 def size_of(path: Path) -> str:
     """Size of a file in words: 3.2 MB."""
-    from meshsplats._files.atomic import in_words
-
-    return in_words(path.stat().st_size)
+    return atomic.in_words(path.stat().st_size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +16,8 @@ from meshsplats.cli.images import DrawOptions, ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.scene_views import WAYS_OF_VIEWS
-from meshsplats.evaluation.comparison_files import ComparisonOptions, save_comparison
+from meshsplats.evaluation.options import ComparisonOptions
 from meshsplats.formats.outputs import CONFIGURATION
-from meshsplats.rendering.looks import comparison_in_words
 
 
 @as_cli_options(presets=False)
@@ -51,6 +51,9 @@ class Compare(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.evaluation.comparison_files import save_comparison
+        from meshsplats.rendering.looks import comparison_in_words
+
         made = save_comparison(
             self.splats,
             self.mesh,
@@ -58,7 +61,7 @@ class Compare(Command):
             self.how,
             force=self.force,
             say=say,
-            progress=lambda views, count: track(views, "comparing", count),
+            progress=partial(track, label="comparing"),
         )
         write_configuration(self.output / CONFIGURATION, "compare", self)
         scores, result = made.scores, made.result

@@ -9,13 +9,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import tyro
 
 from meshsplats._words import plural
-from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options, of_presets, usage_errors
 from meshsplats.cli.common import (
@@ -29,7 +27,6 @@ from meshsplats.cli.common import (
     warnings_kept,
     written,
 )
-from meshsplats.cli.images import views_of_a_place
 from meshsplats.cli.messages import (
     FAILED,
     NO_SPACE,
@@ -47,14 +44,15 @@ from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.options import PRESETS
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.mesh_files import MeshFileOptions
-from meshsplats.evaluation.viewers import AlphaChoice
-from meshsplats.file_conversion import Callbacks, Converter, Product, seen_from
 from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats
-from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import written_ending
-from meshsplats.formats.streaming import SplatStream
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.jobs import Job, formats_of, is_batch, jobs, sources, without_results
+from meshsplats.product import Product
+
+if TYPE_CHECKING:
+    from meshsplats.camera import Camera
+    from meshsplats.formats.streaming import SplatStream
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.jobs import Job
 
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
 """Options that do not change the mesh."""
@@ -120,6 +118,8 @@ class Convert(Command):
     their input or were made with other options."""
 
     def execute(self) -> int:
+        from meshsplats.jobs import formats_of, is_batch, jobs, sources, without_results
+
         if not self.input:
             raise UsageError("give a splat file, a mesh or a folder to convert")
         ending, product = written_ending(self.output.name), self.product
@@ -150,6 +150,8 @@ class Convert(Command):
                     self.output.rmdir()  # where nothing was written
 
     def resolved(self) -> dict[str, Any]:
+        from meshsplats.formats.sniff import identify
+
         if self.product.as_splats or all(identify(path) == "mesh" for path in self.input):
             return {}
         return vars(self.product.resolved(self.input))
@@ -158,9 +160,9 @@ class Convert(Command):
         """Does every job, also after failures; a full disk ends them. Returns the exit code: that of the
         failures if they are all of one kind."""
         codes, skipped = [], 0
-        for job in track(todo, "converting", len(todo)):
+        for job in track(todo, len(todo), "converting"):
             try:
-                with usage_errors(type(self)):
+                with usage_errors():
                     result = self._convert(job, cameras)
                 skipped += result["skipped"]
                 self._print_line(result, job)
@@ -181,6 +183,7 @@ class Convert(Command):
 
     def _convert(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Does ``job``; its result, for JSON."""
+
         import meshsplats
 
         with warnings_kept() as warned, job.claimed(self.force):
@@ -199,9 +202,11 @@ class Convert(Command):
 
     def _made(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``; counts, scores and seconds."""
+        from meshsplats.file_conversion import ConversionCallbacks, Converter
+
         if not (self.product.as_splats or self.product.stream):
             self.product.check_kind(job, self.reading)
-        callbacks = Callbacks(
+        callbacks = ConversionCallbacks(
             load=partial(self.reading.load, up=self.product.up),
             stream=self._opened,
             place=partial(written, origin=self.product.origin),
@@ -229,8 +234,12 @@ class Convert(Command):
         return replace(self, input=(job.source,), output=path, formats=(), product=taken)
 
     def _opening(self, cloud: GaussianCloud, source: Path, given: Sequence[Camera] | None) -> Camera | None:
-        found = views_of_a_place(cloud, source, 1, up=self.product.direction, given=given or None)
-        return found[0] if found else None
+        from meshsplats.viewpoints.showing import default_views
+
+        if (found := default_views(cloud, source, 1, up=self.product.direction, given=given or None)) is None:
+            return None
+        say(found[1])
+        return found[0][0] if found[0] else None
 
     def _changes(self, job: Job, index: int) -> str | None:
         """How the record beside an output of ``job`` differs from the options of now: see ``Job.plan``."""
@@ -242,6 +251,10 @@ class Convert(Command):
         self.finish(result, *self._lines(result, job, cameras), indent=None)
 
     def _lines(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> list[str]:
+        from meshsplats._origin import zero_origin
+        from meshsplats.evaluation.viewers import AlphaChoice
+        from meshsplats.file_conversion import seen_from
+
         made = named(self.output)
         if result["skipped"]:
             return [f"{made}: kept"]
@@ -262,7 +275,7 @@ class Convert(Command):
         if result["preview"]:
             lines.append(f"preview: {result['preview']}")
         if result.get("converted") is not None and self.product.files.compression == "none":
-            lines.append(f"next: {self._next(seen_from(cameras, job.source, np.zeros(3)))}")
+            lines.append(f"next: {self._next(seen_from(cameras, job.source, zero_origin()))}")
         return lines
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:

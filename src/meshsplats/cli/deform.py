@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -14,8 +15,9 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
-from meshsplats.formats.outputs import placed
-from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from meshsplats.mesh import SplatMesh
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class Deform(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.prior.planning import pose_files, posed_files
+        from meshsplats.formats.outputs import placed
+        from meshsplats.prior.planning import save_poses
 
         start, count = time.perf_counter(), len(self.base)
         if not self.base:
@@ -55,15 +58,14 @@ class Deform(Command):
             triangles = len(mesh.faces)
             return placed(mesh, self.origin)
 
-        given = (self.input, self.base, self.output)
-        for _ in track(posed_files(*given, lift=self.lift, place=place, force=self.force), "moving", count):
-            pass
+        how: dict[str, Any] = {"lift": self.lift, "place": place, "force": self.force}
+        shown = partial(track, label="moving")
+        files = save_poses(self.input, self.base, self.output, progress=shown, **how)
         seconds = time.perf_counter() - start
-        files = [str(path) for path in pose_files(self.output, count)]
         more = f" to {files[-1]}" if count > 1 else ""
-        made = f"{files[0]}{more} ({plural(triangles, 'triangle')}, {size_of(Path(files[0]))}):"
+        made = f"{files[0]}{more} ({plural(triangles, 'triangle')}, {size_of(files[0])}):"
         self.finish(
-            {"files": files, "triangles": triangles, "seconds": round(seconds, 3)},
+            {"files": list(map(str, files)), "triangles": triangles, "seconds": round(seconds, 3)},
             f"{made} {plural(count, 'pose')} in {seconds:.2f} s",
             indent=None,
         )

@@ -12,7 +12,6 @@ import tyro
 
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
-from meshsplats.formats.outputs import check_outputs
 
 STEPS = (
     "convert scene.ply -o scene.glb",
@@ -40,6 +39,7 @@ class Demo(Command):
     def execute(self) -> int:
         from meshsplats.demo_scene import make_scene
         from meshsplats.formats.gaussians import save_gaussians
+        from meshsplats.formats.outputs import check_outputs
         from meshsplats.viewer.server import open_page
 
         folder = self.output

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.messages import quoted
-from meshsplats.installation import examine, in_words
 
 
 @dataclass(frozen=True)
@@ -18,6 +17,8 @@ class Doctor(Command):
     """Print the findings as JSON."""
 
     def execute(self) -> int:
+        from meshsplats.installation import examine, in_words
+
         findings = examine()
         missing = findings["to_install"].items()
         findings["to_install"] = {extra: " ".join(map(quoted, names)) for extra, names in missing}

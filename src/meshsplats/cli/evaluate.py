@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -15,11 +15,8 @@ from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, print_table, track
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
-from meshsplats.evaluation.report import SSIM_CONVENTION
-from meshsplats.evaluation.results import notes
-from meshsplats.evaluation.strips import score_table
+from meshsplats.file_options import ScoringOptions
 from meshsplats.formats.outputs import CONFIGURATION
-from meshsplats.scoring import Scoring, ScoringOptions
 
 Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 
@@ -57,12 +54,19 @@ class Evaluate(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.evaluation.report import SSIM_CONVENTION
+        from meshsplats.evaluation.results import notes
+        from meshsplats.evaluation.strips import score_table
+        from meshsplats.scoring import Scoring
+
         self.how.check(self.mesh)
         here = self.cluster.cluster is None  # workers share a terminal
         if self.how.protocol is None and not here:
             raise UsageError("--cluster is for the scenes of --protocol")
         start = time.perf_counter()
-        scoring = Scoring(self.how, self.output, self.threads, _progress if here else None)
+        scoring = Scoring(
+            self.how, self.output, self.threads, partial(track, label="scoring") if here else None
+        )
         if self.how.protocol is None:
             reports = [scoring.run(self.mesh, force=self.force)]
         else:
@@ -76,7 +80,3 @@ class Evaluate(Command):
             *notes(reports),
             f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/",
         )
-
-
-def _progress(views: Iterable[Any], count: int) -> Iterable[Any]:
-    return track(views, "scoring", count)

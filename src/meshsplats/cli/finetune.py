@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, again
 from meshsplats.cli.messages import UsageError, say
-from meshsplats.cli.training import Plan, TrainingCommand
+from meshsplats.cli.training import TrainingCommand
 from meshsplats.conversion import ConversionOptions
-from meshsplats.finetuning import FinetuneConfig, make_config
-from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.file_tuning import FileTuning, StartOptions
-from meshsplats.finetuning.on_splats import check_order_of_file
-from meshsplats.finetuning.plans import Trained
+from meshsplats.finetuning.config import FinetuneConfig, make_config
 from meshsplats.finetuning.run_files import RunFiles
-from meshsplats.finetuning.setup import Setup
+from meshsplats.finetuning.start_options import StartOptions
 from meshsplats.formats.outputs import check_mesh_suffix
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning.checkpoint import Checkpoint
+    from meshsplats.finetuning.plans import Plan, Trained
+    from meshsplats.finetuning.setup import Setup
 
 
 @as_cli_options(without=("look",))
@@ -61,6 +61,8 @@ class Finetune(TrainingCommand):
         return make_config(self.begin.preset, **self.explicit_settings())
 
     def check(self) -> None:
+        from meshsplats.finetuning.on_splats import check_order_of_file
+
         check_mesh_suffix(self.output)
         check_order_of_file(self.configured(), self.output)
         if self.cluster.cluster is not None and self.begin.cell_splats is None:
@@ -68,6 +70,8 @@ class Finetune(TrainingCommand):
         super().check()
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
+        from meshsplats.finetuning.file_tuning import FileTuning
+
         tuning = FileTuning(
             self.input,
             self.output,
@@ -83,6 +87,8 @@ class Finetune(TrainingCommand):
         return tuning.plan(config, earlier, setup)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
+        from meshsplats.cameras.files import save_cameras
+
         if self.target.data is None and plan.dataset.test:
             cameras = [view.camera for view in plan.dataset.test]
             save_cameras(cameras, files.held_out, origin=plan.dataset.origin)

@@ -10,7 +10,6 @@ import tyro
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import shown_path
-from meshsplats.inspection import describe, in_words
 
 
 @dataclass(frozen=True)
@@ -25,6 +24,8 @@ class Info(Command):
     """Print the findings as JSON."""
 
     def execute(self) -> None:
+        from meshsplats.inspection import describe, in_words
+
         findings = {"path": shown_path(self.input), **describe(self.input, self.reading.arguments)}
         if findings["kind"] not in ("splats", "tileset"):
             self.reading.refuse_for(self.input)

@@ -8,20 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from meshsplats._words import optional_up
-from meshsplats.chains import (
-    ChainOptions,
-    LevelTuning,
-    begin_folder,
-    check_folder,
-    make_chain,
-    partial_folder,
-    table_in_words,
-)
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, say_origin
@@ -29,11 +20,13 @@ from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, write_configuration
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning import Interrupted, Progress
+from meshsplats.file_options import ChainOptions, LevelTuning
 from meshsplats.formats.outputs import CONFIGURATION, placed
-from meshsplats.formats.sniff import identify
-from meshsplats.levels import Level
 from meshsplats.order import Order
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning import Progress
+    from meshsplats.levels import Level
 
 _CHANGEABLE = ("output", "threads")
 """Options that may change when a chain is resumed."""
@@ -84,6 +77,10 @@ class Levels(Command):
     """Overwrite an older chain in the folder."""
 
     def execute(self) -> int:
+        from meshsplats.chains import make_chain, planned, table_in_words
+        from meshsplats.finetuning import Interrupted
+        from meshsplats.formats.sniff import identify
+
         self._check()
         config = self.tuning.config()
         if identify(self.input) != "splats":
@@ -101,7 +98,7 @@ class Levels(Command):
                 yield show
 
         options = replace(self.chain, order=self.order, up=optional_up(self.up), threads=self.threads)
-        options.plan(len(cloud))  # before the folder is made
+        planned(options, len(cloud))  # before the folder is made
         self._begin()
         how: dict[str, Any] = {"place": partial(placed, origin=self.origin), "on_level": shown}
         try:
@@ -119,6 +116,8 @@ class Levels(Command):
     def _check(self) -> None:
         """UsageError or OptionsError for options that contradict each other; OSError, before the work, if the
         folder cannot appear."""
+        from meshsplats.chains import check_folder
+
         self.chain.check()
         option.check_resumption(self.resume, self.force)
         optional_up(self.up)
@@ -129,6 +128,8 @@ class Levels(Command):
 
     def _begin(self) -> None:
         """Makes the folder of unfinished levels, empty; with --resume it must be that of the same command."""
+        from meshsplats.chains import begin_folder, partial_folder
+
         if not self.resume:
             write_configuration(begin_folder(self.output) / CONFIGURATION, "levels", self)
             return

@@ -9,11 +9,11 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any
 
-from meshsplats.errors import ClusterError, DeviceError, OverwritingError
+from meshsplats.errors import ClusterError, DeviceError, NamingOptions, OverwritingError, with_options
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a full disk, as in ``_files.atomic``."""
@@ -31,6 +31,8 @@ ENDINGS = {signal.SIGINT: "interrupted"} | {
 
 _standard_input: str | None = None
 """The temporary file that holds standard input, if the input is -."""
+_spelled: Callable[[str], str] | None = None
+"""How the command writes its options, where the library names them."""
 
 
 class UsageError(Exception):
@@ -91,6 +93,17 @@ def read_from_standard_input(path: str | None) -> None:
     _standard_input = path
 
 
+def write_options(how: Callable[[str], str]) -> None:
+    """Messages of the library have its options as ``how`` writes them, until the next command."""
+    global _spelled
+    _spelled = how
+
+
+def with_flags(text: str) -> str:
+    """``text`` with flags for the names of options in double backquotes."""
+    return with_options(text, _spelled or flag)
+
+
 def shown_path(path: str | os.PathLike[str]) -> str:
     """``path`` as the user gave it: - for standard input."""
     return "-" if _standard_input is not None and os.fspath(path) == _standard_input else os.fspath(path)
@@ -104,12 +117,12 @@ def one_line(error: object) -> str:
             reason = os.strerror(errno.EISDIR)  # Windows says "Permission denied"
         text = f"{os.fsdecode(error.filename)}: {reason}"
     else:
-        text = str(error)
+        text = error.spelled(_spelled or flag) if isinstance(error, NamingOptions) else str(error)
     if isinstance(error, MemoryError) and not text:
         text = "out of memory"
     if _standard_input is not None:
         text = text.replace(_standard_input, "standard input")
-    return " ".join(text.split()) or type(error).__name__
+    return " ".join(with_flags(text).split()) or type(error).__name__
 
 
 def command_line(words: Iterable[object]) -> str:
@@ -130,7 +143,7 @@ def quoted(word: str) -> str:
 def say(text: str) -> None:
     """Prints a line on standard error, if anybody reads it."""
     with suppress(OSError):
-        print(f"meshsplats: {text}", file=sys.stderr, flush=True)
+        print(f"meshsplats: {with_flags(text)}", file=sys.stderr, flush=True)
 
 
 def flag(name: str) -> str:

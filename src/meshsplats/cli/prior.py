@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -11,13 +12,16 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import quoted, say
-from meshsplats.cli.training import Plan, TrainingCommand, tuning_options
-from meshsplats.finetuning import FinetuneConfig
-from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.run_files import RunFiles
-from meshsplats.finetuning.setup import Setup
-from meshsplats.prior import prior_config
-from meshsplats.prior.planning import LayingOptions, PriorTraining
+from meshsplats.cli.training import TrainingCommand, tuning_options
+from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.prior.options import LayingOptions, prior_config
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning.checkpoint import Checkpoint
+    from meshsplats.finetuning.plans import Plan
+    from meshsplats.finetuning.run_files import RunFiles
+    from meshsplats.finetuning.setup import Setup
+    from meshsplats.prior.planning import PriorTraining
 
 
 # Layers on a base share a depth, which only the order of fragments knows.
@@ -78,5 +82,7 @@ class Prior(TrainingCommand):
 
     @property
     def _training(self) -> PriorTraining:
+        from meshsplats.prior.planning import PriorTraining
+
         given = (self.input, self.output, self.laying, self.target, self.splats, self.reading)
         return PriorTraining(*given, say, self.threads)

@@ -8,11 +8,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from meshsplats.cli.messages import say
-from meshsplats.finetuning import Progress
-from meshsplats.finetuning.setup import Display
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
+
+    from meshsplats.finetuning import Progress
+    from meshsplats.finetuning.setup import Display
 
 
 @contextmanager

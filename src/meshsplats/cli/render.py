@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +18,7 @@ from meshsplats.cli.images import DrawOptions, ViewOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.scene_views import WAYS_OF_VIEWS
-from meshsplats.renders.saving import ImageOptions, ImageRun
+from meshsplats.renders.options import ImageOptions
 
 
 @as_cli_options(presets=False)
@@ -54,9 +55,11 @@ class Render(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.renders.saving import ImageRun
+
         start = time.perf_counter()
         run = ImageRun(self.input, self.output, self.images, say, self.cluster.workers)
-        made = run.save(force=self.force, progress=lambda items, count: track(items, "rendering", count))
+        made = run.save(force=self.force, progress=partial(track, label="rendering"))
         files, cameras = made.files, made.cameras
         write_configuration(files.config, "render", self, made.record)
         seconds = time.perf_counter() - start

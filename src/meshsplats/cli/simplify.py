@@ -13,7 +13,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, draw_preview, named, written
 from meshsplats.cli.records import write_configuration
-from meshsplats.edits import EditCallbacks, SimplifyOptions, simplify_file
+from meshsplats.file_options import SimplifyOptions
 
 
 @as_cli_options(presets=False)
@@ -43,6 +43,8 @@ class Simplify(Command):
     force: option.Force = False
 
     def execute(self) -> None:
+        from meshsplats.edits import EditCallbacks, simplify_file
+
         made = simplify_file(
             self.input,
             self.output,

@@ -8,27 +8,27 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import again, say_origin
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.progress import progress_display
-from meshsplats.cli.training import Plan, TrainingCommand, tuning_options
-from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
-from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.config import LENGTHS
-from meshsplats.finetuning.plans import Trained
-from meshsplats.finetuning.run_files import RunFiles
-from meshsplats.finetuning.setup import Setup
+from meshsplats.cli.training import TrainingCommand, tuning_options
+from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs, check_splat_endings, placed
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.photographs import PhotographOptions
-from meshsplats.training.run import SO_FAR
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from meshsplats.camera import Camera
+    from meshsplats.finetuning.checkpoint import Checkpoint
+    from meshsplats.finetuning.interruption import Interrupted
+    from meshsplats.finetuning.plans import Plan, Trained
+    from meshsplats.finetuning.run_files import RunFiles
+    from meshsplats.finetuning.setup import Setup
 
 
 @tuning_options(lambda name: f"(default: {getattr(TrainConfig, name)})")
@@ -88,6 +88,7 @@ class Train(TrainingCommand):
         return self.target.plan(self.input, config, as_splats=self.as_splats is not None, say=say)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
+        from meshsplats.finetuning.run import RunOptions
         from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.training.as_splats import fit_splats
 
@@ -106,6 +107,8 @@ class Train(TrainingCommand):
         return (plan.dataset.test or plan.dataset.train)[0].camera
 
     def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
+        from meshsplats.training.run import SO_FAR
+
         code = super().report_interrupt(stop, files)
         say(f"the mesh so far: {files.folder / SO_FAR}")
         return code

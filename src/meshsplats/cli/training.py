@@ -11,31 +11,28 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
-from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together
-from meshsplats.camera import Camera
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets
 from meshsplats.cli.common import draw_preview, written
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, in_plain_words, write_configuration
-from meshsplats.evaluation.viewers import alpha_for_viewers
-from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
-from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, as_begun
-from meshsplats.finetuning.config import LENGTHS, PRESETS
-from meshsplats.finetuning.plans import Plan as Plan
-from meshsplats.finetuning.plans import RunResult, Trained
-from meshsplats.finetuning.reports import SCORED_VIEWS
+from meshsplats.errors import OtherRunError
+from meshsplats.finetuning.config import LENGTHS, PRESETS, FinetuneConfig
+from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Setup
-from meshsplats.finetuning.step import samples_of
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.outputs import recorded_options
-from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from meshsplats.camera import Camera
+    from meshsplats.finetuning.checkpoint import Checkpoint
+    from meshsplats.finetuning.plans import Plan, Trained
+    from meshsplats.finetuning.run import RunOptions
 
 Config = TypeVar("Config", bound=FinetuneConfig)
 STARTUP_SECONDS = 1.0
@@ -116,6 +113,8 @@ class TrainingCommand(Command):
 
     def check(self) -> None:
         """UsageError or OptionsError for options that contradict each other or have no effect."""
+        from meshsplats.webgpu.device import open_device
+
         self.target.check()
         if self.device == "gpu":
             if self.configured().opacity == "cutoff":
@@ -128,6 +127,7 @@ class TrainingCommand(Command):
         return self if self.target.data is None else self._sized(self.target.data, config)
 
     def _sized(self, folder: Path, config: FinetuneConfig) -> Self:
+        from meshsplats._core.library import thread_count
         from meshsplats.training.image_sizes import worthwhile_downscale
 
         target: Any = self.target
@@ -154,6 +154,8 @@ class TrainingCommand(Command):
         return self.configured().to_dict()
 
     def execute(self) -> int:
+        from meshsplats.finetuning.checkpoint import as_begun
+
         config = self.configured()
         start = time.perf_counter() - STARTUP_SECONDS
         self.check()
@@ -167,6 +169,9 @@ class TrainingCommand(Command):
 
     def _run(self, config: FinetuneConfig, files: RunFiles, earlier: Checkpoint | None, start: float) -> int:
         """``execute`` of a prepared command, which began at ``start`` by the performance counter."""
+        from meshsplats.evaluation.viewers import alpha_for_viewers
+        from meshsplats.finetuning.plans import RunResult
+        from meshsplats.finetuning.reports import SCORED_VIEWS
         from meshsplats.formats.meshes import save_mesh
 
         try:
@@ -227,6 +232,8 @@ class TrainingCommand(Command):
 
     def evaluating_next(self, words: Sequence[object], plan: Plan, config: FinetuneConfig) -> list[str]:
         """``next_steps``: the command that scores the result on held-out views. ``words``: their options."""
+        from meshsplats.finetuning.step import samples_of
+
         words = ["meshsplats", "evaluate", self.output, *words]
         if plan.background is not None or config.background == "black":
             words += ["--background", "black" if plan.background is None else plan.background.name]
@@ -244,6 +251,8 @@ class TrainingCommand(Command):
     def _run_options(self, files: RunFiles, start: float, reserve: float) -> RunOptions:
         """Of a run whose command started at ``start`` by the performance counter, and needs ``reserve``
         seconds afterwards."""
+        from meshsplats.finetuning.run import RunOptions
+
         return RunOptions(
             folder=files.folder,
             resume=self.resume,

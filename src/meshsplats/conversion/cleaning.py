@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from meshsplats._cells import Cells
 from meshsplats._geometry import spacing
-from meshsplats._options import Range, check_options
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
 from meshsplats.gaussians import SH_C0, GaussianCloud
@@ -26,35 +25,6 @@ CELL = 2.5
 """Side of the cells for counting neighbours and connecting parts, in spacings of the splats."""
 REACH = 1.5
 """Standard deviations at which a splat ends where its neighbours are counted."""
-
-
-@dataclass(frozen=True)
-class CleaningRules:
-    """Which splats are removed: those that any of these rules names. None: no such rule."""
-
-    crop: tuple[float, float, float, float, float, float] | None = None
-    """Centre outside the box x0 y0 z0 x1 y1 z1, in the coordinates of the file."""
-    min_opacity: Annotated[float | None, Range(0, 1)] = None
-    """Opacity below this."""
-    max_distance: Annotated[float | None, Range(0, math.inf)] = None
-    """Farther from the middle than this many radii of the subject. Within one radius lie nine tenths of its
-    opacity."""
-    max_size: Annotated[float | None, Range(0, math.inf)] = None
-    """Longer, from its middle to an end, than this many radii of the subject. 1000 removes what no camera can
-    have seen whole."""
-    sparse: Annotated[float | None, Range(0, 1)] = None
-    """Fewer neighbours than this share of the median. 0.05 removes single floaters and thin
-    clouds."""
-    min_part: Annotated[float | None, Range(0, 1)] = None
-    """In a part that touches nothing else and has less than this share of all opacity. 0.01 removes
-    clumps in the air."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.crop is not None:
-            low, high = np.array(self.crop[:3]), np.array(self.crop[3:])
-            if not (np.isfinite(self.crop).all() and (low < high).all()):
-                raise ValueError(f"crop must be x0 y0 z0 x1 y1 z1 with x0 < x1 and so on, got {self.crop}")
 
 
 _WORDS = {
@@ -68,9 +38,6 @@ _WORDS = {
     "surroundings": "kept, as they surround the place",
 }
 """Names of the rules in tables."""
-
-FLOATERS = CleaningRules(max_size=1000, sparse=0.05, min_part=0.01)
-"""The default rules."""
 
 
 @dataclass(frozen=True, eq=False)

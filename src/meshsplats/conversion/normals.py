@@ -190,10 +190,8 @@ def _seen_side(
     up, middle = guess_up(mesh), scene_bounds(mesh).center
     for i, camera in enumerate(views_around(mesh, views, _SIDE, cameras, 16)):
         surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
-        positions, z = camera.project(centers)
-        rows = np.flatnonzero(camera.in_image(positions))
-        column, row = positions[rows].T.astype(np.intp)
-        visible = rows[z[rows] < surface[row, column] + tolerance]
+        shown, column, row, z = camera.pixels_of(centers)
+        visible = shown[z < surface[row, column] + tolerance]
         away = camera.center - centers[visible]
         side = np.einsum("ij,ij->i", normals[visible], away) / np.linalg.norm(away, axis=1)
         front[visible] += np.maximum(side, 0)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 
-import numpy as np
-
 from meshsplats._options import Advanced, Range, With, check_names, check_options
-from meshsplats.rendering.looks import Look
+from meshsplats.choices import Look
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -152,6 +150,8 @@ class ConversionOptions:
         if self.colors == "mean" and not has_cameras:
             raise ValueError("colors='mean' needs cameras")
         if self.crop is not None:
+            import numpy as np
+
             box = np.asarray(self.crop, np.float64)
             if box.shape != (6,) or not np.isfinite(box).all() or not (box[:3] <= box[3:]).all():
                 raise ValueError(

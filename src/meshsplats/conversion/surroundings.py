@@ -13,7 +13,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.conversion.cleaning import FLOATERS, Findings, find
+from meshsplats.conversion.cleaning import Findings, find
+from meshsplats.conversion.cleaning_rules import FLOATERS
 from meshsplats.conversion.recovery import splats_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh

@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from meshsplats._geometry import rotation_rows
-from meshsplats.camera import MAX_SIDE
+from meshsplats.choices import MAX_SIDE
 from meshsplats.datasets.image_files import MAX_NAME, Frame
 from meshsplats.datasets.lens import MODELS, Lens
 from meshsplats.errors import FileFormatError

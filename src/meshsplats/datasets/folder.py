@@ -14,8 +14,9 @@ import numpy as np
 from meshsplats._foreign import what_it_is
 from meshsplats._kinds import need_path
 from meshsplats._origin import choose_origin
+from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.colmap import read_model
-from meshsplats.datasets.image_files import Album, Frame, Masks, Missing, PhotoFile, Taken, split
+from meshsplats.datasets.image_files import Album, Frame, PhotoFile, Taken, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
 from meshsplats.datasets.llff import read_poses_bounds
 from meshsplats.datasets.transforms import read_transforms

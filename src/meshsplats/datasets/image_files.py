@@ -10,11 +10,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Literal
 
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, pinholes, undistort
 from meshsplats.datasets.views import ImageCache, ViewImage
 from meshsplats.errors import DataWarning, FileFormatError
@@ -246,11 +246,6 @@ Taken = list[tuple[Camera, PhotoFile]]
 """The views made from one photograph: one, or the six of a panorama."""
 
 
-Missing = Literal["few", "error", "skip"]
-"""What missing images mean: an error, or that their views are left out; few: left out if under a half."""
-Masks = Literal["count", "subject"]
-
-
 @dataclass
 class Album:
     """Turns the frames of a data set into cameras with their photographs, and counts what is missing."""
@@ -375,7 +370,7 @@ class Album:
         if self.missing and refused:
             raise FileFormatError(
                 f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
-                f" ({_first(self.missing)}){self._near()}; --missing skip (missing='skip') leaves them out"
+                f" ({_first(self.missing)}){self._near()}; ``missing`` skip leaves them out"
             )
         near = self._near() if self.missing else ""
         for names, text in (

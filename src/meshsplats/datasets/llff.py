@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE
+from meshsplats.camera import MAX_SKEW
+from meshsplats.choices import MAX_SIDE
 from meshsplats.datasets.image_files import Frame, Shelf
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError
@@ -23,7 +24,6 @@ MAX_BYTES = 32 << 20
 NEAR_SHARE = 0.5
 """Share of the nearest content's depth at which the near plane lies: the bound leaves out a thousandth of the
 content, which is nearer."""
-_MAX_SKEW = 1e-2
 
 
 def read_poses_bounds(path: Path, images: str) -> list[Frame]:
@@ -73,7 +73,7 @@ def _frame(row: np.ndarray, name: str, file: str, where: str) -> Frame:
         )
     down, right, back = matrix[:, :3].T
     axes = np.stack([right, down, -back])  # OpenCV's in the world, row by row
-    if np.abs(axes @ axes.T - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(axes) < 0:
+    if np.abs(axes @ axes.T - np.eye(3)).max() > MAX_SKEW or np.linalg.det(axes) < 0:
         raise FileFormatError(f"{where}: its axes down, right and back are not those of a camera")
     left, _, across = np.linalg.svd(axes)
     world_to_camera = np.eye(4)

@@ -7,19 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
-
 from meshsplats._options import Advanced, Help, changed
 from meshsplats._words import direction_in_words
-from meshsplats.cameras.framing import warn_of_strays_in
 from meshsplats.errors import FileFormatError, OptionsError
-from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import listed, y_up_suffixes
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from meshsplats.formats.streaming import SplatStream
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
 
 _AXES = Help(
     "Direction of the y axis in the file; auto: as its format prescribes, up in"
@@ -48,7 +46,9 @@ class SceneReading:
     def load(self, path: Path, origin: np.ndarray | None = None, *, up: str | None = None) -> GaussianCloud:
         """The splats of a file, relative to ``origin`` (3,). Tells what its header names; ``up``: the option
         that counts in its place. FileFormatError for a mesh, and what ``load_gaussians`` raises."""
+        from meshsplats.cameras.framing import warn_of_strays_in
         from meshsplats.formats.gaussians import load_gaussians
+        from meshsplats.formats.sniff import identify
 
         try:
             cloud = load_gaussians(path, origin=origin, **self.arguments)
@@ -77,9 +77,14 @@ class SceneReading:
     def load_scene(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh:
         """The splats or the mesh at ``path``; ``up`` as for ``load``. FileFormatError for cameras, and
         OptionsError as by ``refuse_for``."""
+        from meshsplats.cameras.framing import warn_of_strays_in
+        from meshsplats.formats.sniff import identify
+
         kind = identify(path)
         if kind == "cameras":
-            raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
+            raise FileFormatError(
+                f"{path}: a JSON file; expected splats or a mesh (``cameras`` takes cameras)"
+            )
         if kind == "splats":
             return self.load(path, up=up)
         self.refuse_for(path)

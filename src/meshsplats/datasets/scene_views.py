@@ -5,25 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Annotated, Any
 
 from meshsplats._options import Help, Range, changed, check_options
 from meshsplats._words import parse_up
-from meshsplats.camera import MAX_SIDE, Camera
-from meshsplats.cameras.files import cameras_beside, load_cameras
-from meshsplats.cameras.framing import guess_up
-from meshsplats.cameras.trajectories import dome, look_around, orbit
-from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
-from meshsplats.datasets.views import Dataset
+from meshsplats.choices import MAX_SIDE, Masks, Missing
 from meshsplats.errors import OptionsError
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
-from meshsplats.viewpoints.showing import default_views
 
-Origin = Sequence[float] | np.ndarray
+if TYPE_CHECKING:
+    import numpy as np
+
+    from meshsplats.camera import Camera
+    from meshsplats.datasets.views import Dataset
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
+
+    Origin = Sequence[float] | np.ndarray
+
 MissingOfData = Annotated[
     Missing, Help("With ``data``: missing images are left out; few: if fewer than half are missing.")
 ]
@@ -41,6 +39,9 @@ def cameras_named(
 ) -> list[Camera] | None:
     """The cameras in a file, or those of the training views of a data set, relative to ``origin`` (3,); None
     if neither is named. ``missing``: as in ``load_dataset``."""
+    from meshsplats.cameras.files import load_cameras
+    from meshsplats.datasets.folder import load_dataset
+
     if data is not None:
         dataset = load_dataset(data, missing=missing, origin=origin)
         return [view.camera for view in dataset.train or dataset.views]
@@ -137,6 +138,8 @@ class SceneViews:
 
     def photographs(self, origin: np.ndarray) -> Dataset | None:
         """The data set of ``data``, relative to ``origin``, or None."""
+        from meshsplats.datasets.folder import load_dataset
+
         if self.data is None:
             return None
         return load_dataset(self.data, downscale=self.downscale, missing=self.missing, origin=origin)
@@ -165,6 +168,11 @@ class SceneViews:
 
         Raises ValueError for values out of range, FileFormatError and OSError for files that cannot be read.
         """
+        from meshsplats.cameras.files import cameras_beside, load_cameras
+        from meshsplats.cameras.framing import guess_up
+        from meshsplats.cameras.trajectories import dome, look_around, orbit
+        from meshsplats.viewpoints.showing import default_views
+
         check_options(self)
         if self.cameras is not None or self.data is not None:
             if dataset := photographs or self.photographs(scene.origin):
@@ -180,6 +188,8 @@ class SceneViews:
         fov = self.fov
         if self.focal_length is not None:
             shorter = 36 * min(1.0, lens["height"] / lens["width"])
+            import numpy as np
+
             fov = float(np.degrees(2 * np.arctan(shorter / (2 * self.focal_length))))
         if self.look_around is not None:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
@@ -193,7 +203,7 @@ class SceneViews:
                 say(found[1])
                 return found[0]
         lens["fov"] = 45.0 if fov is None else fov
-        target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
+        target = None if self.look_at is None else self.look_at - scene.origin
         lens |= {"distance": self.distance, "target": target}
         if self.dome is not None:
             return dome(scene, self.dome, **lens)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats._kinds import need, need_all, need_choice
+from meshsplats.camera import Camera
 from meshsplats.cameras.placing import (
     ALL_ELEVATIONS,
     DISTANCES,
@@ -20,9 +20,10 @@ from meshsplats.cameras.placing import (
     inside_cameras,
     outside_cameras,
 )
+from meshsplats.choices import MAX_SIDE, Look
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.looks import Look, check_look, draw_splats
+from meshsplats.rendering.looks import check_look, draw_splats
 from meshsplats.viewpoints.finding import find_cameras
 
 Placement = Literal["auto", "object", "surrounded", "inside", "found"]
@@ -100,8 +101,7 @@ def splat_dataset(
     need_all(Camera, cameras=cameras, optional=True)
     if len(cloud) == 0:
         raise ValueError("the scene is empty: there is nothing to make images of")
-    if placement not in get_args(Placement):
-        raise ValueError(f"placement must be one of {', '.join(get_args(Placement))}, got {placement!r}")
+    need_choice(Placement, placement=placement)
     if train < 1 or test < 0:
         raise ValueError(f"there must be at least 1 training view and 0 test views, got {train} and {test}")
     if not 1 <= width <= MAX_SIDE or not (height is None or 1 <= height <= MAX_SIDE):

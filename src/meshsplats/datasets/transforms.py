@@ -15,15 +15,14 @@ from typing import Any
 import numpy as np
 
 from meshsplats._json import read_json
-from meshsplats.camera import MAX_SIDE
+from meshsplats.camera import from_opengl
+from meshsplats.choices import MAX_SIDE
 from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable, leads_out
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.images.reading import read_header
 
 MAX_FRAMES = 200_000
-MAX_SKEW = 1e-2
-"""How far a rotation may be from orthonormal; less than that is taken for rounding."""
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 _RADIAL = ("k1", "k2", "k3", "k4")
 _TANGENTIAL = ("p1", "p2")
@@ -211,16 +210,11 @@ def _world_to_camera(frame: dict[str, Any], where: str) -> np.ndarray:
         )
     if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise FileFormatError(f"{where}: the last row of {key!r} must be 0 0 0 1")
-    axes = matrix[:3, :3]
-    if np.abs(axes.T @ axes - np.eye(3)).max() > MAX_SKEW or np.linalg.det(axes) < 0:
+    result = from_opengl(matrix)
+    if result is None:
         raise FileFormatError(
             f"{where}: {key!r} is no rotation and translation (it scales, shears or mirrors)"
         )
-    left, _, right = np.linalg.svd(axes)
-    rotation = (left @ right * [1, -1, -1]).T  # OpenGL's y and z axes turned to OpenCV's, then inverted
-    result = np.eye(4)
-    result[:3, :3] = rotation
-    result[:3, 3] = -rotation @ matrix[:3, 3]
     return result
 
 

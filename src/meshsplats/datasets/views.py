@@ -14,7 +14,7 @@ from meshsplats._arrays import checked_array
 from meshsplats._kinds import need, need_all
 from meshsplats._origin import in_words, zero_origin
 from meshsplats.camera import Camera
-from meshsplats.rendering.looks import Look
+from meshsplats.choices import Look
 
 CACHE_BYTES = 2 << 30
 """Default limit on the images of a data set that are kept in memory after their first use, bytes."""

@@ -14,13 +14,13 @@ from meshsplats._kinds import need, need_all
 from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.choices import Device, Look
 from meshsplats.datasets.views import View
 from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.engine import Device
-from meshsplats.rendering.looks import Look, check_look, draw_splats, image_of, mesh_samples
+from meshsplats.rendering.looks import check_look, draw_splats, image_of, mesh_samples
 
 
 @dataclass(frozen=True)

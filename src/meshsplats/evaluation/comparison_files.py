@@ -2,64 +2,32 @@
 
 from __future__ import annotations
 
-import json
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from meshsplats._files.atomic import write_text
-from meshsplats._options import check_options
+from meshsplats._files.atomic import write_json
+from meshsplats._kinds import as_path
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import convert
 from meshsplats.conversion.cleaning import cropped
-from meshsplats.conversion.options import Preset
-from meshsplats.datasets.scene_files import PartOfScene, SceneReading
-from meshsplats.datasets.scene_views import SceneViews
-from meshsplats.errors import FileFormatError, OptionValueError
+from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.comparison import Comparison, compare_views
+from meshsplats.evaluation.options import ComparisonOptions
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, check_outputs, view_names
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import amplified_error, save_image, strip
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.drawing import DrawingOptions
-from meshsplats.rendering.looks import Look, mesh_samples
+from meshsplats.rendering.looks import mesh_samples
 
 RESULTS = "results.json"
-
-
-@dataclass(frozen=True)
-class ComparisonOptions:
-    """How splats and a mesh are compared."""
-
-    preset: Preset = "default"
-    """Preset of the conversion, without a mesh."""
-    look: Look = "area"
-    """Ground truth. area: the mean over each pixel's area, as in photographs, Blender, MSAA and ray tracers.
-    splats: the image of a 3DGS viewer at this size."""
-    views: SceneViews = field(default_factory=SceneViews)
-    """Default: 8 views of an orbit, 400 pixels wide."""
-    draw: DrawingOptions = field(default_factory=DrawingOptions)
-    reading: SceneReading = field(default_factory=SceneReading)
-    part: PartOfScene = field(default_factory=PartOfScene)
-    """Of the splats and of the mesh."""
-    amplify: float = 4.0
-    """Factor of the error in the strips."""
-
-    def check(self) -> None:
-        """OptionsError for options that contradict each other or have no effect, ValueError for values out of
-        range, DeviceError or MissingDependencyError for a device that is not there."""
-        check_options(self)
-        if not self.amplify > 0:
-            raise OptionValueError(f"``amplify`` must be positive, got {self.amplify}")
-        _ = self.draw.color  # which is checked
-        self.views.check()
-        self.draw.check_device()
 
 
 @dataclass(frozen=True)
@@ -73,9 +41,9 @@ class SavedComparison:
 
 
 def save_comparison(
-    splats: Path,
-    mesh: Path | None,
-    folder: Path,
+    splats: str | os.PathLike[str],
+    mesh: str | os.PathLike[str] | None,
+    folder: str | os.PathLike[str],
     options: ComparisonOptions,
     *,
     force: bool = False,
@@ -93,13 +61,14 @@ def save_comparison(
     Raises what ``ComparisonOptions.check`` and ``check_outputs`` raise, and FileFormatError for a file of
     another kind.
     """
+    splats, folder = as_path("splats", splats), as_path("folder", folder)
     options.check()
     cloud = cropped(options.reading.load(splats), options.part.crop)
     photographs = options.views.photographs(cloud.origin)
     cameras = options.views.make(cloud, splats, count=8, side=400, photographs=photographs, say=say)
     strips = view_names(len(cameras))
     check_outputs([folder / name for name in (*strips, RESULTS, CAMERAS, CONFIGURATION)], force, folder)
-    made = _mesh(mesh, cloud, cameras, options)
+    made = _mesh(None if mesh is None else as_path("mesh", mesh), cloud, cameras, options)
     start, draw = time.perf_counter(), options.draw
     background = choose_background(draw.color, photographs, {"splats": cloud}, splats, draw.threads)
     samples = draw.samples or mesh_samples(options.look, made, cameras)
@@ -134,7 +103,7 @@ def save_comparison(
         "seconds": round(time.perf_counter() - start, 3),
         **comparison.to_dict(),
     }
-    write_text(folder / RESULTS, json.dumps(result, indent=1, allow_nan=False) + "\n")
+    write_json(folder / RESULTS, result)
     save_cameras(cameras, folder / CAMERAS, origin=cloud.origin)
     return SavedComparison(comparison, background, result)
 

@@ -21,10 +21,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from meshsplats._kinds import need_choice
 from meshsplats.errors import GET_TORCH, FileFormatError, MissingDependencyError
 from meshsplats.evaluation.metrics import checked_images
 from meshsplats.formats.safetensors import load_safetensors
@@ -177,8 +178,7 @@ def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "v
         ValueError: an unknown network.
         MissingDependencyError: torch is missing.
     """
-    if network not in get_args(Network):
-        raise ValueError(f"network must be one of {', '.join(get_args(Network))}, got {network!r}")
+    need_choice(Network, network=network)
     if weights is None:
         return None
     layout = _LAYOUTS[network]

@@ -8,19 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from meshsplats._options import Advanced, check_options
-from meshsplats.camera import Camera
-from meshsplats.conversion.normals import shading_normals
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import OptionsError
-from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
-from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.formats.meshes import save_mesh
-from meshsplats.mesh import SplatMesh, checked_cutoff
-from meshsplats.rendering.ordering import NODES, check_nodes, drawing_order
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from meshsplats.camera import Camera
+    from meshsplats.draw_order import DrawOrder
+    from meshsplats.evaluation.viewers import AlphaChoice
+    from meshsplats.mesh import SplatMesh
 
 GLB_ALPHA = ("mask", "hybrid", "ordered")
 """Values of ``alpha`` that only .glb files have."""
@@ -59,6 +56,9 @@ class MeshFileOptions:
             OptionsError: options contradict each other or have no effect.
             ValueError: one is out of range.
         """
+        from meshsplats.mesh import checked_cutoff
+        from meshsplats.rendering.ordering import check_nodes
+
         check_options(self)
         names = [f"mesh.{kind}" for kind in kinds]
         if self.lit and not any(takes(name, "lit") for name in names):
@@ -92,6 +92,9 @@ class MeshFileOptions:
 
     def prepared(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
         """``mesh`` cut and with normals, where that is asked for. ``cameras``: where it is seen from."""
+        from meshsplats.conversion.normals import shading_normals
+        from meshsplats.formats.cutting import CUTOFF, cut_mesh
+
         if self.alpha == "opaque":
             mesh = cut_mesh(mesh, CUTOFF if self.cutoff is None else self.cutoff)
         return replace(mesh, normals=shading_normals(mesh, cameras)) if self.smooth else mesh
@@ -100,6 +103,8 @@ class MeshFileOptions:
         self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
     ) -> AlphaChoice | None:
         """The alpha mode of the .glb among ``paths``, where it is left to the measurement."""
+        from meshsplats.evaluation.viewers import choose_alpha
+
         measured = self.alpha == "auto" and len(mesh.faces) and any(takes(path, "alpha") for path in paths)
         return choose_alpha(mesh, cameras) if measured else None
 
@@ -107,6 +112,8 @@ class MeshFileOptions:
         self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
     ) -> DrawOrder | None:
         """The order of blending of the .glb among ``paths``, where it is to have one."""
+        from meshsplats.rendering.ordering import NODES, drawing_order
+
         if self.alpha != "ordered" or not any(takes(path, "alpha") for path in paths):
             return None
         return drawing_order(
@@ -121,6 +128,8 @@ class MeshFileOptions:
         order: DrawOrder | None = None,
     ) -> None:
         """Saves a ``prepared`` mesh with the alpha mode of the ``choice``, or in an ``order``."""
+        from meshsplats.formats.meshes import save_mesh
+
         own: dict[str, Any] = {"order": order}
         if order is None:
             own = {

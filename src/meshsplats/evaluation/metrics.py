@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
-from meshsplats._kinds import need_array
+from meshsplats._kinds import need_array, need_choice
 
 SsimConvention = Literal["3dgs", "valid", "reflect"]
 
@@ -68,9 +68,7 @@ def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -
             the window with convention 'valid'.
     """
     a, b = checked_images(a, b)
-    if convention not in get_args(SsimConvention):
-        known = ", ".join(get_args(SsimConvention))
-        raise ValueError(f"convention must be one of {known}, got {convention!r}")
+    need_choice(SsimConvention, convention=convention)
     if convention == "valid" and min(a.shape[:2]) < WINDOW:
         raise ValueError(
             f"convention 'valid' needs images of at least {WINDOW} x {WINDOW} pixels, got {a.shape[0]} x"

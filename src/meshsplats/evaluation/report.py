@@ -12,12 +12,13 @@ import numpy as np
 from meshsplats._kinds import need
 from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
+from meshsplats.choices import Look
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.looks import GROUND_TRUTHS, Look, draw_splats, image_of, mesh_samples
+from meshsplats.rendering.looks import GROUND_TRUTHS, draw_splats, image_of, mesh_samples
 
 if TYPE_CHECKING:
     from meshsplats.evaluation.lpips import Lpips

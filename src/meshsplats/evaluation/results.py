@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from meshsplats._arrays import spread_indices
-from meshsplats._files.atomic import write_text
+from meshsplats._files.atomic import write_json, write_text
 from meshsplats.evaluation.benchmarks import BenchmarkResult
 from meshsplats.evaluation.report import Report, ScoredView
 from meshsplats.evaluation.strips import markdown_table, view_crop, view_strip
@@ -63,5 +62,5 @@ def notes(reports: Sequence[Report]) -> list[str]:
 
 def _save(folder: Path, results: Any, per_view: Any, report: Any, table: str) -> None:
     for name, content in (RESULTS, results), (PER_VIEW, per_view), (REPORT, report):
-        write_text(folder / name, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_json(folder / name, content)
     write_text(folder / TABLE, table)

@@ -74,7 +74,7 @@ class AlphaChoice:
         modes = {"blend": "blend", "mask": f"mask with cutoff {self.cutoff:g}"}
         other = "mask" if self.alpha == "blend" else "blend"
         sorting = (
-            "" if self.alpha == "blend" else " (--alpha blend for ray tracers and Blender's own importer)"
+            "" if self.alpha == "blend" else " (``alpha`` blend for ray tracers and Blender's own importer)"
         )
         return (
             f"alpha: {modes[self.alpha]}, {getattr(self, self.alpha):.1f} dB from the sorted image in viewers"

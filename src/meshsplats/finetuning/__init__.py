@@ -3,17 +3,9 @@
 Needs NumPy alone. ``meshsplats.finetuning.losses`` has the same losses as torch functions.
 """
 
-from meshsplats.finetuning.config import (
-    FEWEST_VIEWS,
-    PRESETS,
-    FinetuneConfig,
-    make_config,
-    worthwhile_views,
-)
-from meshsplats.finetuning.initial import starting_mesh
-from meshsplats.finetuning.interruption import Interrupted
-from meshsplats.finetuning.ordered import OrderedMesh, finetune_ordered
-from meshsplats.finetuning.run import Progress, RunOptions, finetune
+from typing import TYPE_CHECKING
+
+from meshsplats._lazy import lazy_names
 
 __all__ = [
     "FEWEST_VIEWS",
@@ -29,3 +21,27 @@ __all__ = [
     "starting_mesh",
     "worthwhile_views",
 ]
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning.config import (
+        FEWEST_VIEWS,
+        PRESETS,
+        FinetuneConfig,
+        make_config,
+        worthwhile_views,
+    )
+    from meshsplats.finetuning.initial import starting_mesh
+    from meshsplats.finetuning.interruption import Interrupted
+    from meshsplats.finetuning.ordered import OrderedMesh, finetune_ordered
+    from meshsplats.finetuning.run import Progress, RunOptions, finetune
+else:
+    _HOME = {
+        "meshsplats.finetuning.config": (
+            *("FEWEST_VIEWS", "PRESETS", "FinetuneConfig", "make_config", "worthwhile_views"),
+        ),
+        "meshsplats.finetuning.initial": ("starting_mesh",),
+        "meshsplats.finetuning.interruption": ("Interrupted",),
+        "meshsplats.finetuning.ordered": ("OrderedMesh", "finetune_ordered"),
+        "meshsplats.finetuning.run": ("Progress", "RunOptions", "finetune"),
+    }
+    __getattr__ = lazy_names(__name__, _HOME)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._core.kernels import AdamStep, adam_rows
+from meshsplats._core.library import check_threads
 
 
 class RowAdam:
@@ -67,8 +68,7 @@ class RowAdam:
         low, high = (-math.inf, math.inf) if bounds is None else bounds
         if not low <= high:
             raise ValueError(f"bounds must be (low, high) with low <= high, got {bounds}")
-        if threads is not None and threads < 1:
-            raise ValueError(f"threads must be at least 1, got {threads}")
+        check_threads(threads)
         self.lr = lr
         self.betas, self.eps, self.bounds, self.threads = (betas[0], betas[1]), eps, (low, high), threads
         self.scale = _checked_scale(scale, len(self._array))

@@ -31,7 +31,8 @@ from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.merging import simplify
 from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.datasets.windows import window_of
-from meshsplats.finetuning.checkpoint import OtherRunError, cloud_digest, dataset_fingerprint
+from meshsplats.errors import OtherRunError
+from meshsplats.finetuning.checkpoint import cloud_digest, dataset_fingerprint
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.dividing import Cells, divide, waves
 from meshsplats.finetuning.initial import starting_mesh

@@ -19,7 +19,7 @@ import numpy as np
 
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import FileFormatError, OtherRunError
 from meshsplats.finetuning.config import LENGTHS, FinetuneConfig, with_changes
 from meshsplats.finetuning.loss import DEFAULT
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors
@@ -73,7 +73,7 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no checkpoint at {path}: leave out --resume to begin anew")
+        raise FileNotFoundError(f"no checkpoint at {path}: leave out ``resume`` to begin anew")
     arrays, texts = load_safetensors(path, only_texts=only_header)
     try:
         header = json.loads(texts.get(_KEY, ""))
@@ -114,10 +114,6 @@ def as_begun(config: FinetuneConfig, earlier: Checkpoint | None) -> FinetuneConf
     """``config`` with the length that the run began with: one that is made longer keeps its views and its
     starting mesh."""
     return config if earlier is None else with_changes(config, **planned_length(earlier))
-
-
-class OtherRunError(ValueError):
-    """The checkpoint to resume from belongs to another run; the message names the differences."""
 
 
 def check_same_run(

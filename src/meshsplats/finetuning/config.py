@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 from meshsplats._options import Advanced, Range, With, check_names, check_options
-from meshsplats.datasets.splat_targets import ZOOMS
-from meshsplats.rendering.looks import Look
+from meshsplats.choices import Look
 
 Unit = Literal["splat", "scene"]
 BackgroundMode = Literal["mixed", "random", "white", "black"]
@@ -342,6 +341,8 @@ def worthwhile_zooms(config: FinetuneConfig, look: Look, filtered: bool = False)
     several for a mesh with a filter (``filtered``): without one, it can match a viewer's images of one size
     only.
     """
+    from meshsplats.datasets.splat_targets import ZOOMS
+
     if look == "splats":
         return ZOOMS["splats"] if filtered else (1,)
     return AREA_ZOOMS if config.preset == "default" and config.opacity == "blended" else (1,)

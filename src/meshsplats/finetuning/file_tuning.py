@@ -5,13 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
 
-from meshsplats._options import Advanced
 from meshsplats._words import plural
+from meshsplats.choices import Device
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.selection import choose_splats
@@ -28,32 +27,13 @@ from meshsplats.finetuning.plans import Plan, Trained, over_background
 from meshsplats.finetuning.run import RunOptions
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.setup import Display, Setup
+from meshsplats.finetuning.start_options import StartOptions
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.engine import Device
 
 Scene = GaussianCloud | SplatMesh
-
-
-@dataclass(frozen=True)
-class StartOptions:
-    """From which mesh a fine-tuning starts."""
-
-    preset: Literal["default", "paper"] = "default"
-    """default: best quality at equal time. paper: the text of the MeshSplats paper."""
-    start: Annotated[Literal["same", "default", "paper"], Advanced] = "same"
-    """Conversion of splats; same: that of ``preset``. default: an ellipse of 5 to 32 triangles a splat.
-    paper: the paper's conversion."""
-    conversion: ConversionOptions = field(default_factory=ConversionOptions)
-    cell_splats: int | None = None
-    """Tune splats in cells of at most N, in the memory of a cell, one after the other or by ``cluster``."""
-
-    @property
-    def of_start(self) -> Literal["default", "paper"]:
-        """The preset of the conversion."""
-        return self.preset if self.start == "same" else self.start
 
 
 @dataclass(frozen=True)
@@ -245,7 +225,7 @@ def _cell_scene(
 def _warn_of_the_rest(image: ViewImage) -> None:
     if image.alpha is None and image.mask is None:
         warnings.warn(
-            "--crop with photographs that have neither masks nor alpha: they still show what is cropped,"
+            "``crop`` with photographs that have neither masks nor alpha: they still show what is cropped,"
             " which will be baked into the rest; to get a part, crop the tuned mesh",
             DataWarning,
             stacklevel=2,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._core.kernels import compare_images
+from meshsplats._core.library import check_threads
 from meshsplats._kinds import described
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.finetuning.loss import Loss, Target, loss_name
@@ -129,8 +130,7 @@ def _weighted(
     threads: int | None,
 ) -> torch.Tensor:
     _check(image, target, mask)
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads must be at least 1, got {threads}")
+    check_threads(threads)
     pixels = image.shape[:-1].numel()
     if mask is not None:
         pixels = int(mask.sum())  # from the mask itself, which may be a view: the number of pixels is exact

@@ -90,7 +90,7 @@ def check_memory(mesh: SplatMesh, dataset: Dataset, *, cache_bytes: int = CACHE_
     """Returns ``estimate_memory``; raises MemoryError with advice if it exceeds ``available_memory``."""
     needed = estimate_memory(mesh, dataset, cache_bytes)
     what = f"fine-tuning {len(mesh.vertices):,} vertices on {len(dataset.views):,} images"
-    check_bytes(needed, what, "convert fewer splats (--max-splats)")
+    check_bytes(needed, what, "convert fewer splats (``max_splats``)")
     return needed
 
 
@@ -101,7 +101,7 @@ def check_bytes(needed: int, what: str, advice: str) -> None:
     if available is not None and needed > available:
         raise MemoryError(
             f"{what} needs about {readable(needed)}, {readable(available)} are free: {advice}, use smaller"
-            " images (--downscale, --width), or keep fewer of them in memory (--cache)"
+            " images (``downscale``, ``width``), or keep fewer of them in memory (``cache``)"
         )
 
 

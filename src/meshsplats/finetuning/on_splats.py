@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats.choices import Device
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
@@ -41,7 +42,6 @@ from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.engine import Device
 from meshsplats.rendering.ordering import VIEWS, default_views, drawing_order
 
 SETUP_SHARE = 0.2

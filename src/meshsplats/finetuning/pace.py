@@ -16,6 +16,7 @@ import numpy as np
 
 from meshsplats._files.atomic import write_text
 from meshsplats._json import read_json
+from meshsplats.choices import Device
 from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.datasets.splat_targets import ZOOMS
 from meshsplats.datasets.views import Dataset
@@ -26,7 +27,6 @@ from meshsplats.finetuning.phases.choice import first_phase
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.engine import Device
 from meshsplats.rendering.ordering import drawing_order
 
 FEWEST_STEPS = 150

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats.choices import Device
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import images_of_view
@@ -17,7 +18,6 @@ from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.step import samples_of
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.engine import Device
 
 SCORED_VIEWS = 8
 """Maximum number of held-out views that are scored during a run."""

@@ -15,11 +15,12 @@ from meshsplats._arrays import checked_array
 from meshsplats._kinds import need, need_path
 from meshsplats._options import Range, check_options
 from meshsplats._origin import need_one_origin
+from meshsplats.choices import Device
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
 from meshsplats.draw_order import DrawOrder
+from meshsplats.errors import OtherRunError
 from meshsplats.finetuning.checkpoint import (
     Checkpoint,
-    OtherRunError,
     check_same_run,
     dataset_fingerprint,
     mesh_fingerprint,
@@ -40,7 +41,6 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import for_views, make_step
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
-from meshsplats.rendering.engine import Device
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from meshsplats._files.locks import locked
-from meshsplats.finetuning.cells import RECORD
-from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint
-from meshsplats.finetuning.journal import CHECKPOINT
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -48,22 +49,28 @@ class RunFiles:
     def earlier(self) -> Checkpoint | None:
         """Of a run that is to be resumed, the checkpoint without its arrays; None for one in cells, which
         have their own."""
+        from meshsplats.finetuning.checkpoint import load_checkpoint
+        from meshsplats.finetuning.journal import CHECKPOINT
+
         return None if self.in_cells else load_checkpoint(self.folder / CHECKPOINT, only_header=True)
 
     def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
         """OSError if something would be overwritten, cannot be written, or is missing for --resume."""
+        from meshsplats.finetuning.cells import RECORD
+        from meshsplats.finetuning.journal import CHECKPOINT
+
         checkpoint = self.folder / (RECORD if self.in_cells else CHECKPOINT)
         if resume and not checkpoint.is_file():
-            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to start again")
+            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out ``resume`` to start again")
         for left in (self.folder / CHECKPOINT, self.folder / RECORD):
             if left.exists() and not (resume or force):
                 raise FileExistsError(
-                    f"{left} is left from an earlier run: --resume continues it, --force starts again"
+                    f"{left} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
                 )
         if resume and self.mesh.exists() and not force:
             raise FileExistsError(
                 f"{self.mesh} exists: the run has ended, or there was one before;"
-                " --resume --force continues it and overwrites the mesh"
+                " ``resume`` and ``force`` continue it and overwrite the mesh"
             )
         check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
 

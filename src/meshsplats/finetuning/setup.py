@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from meshsplats.finetuning.run import Progress
+if TYPE_CHECKING:
+    from meshsplats.finetuning.run import Progress
 
 
 class Display(Protocol):

@@ -11,6 +11,7 @@ import numpy as np
 from meshsplats._arrays import checked_array, nonzero_rows
 from meshsplats._core.kernels import round_fans
 from meshsplats.camera import Camera
+from meshsplats.choices import Device
 from meshsplats.colors import srgb_to_linear
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
@@ -23,7 +24,7 @@ from meshsplats.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.edges import faces_across
-from meshsplats.rendering.engine import Device, Need, Taped, WholeSteps
+from meshsplats.rendering.engine import Need, Taped, WholeSteps
 from meshsplats.webgpu.training import Moments, Parameters, Sums
 from meshsplats.webgpu.training import Rates as StepRates
 

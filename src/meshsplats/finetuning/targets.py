@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from meshsplats._kinds import need
 from meshsplats._options import Advanced, changed
 from meshsplats._words import parse_up
-from meshsplats.camera import Camera
-from meshsplats.cameras.files import cameras_beside, load_cameras
-from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks
+from meshsplats.choices import Look, Masks
 from meshsplats.datasets.scene_views import MissingOfData
-from meshsplats.datasets.splat_targets import splat_dataset
-from meshsplats.datasets.views import Dataset
 from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import FEWEST_VIEWS
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.looks import Look
+
+if TYPE_CHECKING:
+    from meshsplats.camera import Camera
+    from meshsplats.datasets.views import Dataset
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
 
 PLACING = ("placement", "distance", "up")
 """Options of cameras that are placed."""
@@ -123,6 +120,13 @@ class Targets:
 
         Raises ValueError if no view is left to train on, and what ``load_dataset`` or ``splat_dataset`` do.
         """
+        from meshsplats._kinds import need
+        from meshsplats.cameras.files import cameras_beside, load_cameras
+        from meshsplats.datasets.folder import load_dataset
+        from meshsplats.datasets.splat_targets import splat_dataset
+        from meshsplats.gaussians import GaussianCloud
+        from meshsplats.mesh import SplatMesh
+
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
@@ -135,9 +139,9 @@ class Targets:
                 origin=scene.origin,
             )
             if not dataset.train:
-                raise ValueError(
+                raise OptionValueError(
                     f"{self.data}: all its {len(dataset.test)} views are held out, so there is nothing to"
-                    " train on; --test-every 0 holds none out"
+                    " train on; ``test_every`` 0 holds none out"
                 )
             return dataset
         if isinstance(scene, SplatMesh):

@@ -10,8 +10,8 @@ import numpy as np
 
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.gaussians import SH_C0, GaussianCloud, constant_harmonics
+from meshsplats.spherical_harmonics import sh_basis, spiral
 
 _DIRECTIONS = 128
 _AT_ONCE = 1 << 14
@@ -37,11 +37,8 @@ def _mapped(cloud: GaussianCloud, curve: Callable[[np.ndarray], np.ndarray]) -> 
     sh = cloud.sh
     if cloud.sh_degree == 0:
         colors = np.maximum(np.float32(0.5) + np.float32(SH_C0) * sh, 0)
-        return replace(cloud, sh=(curve(colors) - np.float32(0.5)) / np.float32(SH_C0))
-    i = np.arange(_DIRECTIONS) + 0.5  # directions on a Fibonacci spiral
-    z, angle = 1 - 2 * i / _DIRECTIONS, i * np.pi * (1 + 5**0.5)
-    r = np.sqrt(1 - z * z)
-    basis = sh_basis(np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1), cloud.sh_degree)
+        return replace(cloud, sh=constant_harmonics(curve(colors)))
+    basis = sh_basis(spiral(_DIRECTIONS), cloud.sh_degree)
     fit = np.linalg.pinv(basis).astype(np.float32)
     basis = basis.astype(np.float32)
     fitted = np.empty_like(sh)

@@ -7,12 +7,12 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path, together
-from meshsplats._kinds import need, need_path
+from meshsplats._kinds import need, need_choice, need_path
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.content import Content
@@ -179,10 +179,8 @@ def check_writing(
         raise ValueError(f"{target.name!r} does not name a format; choose a name that ends in {known}")
     if unlit and suffix not in _SHADED:
         raise ValueError(f"unlit applies to {', '.join(_SHADED)} only, not to {suffix}")
-    if image is not None and image not in get_args(TextureImage):
-        raise ValueError(f"image must be one of {', '.join(get_args(TextureImage))}, got {image!r}")
-    if collision is not None and collision not in get_args(Collision):
-        raise ValueError(f"collision must be one of {', '.join(get_args(Collision))}, got {collision!r}")
+    need_choice(TextureImage, optional=True, image=image)
+    need_choice(Collision, optional=True, collision=collision)
     if collision is not None and suffix not in _SHADED:
         raise ValueError(f"collision applies to {', '.join(_SHADED)} only, not to {suffix}")
     if collision == "convex" and suffix != ".glb":

@@ -215,7 +215,8 @@ def save_mesh(
     if mesh.harmonics is not None and "harmonics" not in kind.keeps:
         warnings.warn(
             f"{target.name}: harmonics are left out, {suffix} has no place for them: colours will be the same"
-            " from everywhere. bake --colors (plain_colors_of) makes them the mean of what given views show",
+            " from everywhere. plain_colors_of(mesh, cameras), or meshsplats bake with ``colors``, makes them"
+            " the mean of what given views show",
             DataWarning,
             stacklevel=2,
         )

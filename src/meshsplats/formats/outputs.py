@@ -9,20 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-import numpy as np
-
 from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
-from meshsplats._origin import lost_detail, sampled
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, OverwritingError
 from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
 from meshsplats.formats.splat_formats import format_to_write, listed, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 
-Scene = TypeVar("Scene", GaussianCloud, SplatMesh, BaseMesh, GaussianCloud | SplatMesh)
+Scene = TypeVar("Scene", "GaussianCloud", "SplatMesh", "BaseMesh", "GaussianCloud | SplatMesh")
 WantedOrigin = Literal["keep", "local"] | Sequence[float]
 """Where outputs of scenes stand: see ``placed``."""
 
@@ -30,6 +24,10 @@ CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
 
 if TYPE_CHECKING:
+    from meshsplats.base_mesh import BaseMesh
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
+
     MeshEnding = str
     Ending = str
 else:
@@ -75,6 +73,11 @@ def splat_options(kinds: Sequence[str], **given: Any) -> list[dict[str, Any]]:
 def scaled(scene: Scene, factor: float | None) -> Scene:
     """``scene`` with all lengths, from the origin of the world on, times ``factor``; None: as it is.
     ValueError for a mesh that is bound to a base mesh, whose lengths are those of the base."""
+    import numpy as np
+
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
+
     if factor is None:
         return scene
     if isinstance(scene, GaussianCloud):
@@ -88,6 +91,11 @@ def placed(scene: Scene, origin: WantedOrigin) -> Scene:
     """``scene`` as it is to be written: with its origin ("keep"), without any ("local"), or relative to this
     point of the world. OptionsError for a point that is too far away for float32, OptionValueError for any
     other word."""
+    import numpy as np
+
+    from meshsplats._origin import lost_detail, sampled
+    from meshsplats.gaussians import GaussianCloud
+
     check_origin(origin)
     if isinstance(origin, str):
         return scene if origin == "keep" else replace(scene, origin=np.zeros(3))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, BinaryIO, Literal, get_args
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
+from meshsplats._kinds import need_choice
 from meshsplats.formats._display import display_cloud
 from meshsplats.formats.content import Content
 from meshsplats.formats.opened import Splats
@@ -40,10 +41,8 @@ class Reading:
         in_blocks: bool,
     ) -> Reading:
         """Raises ValueError for values that do not exist."""
-        if axes not in get_args(Axes):
-            raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
-        if kernel is not None and kernel not in get_args(Kernel):
-            raise ValueError(f"kernel must be one of {', '.join(get_args(Kernel))}, got {kernel!r}")
+        need_choice(Axes, axes=axes)
+        need_choice(Kernel, optional=True, kernel=kernel)
         if time is not None and not np.isfinite(time):
             raise ValueError(f"time must be a finite number, got {time!r}")
         own = None if time is None else float(time)

@@ -71,8 +71,8 @@ def splat_file(path: Path) -> Path:
     photographs = [name for name in _OF_PHOTOGRAPHS if (path / name).exists()]
     if photographs:
         raise FileFormatError(
-            f"{path}: photographs, not splats ({photographs[0]} is there); commands take them with --data,"
-            " load_dataset reads them"
+            f"{path}: photographs, not splats ({photographs[0]} is there); commands take them with"
+            " ``data``, load_dataset reads them"
         )
     if images := files_named(path, IMAGE_SUFFIXES):
         raise FileFormatError(

@@ -17,17 +17,17 @@ Layouts, from the programs' sources:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
-from meshsplats._kinds import described, need
+from meshsplats._kinds import described, need, need_choice
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.formats import _activation
 from meshsplats.formats._validation import local_positions
 from meshsplats.formats.splats._cloud_builder import CloudBuilder
-from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
+from meshsplats.gaussians import GaussianCloud, Kernel, constant_harmonics
 
 if TYPE_CHECKING:
     import torch as torch_library
@@ -119,7 +119,7 @@ def gaussians_from_tensors(
     if take(names.rest) is not None:
         rest = part(names.rest, "(n, k, 3) with k = 0, 3, 8 or 15", *((k, 3) for k in (0, 3, 8, 15)))
     if layout == "nerfstudio" and not rest.shape[1]:
-        first = (_activation.activated_opacities(first) - np.float32(0.5)) / np.float32(SH_C0)
+        first = constant_harmonics(_activation.activated_opacities(first))
     stored = _Stored(means, quaternions, logs, logits, first, rest)
     return _activated(stored, kernel, f"the tensors of {layout}", at, strict=strict)
 
@@ -175,8 +175,7 @@ def gaussians_to_tensors(
         MissingDependencyError: torch is not installed.
     """
     need(GaussianCloud, cloud=cloud)
-    if layout not in get_args(Layout):
-        raise ValueError(f"layout must be one of {', '.join(get_args(Layout))}, got {layout!r}")
+    need_choice(Layout, layout=layout)
     names = _LAYOUTS[layout]
     axes = 2 if layout == "inria" and cloud.kernel == "2dgs" and not cloud.scales[:, 2].any() else 3
     opacities = _activation.logits(cloud.opacities)

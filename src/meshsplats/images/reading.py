@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE
+from meshsplats.choices import MAX_SIDE
 from meshsplats.errors import FileFormatError, MissingDependencyError
 
 MAX_PIXELS = 1 << 26

@@ -3,12 +3,9 @@
 Needs NumPy alone.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.prior.bind import bind
-from meshsplats.prior.model import LIFT, MeshPrior, load_prior
-from meshsplats.prior.training import prior_config, train_prior
+from meshsplats._lazy import lazy_names
 
 __all__ = [
     "LIFT",
@@ -20,3 +17,19 @@ __all__ = [
     "prior_config",
     "train_prior",
 ]
+
+if TYPE_CHECKING:
+    from meshsplats.base_mesh import BaseMesh, Texture
+    from meshsplats.prior.laying import bind
+    from meshsplats.prior.model import LIFT, MeshPrior, load_prior
+    from meshsplats.prior.options import prior_config
+    from meshsplats.prior.training import train_prior
+else:
+    _HOME = {
+        "meshsplats.base_mesh": ("BaseMesh", "Texture"),
+        "meshsplats.prior.laying": ("bind",),
+        "meshsplats.prior.model": ("LIFT", "MeshPrior", "load_prior"),
+        "meshsplats.prior.options": ("prior_config",),
+        "meshsplats.prior.training": ("train_prior",),
+    }
+    __getattr__ = lazy_names(__name__, _HOME)

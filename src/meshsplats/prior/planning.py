@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from meshsplats._options import check_options
+from meshsplats._kinds import as_path
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.scene_files import SceneReading
@@ -25,41 +27,10 @@ from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.bind import LAYERS, Source, bind
+from meshsplats.prior.laying import bind
 from meshsplats.prior.model import load_prior
+from meshsplats.prior.options import LayingOptions
 from meshsplats.prior.training import train_prior
-
-
-@dataclass(frozen=True)
-class LayingOptions:
-    """Splats on the base."""
-
-    triangles: int = 1
-    """Triangles on each face, in each layer: 1 to 256; square numbers avoid T-junctions."""
-    by_area: bool = False
-    """Take ``triangles`` as the mean, with more on larger faces."""
-    layers: int = LAYERS
-    """Layers of triangles on each face: 1 to 16."""
-    spacing: float | None = None
-    """Distance between layers along the base's normals, scene units; below 0 inwards; 0: all layers lie in
-    the base. Default: inwards, all layers together 1/30 of the diagonal of the base's box."""
-    colors: Source = "auto"
-    """Initial colours: the base's texture, its vertex colours, or the images that see a point most squarely;
-    auto: the first of these that exists."""
-    texture: Path | None = None
-    """Image for the base's texture coordinates, if its file names none."""
-
-    def check(self) -> None:
-        """OptionsError for options without effect, ValueError for values out of range."""
-        check_options(self)
-        if self.texture is not None and self.colors not in ("auto", "texture"):
-            raise OptionsError(f"``texture`` has no effect with ``colors`` {self.colors}")
-        if self.spacing and self.layers == 1:
-            raise OptionsError("``spacing`` has no effect with one layer; give ``layers``")
-
-    def load_base(self, path: Path) -> BaseMesh:
-        """The base mesh at ``path``, with its textures where colours come from them."""
-        return load_base(path, texture=self.texture, textures=self.colors in ("auto", "texture"))
 
 
 @dataclass(frozen=True)
@@ -144,44 +115,45 @@ def pose_files(output: Path, count: int) -> list[Path]:
     return [output.with_name(f"{output.stem}_{i:0{width}d}{output.suffix}") for i in range(1, count + 1)]
 
 
-def posed_files(
-    source: Path,
-    bases: Sequence[Path],
-    output: Path,
+def save_poses(
+    source: str | os.PathLike[str],
+    bases: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
     *,
     lift: float | None = None,
     place: Callable[[SplatMesh], SplatMesh] = lambda mesh: mesh,
     force: bool = False,
-) -> Iterator[tuple[Path, SplatMesh]]:
+    progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda poses, count: poses,
+) -> list[Path]:
     """Writes the splats of the prior in the file ``source`` on each of the edited ``bases``, to
-    ``pose_files(output, len(bases))``.
+    ``pose_files(output, len(bases))``, which are returned.
 
     Args:
         lift: distance between layers, scene units. By default that of the prior; for coplanar layers 0 in
             .npz, and ``MeshPrior.export_lift`` in other formats.
         place: makes of a mesh the one that is written.
         force: replace files that are there.
-
-    Yields:
-        Each file, when it is written, with its mesh.
+        progress: shows the progress of poses, of which there are so many, and passes them on.
 
     Raises, before anything is written, what ``check_outputs`` raises, and ValueError for a base with another
     number of vertices or other triangles.
     """
+    source, output = as_path("source", source), as_path("output", output)
+    edited = [as_path(f"bases[{i}]", base) for i, base in enumerate(bases)]
     check_mesh_suffix(output)
-    targets = pose_files(output, len(bases))
-    check_outputs(targets, force, inputs=[source, *bases])
+    targets = pose_files(output, len(edited))
+    check_outputs(targets, force, inputs=[source, *edited])
     prior = load_prior(source)
-    loaded = [load_base(path, textures=False, origin=prior.mesh.origin) for path in bases]
-    for path, base in zip(bases, loaded, strict=True):
+    loaded = [load_base(path, textures=False, origin=prior.mesh.origin) for path in edited]
+    for path, base in zip(edited, loaded, strict=True):
         try:
             prior.check_topology(base)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
     if lift is None and output.suffix.lower() != ".npz" and not prior.lift:
         lift = prior.export_lift
-    for base, target in zip(loaded, targets, strict=True):
+    for base, target in progress(zip(loaded, targets, strict=True), len(targets)):
         mesh = place(prior.pose(base.vertices, lift=lift))
         # Formats without a place for the binding would warn of it.
         save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)
-        yield target, mesh
+    return targets

@@ -37,11 +37,9 @@ class DepthViews:
         """(k,) bool: which of ``points`` (k, 3) any camera sees in front of the base or beside it."""
         result = np.zeros(len(points), bool)
         for camera, nearest in zip(self.cameras, self.nearest, strict=True):
-            positions, z = camera.project(points)
-            rows = np.flatnonzero(camera.in_image(positions))
-            column, row = positions[rows].T.astype(np.intp)
+            shown, column, row, z = camera.pixels_of(points)
             slack = 1 + _TOLERANCE / min(camera.fx, camera.fy)
-            result[rows] |= z[rows] * slack < nearest[row, column]
+            result[shown] |= z * slack < nearest[row, column]
         return result
 
 

@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from meshsplats._kinds import need
-from meshsplats.datasets.views import Dataset
-from meshsplats.prior.model import MeshPrior
+from meshsplats.prior.options import prior_config
 
 if TYPE_CHECKING:
+    from meshsplats.datasets.views import Dataset
     from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
-
-
-CHOICES = {
-    "color_rate": 0.05,
-    "position_rate": 0.05,
-    "rate_steps": 0,
-    "ssim_weight": 0.0,
-    "l2_weight": 5.0,
-}
-"""Differences from the preset 'default' of fine-tuning."""
-
-
-def prior_config(**changes: Any) -> FinetuneConfig:
-    """The default configuration of ``train_prior``, with ``changes`` as in ``make_config``."""
-    from meshsplats.finetuning import make_config
-
-    return make_config("default", **{**CHOICES, **changes})
+    from meshsplats.prior.model import MeshPrior
 
 
 def train_prior(
@@ -58,6 +42,9 @@ def train_prior(
     Raises:
         The errors of ``finetune``.
     """
+    from meshsplats.datasets.views import Dataset
+    from meshsplats.prior.model import MeshPrior
+
     need(MeshPrior, prior=prior)
     need(Dataset, dataset=dataset)
     from meshsplats.finetuning import finetune

@@ -10,12 +10,13 @@ import numpy as np
 from meshsplats._core import library, structures
 from meshsplats._kinds import need
 from meshsplats.camera import Camera
+from meshsplats.choices import Device
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
 from meshsplats.order import Order, checked_order
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
 from meshsplats.rendering.devices import engine
-from meshsplats.rendering.engine import Device, ImageOptions, check_device
+from meshsplats.rendering.engine import ImageOptions, check_device
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,12 @@ import numpy as np
 
 from meshsplats._kinds import need_all
 from meshsplats.camera import Camera
+from meshsplats.choices import Device
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.mesh import MIN_TRANSMITTANCE
 from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, TapeOptions
 from meshsplats.rendering.devices import engine
-from meshsplats.rendering.engine import Device
 
 if TYPE_CHECKING:
     import torch

@@ -8,7 +8,9 @@ from ctypes import c_double
 import numpy as np
 
 from meshsplats._core import library, structures
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats._core.library import check_threads
+from meshsplats.camera import Camera
+from meshsplats.choices import MAX_SIDE
 from meshsplats.mesh import Triangles, checked_filter
 from meshsplats.order import checked_order
 
@@ -70,8 +72,7 @@ def checked_options(
     """The options of an image. ValueError for values out of range, or a background of another shape."""
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
-    if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
-        raise ValueError(f"threads must be at least 1, got {threads!r}")
+    check_threads(threads)
     backdrop = np.ascontiguousarray(background, np.float32)
     if backdrop.shape not in ((3,), (camera.height, camera.width, 3)):
         raise ValueError(

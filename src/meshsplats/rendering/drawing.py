@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from meshsplats._words import optional_color
-from meshsplats.camera import Camera
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.order import Order
-from meshsplats.rendering.devices import engine
-from meshsplats.rendering.layers import MANY_LAYERS, estimated_seconds, layers
+
+if TYPE_CHECKING:
+    from meshsplats.camera import Camera
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
 
 LONG_SECONDS = 10
 """Images that take longer than this, as far as can be estimated, are announced."""
@@ -48,6 +48,8 @@ class DrawingOptions:
 
     def check_device(self) -> None:
         """Raises MissingDependencyError or DeviceError if there is no such device."""
+        from meshsplats.rendering.devices import engine
+
         engine(self.device).check()
 
 
@@ -59,6 +61,8 @@ def announce_cost(
     say: Callable[[str], object],
 ) -> None:
     """Says before the work how long images may take, where layers upon layers make it long."""
+    from meshsplats.rendering.layers import MANY_LAYERS, estimated_seconds, layers
+
     count = layers(scene, cameras[0])
     if (
         count > MANY_LAYERS

@@ -13,13 +13,11 @@ from typing import Literal, NamedTuple, Protocol, get_args
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.choices import Device
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, Triangles
 from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.webgpu.training import Parameters, Rates, Sums
-
-Device = Literal["cpu", "gpu"]
-"""Where meshes are rendered: by the compiled core, or on a GPU by WebGPU."""
 
 Need = Literal[
     "cutoff",

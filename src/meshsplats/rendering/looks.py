@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
 from meshsplats._kinds import need
 from meshsplats.camera import Camera
+from meshsplats.choices import Device, Look
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.draw_order import DrawOrder
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import Rendering, render, render_splats
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
-from meshsplats.rendering.engine import Device
 from meshsplats.rendering.samples import needed_samples
-
-Look = Literal["area", "splats"]
-"""area: each pixel is the mean over its area, as in photographs, Blender, engines with MSAA and ray tracers.
-splats: as a 3DGS viewer draws them, with its filter of 0.3 px^2 at the size of the image: wider in small
-images, narrower in large ones."""
 
 GROUND_TRUTHS: dict[Look, str] = {
     "area": "splats as means over each pixel's area",

@@ -10,6 +10,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._core import kernels
+from meshsplats._core.library import check_threads
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import dome, orbit
@@ -137,8 +138,7 @@ def drawing_order(
     if not len(mesh.faces):
         raise ValueError("a mesh without triangles has no order")
     check_nodes(nodes)
-    if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
-        raise ValueError(f"threads must be at least 1, got {threads!r}")
+    check_threads(threads)
     if cameras is not None and not len(cameras):
         raise ValueError("cameras must hold a camera, or be None for views from all around")
     views = default_views(mesh) if cameras is None else subsample(cameras, VIEWS)

@@ -8,10 +8,8 @@ from typing import Annotated, Literal
 
 from meshsplats._options import Range, check_options
 from meshsplats._words import parse_up
-from meshsplats.conversion.budget import triangles_each
+from meshsplats.choices import Look
 from meshsplats.conversion.options import ConversionOptions, Preset
-from meshsplats.conversion.streaming import refuse_whole
-from meshsplats.rendering.looks import Look
 
 TilesAlpha = Literal["auto", "blend", "mask", "opaque"]
 
@@ -52,6 +50,8 @@ class TileOptions:
 
     def resolved(self) -> ConversionOptions:
         """The checked options of the conversion. Raises ValueError."""
+        from meshsplats.conversion.streaming import refuse_whole
+
         check_options(self)
         conversion = self.conversion or ConversionOptions()
         if self.as_splats:
@@ -71,6 +71,8 @@ class TileOptions:
 
     def triangles_each(self, conversion: ConversionOptions) -> int:
         """Triangles of a splat with the resolved options of the ``conversion``."""
+        from meshsplats.conversion.budget import triangles_each
+
         return 2 if self.as_splats else triangles_each(conversion)
 
     def _check_splats(self, conversion: ConversionOptions) -> None:

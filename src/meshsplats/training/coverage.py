@@ -79,10 +79,8 @@ def counts_of_fans(mesh: SplatMesh, views: Sequence[View], threads: int | None =
     for index in spread_indices(len(views), COUNTED):
         camera = views[index].camera.within(COUNT_SIDE)
         depths = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=0.5)
-        positions, depth = camera.project(centers)
-        rows = np.flatnonzero(camera.in_image(positions))
-        x, y = positions[rows].astype(int).T
-        counts[rows] += depth[rows] <= (1 + HIDDEN) * depths[y, x]
+        shown, x, y, depth = camera.pixels_of(centers)
+        counts[shown] += depth <= (1 + HIDDEN) * depths[y, x]
     return counts
 
 

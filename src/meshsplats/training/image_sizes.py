@@ -5,8 +5,8 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.folder import MOST_DOWNSCALE, load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
 from meshsplats.errors import DataWarning
 
 PIXELS_PER_MINUTE = 40_000

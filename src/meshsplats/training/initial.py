@@ -222,10 +222,8 @@ def shell_patches(
         places = middle + radius * directions
         needed = np.zeros(total, bool)
         for camera, covered in looks:
-            positions, _depth = camera.project(places)
-            rows = np.flatnonzero(camera.in_image(positions))
-            u, v = positions[rows].astype(int).T
-            needed[rows] |= covered[v, u] < COVERED
+            shown, u, v, _ = camera.pixels_of(places)
+            needed[shown] |= covered[v, u] < COVERED
         found = int(needed.sum())
         if not found:
             return None

@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Masks, Missing
-from meshsplats.datasets.points import load_points
-from meshsplats.datasets.views import Dataset
-from meshsplats.errors import OptionsError
-from meshsplats.evaluation.backgrounds import BLACK, Background
+from meshsplats.choices import Masks, Missing
+from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import BACKGROUNDS
-from meshsplats.finetuning.plans import Plan, Trained
-from meshsplats.finetuning.run import RunOptions
-from meshsplats.finetuning.setup import Display
 from meshsplats.finetuning.targets import check_cache
-from meshsplats.training.as_splats import FITTED_SHARE
 from meshsplats.training.config import TrainConfig
-from meshsplats.training.reconstruction import ensure_cameras
-from meshsplats.training.run import check_training_memory, train
-from meshsplats.training.video import photographs_of
+
+if TYPE_CHECKING:
+    from meshsplats.datasets.views import Dataset
+    from meshsplats.evaluation.backgrounds import Background
+    from meshsplats.finetuning.plans import Plan, Trained
+    from meshsplats.finetuning.run import RunOptions
+    from meshsplats.finetuning.setup import Display
 
 Say = Callable[[str], None]
 
@@ -56,6 +53,9 @@ class PhotographOptions:
     def with_cameras(self, source: Path, say: Say) -> Path:
         """The folder of the photographs at ``source``, a folder or a video, with cameras, which are found
         where there are none. ``say`` gets lines about it. OptionsError if they are not to be found."""
+        from meshsplats.training.reconstruction import ensure_cameras
+        from meshsplats.training.video import photographs_of
+
         folder = photographs_of(source, self.frames, say)
         there = ensure_cameras(folder, replacing=self.estimate_cameras, say=say)
         if there is not None and self.estimate_cameras:
@@ -65,6 +65,9 @@ class PhotographOptions:
     def load(self, folder: Path, config: TrainConfig) -> tuple[Dataset, Background]:
         """The photographs in ``folder``, over the background of the training, and that background. ValueError
         if there are fewer than two to train on."""
+        from meshsplats.datasets.folder import load_dataset
+        from meshsplats.evaluation.backgrounds import BLACK, Background
+
         dataset = load_dataset(
             folder,
             downscale=1 if self.downscale is None else self.downscale,
@@ -74,9 +77,9 @@ class PhotographOptions:
             masks=self.masks,
         )
         if len(dataset.train) < 2:
-            raise ValueError(
+            raise OptionValueError(
                 f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
-                " are needed to train on (--test-every 0 holds none out)"
+                " are needed to train on (``test_every`` 0 holds none out)"
             )
         if config.background in BACKGROUNDS:
             found = Background(BACKGROUNDS[config.background], "given")
@@ -89,10 +92,17 @@ class PhotographOptions:
     def plan(self, folder: Path, config: TrainConfig, *, as_splats: bool = False, say: Say) -> Plan:
         """A training on the photographs in ``folder``, of which splats are made afterwards, too, if
         ``as_splats``. ``say`` gets lines about it. Raises what ``load`` and ``check_training_memory`` do."""
+        from meshsplats.datasets.points import load_points
+        from meshsplats.finetuning.plans import Plan, Trained
+        from meshsplats.training.as_splats import FITTED_SHARE
+        from meshsplats.training.run import check_training_memory, train
+
         dataset, background = self.load(folder, config)
         mask = dataset.train[0].mask
         if mask is not None and mask.mean() < 0.5:
-            say("masks leave most pixels out, which may become anything: --masks subject cuts out an object")
+            say(
+                "masks leave most pixels out, which may become anything: ``masks`` subject cuts out an object"
+            )
         points = load_points(folder, origin=dataset.origin)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 

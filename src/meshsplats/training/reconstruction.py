@@ -64,7 +64,7 @@ def ensure_cameras(
         layout = find_layout(folder)
         return None if layout is None or layout.source == folder / CAMERAS else layout.source
     if not replacing and (there := unread_cameras(folder)):
-        raise FileFormatError(f"{folder}: {there}; --estimate-cameras finds cameras in their place")
+        raise FileFormatError(f"{folder}: {there}; ``estimate_cameras`` finds cameras in their place")
     find_cameras(folder, say)
     return None
 

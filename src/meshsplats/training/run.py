@@ -106,7 +106,7 @@ def train(
         if config.exposure:
             warnings.warn(
                 "the photographs differ in exposure or white balance: a gain and an offset of each are fitted"
-                " (--exposure False: not)",
+                " (``exposure`` False: not)",
                 DataWarning,
                 stacklevel=2,
             )
@@ -155,7 +155,7 @@ def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes:
     needed += min(sum(view.source.nbytes for view in reduced), cache_bytes // REDUCED_PART)
     needed += max(matching_bytes(views), carving_bytes(views, config.first_splats(masked=True)))
     what = f"training {config.max_splats:,} fans on {len(dataset.views):,} images"
-    check_bytes(needed, what, "allow fewer fans (--max-splats)")
+    check_bytes(needed, what, "allow fewer fans (``max_splats``)")
     return needed
 
 
@@ -188,7 +188,7 @@ def starting_fans(
 def _stored_start(journal: Journal) -> SplatMesh:
     path = journal.folder / START
     if not path.is_file():
-        raise FileNotFoundError(f"no {path}: leave out --resume to begin anew")
+        raise FileNotFoundError(f"no {path}: leave out ``resume`` to begin anew")
     mesh = load_mesh(path)
     if mesh.face_splat is None or not len(mesh.faces):
         raise FileFormatError(f"{path}: not the fans that a training started from")

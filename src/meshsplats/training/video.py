@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats._foreign import VIDEO_SUFFIXES
-from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image
 
@@ -71,7 +71,9 @@ def photographs_of(
         return folder
     there = len(list((folder / IMAGES).glob("*.jpg")))
     if frames not in (None, there):
-        raise ValueError(f"{folder} has {there} frames, not {frames}: remove it, or keep them (no --frames)")
+        raise OptionValueError(
+            f"{folder} has {there} frames, not {frames}: remove it, or keep them: leave out ``frames``"
+        )
     say(f"the {there} frames of {path.name} that are in {folder}")
     return folder
 

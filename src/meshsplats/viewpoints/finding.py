@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from meshsplats._kinds import need
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.placing import (
     OBJECT_ELEVATIONS,
@@ -19,6 +19,7 @@ from meshsplats.cameras.placing import (
     has_surroundings,
     outside_cameras,
 )
+from meshsplats.choices import MAX_SIDE
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import FRAGMENTS, preview_camera

@@ -10,7 +10,8 @@ import numpy as np
 from meshsplats.blender.inside import objects
 from meshsplats.blender.inside.host import bpy
 from meshsplats.conversion import surroundings
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, find
+from meshsplats.conversion.cleaning import find
+from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.mesh import SplatMesh
 
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.camera import OPENGL, Camera
+from meshsplats.choices import MAX_SIDE
 from meshsplats.formats._orientation import HALF_TURN_Z
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.scene import placed_nodes
@@ -15,7 +16,6 @@ from meshsplats.formats.gltf.splats import has_own_frame, names_splats, splat_do
 
 _SIDE = 800
 """Height of the images, pixels; the file names only their shape."""
-_OPENGL = np.array([1.0, -1.0, -1.0])
 
 
 def cameras_in_gltf(path: Path) -> list[Camera]:
@@ -53,7 +53,7 @@ def _camera(document: GltfDocument, lens: dict[str, Any], matrix: np.ndarray, na
     axes = left @ right
     if size.min() <= 0 or np.linalg.det(axes) < 0:
         raise document.error("the node of a camera mirrors it, or has no size")
-    rotation = (HALF_TURN_Z @ axes * _OPENGL).T
+    rotation = (HALF_TURN_Z @ axes * OPENGL).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ HALF_TURN_Z @ matrix[:3, 3]
     width = min(round(_SIDE * shape), MAX_SIDE)

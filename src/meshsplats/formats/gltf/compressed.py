@@ -6,10 +6,11 @@ other arrays come back to the bit.
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from meshsplats._kinds import need_choice
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk
 from meshsplats.formats.gltf.document import MESHOPT
 from meshsplats.formats.gltf.meshopt import encoded_attributes, encoded_triangles
@@ -24,9 +25,7 @@ _MOST_BYTES = 256
 
 def check_compression(compression: str, color_type: str, *, is_ordered: bool) -> None:
     """ValueError for an unknown ``compression``, and for what it does not go with."""
-    if compression not in get_args(Compression):
-        known = ", ".join(get_args(Compression))
-        raise ValueError(f"compression must be one of {known}, got {compression!r}")
+    need_choice(Compression, compression=compression)
     if color_type != "uint16":
         raise ValueError(f"compressed colours are of type 'uint16', got {color_type!r}; leave one out")
     if is_ordered:

@@ -81,10 +81,13 @@ class GltfDocument:
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """The top-level array ``kind`` ("meshes", "nodes" ...), empty where it is absent."""
-        found = self.json.get(kind, [])
-        if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
-            raise self.error(f"{kind} must be an array of objects")
-        return found
+        return self.objects(self.json.get(kind, []), kind)
+
+    def objects(self, value: object, what: str) -> list[dict[str, Any]]:
+        """``value``, an array of objects. FileFormatError for anything else; ``what`` names it."""
+        if not isinstance(value, list) or not all(isinstance(x, dict) for x in value):
+            raise self.error(f"{what} must be an array of objects")
+        return value
 
     def item(self, kind: str, index: object, what: str) -> dict[str, Any]:
         """Entry ``index`` of the top-level array ``kind``; ``what`` names the object that refers to it."""

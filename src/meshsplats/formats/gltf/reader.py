@@ -106,7 +106,7 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
         note["up"] = [0.0, 1.0, 0.0]
     motion = placed[0].matrix[:3, :3] if placed else np.eye(3)
     for place in placed:
-        for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
+        for primitive in document.objects(place.mesh.get("primitives"), "primitives of a mesh"):
             mode = primitive.get("mode", _TRIANGLES)
             if mode in POINTS_TO_LINES:
                 skipped += 1
@@ -275,9 +275,3 @@ def pbr_of(material: dict[str, Any]) -> dict[str, Any]:
 def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
     if is_splats(primitive):
         raise document.error("holds Gaussian splats, not a mesh; read it with load_gaussians")
-
-
-def objects_in(document: GltfDocument, value: object, what: str) -> list[dict[str, Any]]:
-    if not isinstance(value, list) or not all(isinstance(x, dict) for x in value):
-        raise document.error(f"{what} must be an array of objects")
-    return value

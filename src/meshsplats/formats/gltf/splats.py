@@ -23,7 +23,6 @@ from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z, up_quaternion
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
-from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
@@ -159,7 +158,7 @@ def _has_splats(content: Content) -> bool:
 
 
 def _splat_primitives(document: GltfDocument, mesh: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    for primitive in objects_in(document, mesh.get("primitives"), "primitives of a mesh"):
+    for primitive in document.objects(mesh.get("primitives"), "primitives of a mesh"):
         if _EXTENSIONS & _object(document, primitive, "extensions").keys():
             yield primitive
 

@@ -16,7 +16,6 @@ from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.reader import (
     POINTS_TO_LINES,
     material_of,
-    objects_in,
     pbr_of,
     primitive_faces,
 )
@@ -39,7 +38,7 @@ def gltf_textures(
     found = _Textures(document, read)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     for place in shown_meshes(document):
-        for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
+        for primitive in document.objects(place.mesh.get("primitives"), "primitives of a mesh"):
             if primitive.get("mode", 4) in POINTS_TO_LINES:
                 continue
             attributes = dict_or_empty(primitive.get("attributes"))

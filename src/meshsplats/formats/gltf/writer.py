@@ -15,11 +15,12 @@ import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from meshsplats._geometry import vertex_normals
+from meshsplats._kinds import need_choice
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.draw_order import DrawOrder
@@ -85,12 +86,9 @@ def write_glb(
             length, ``order`` is that of another mesh or goes with another mode, or the file needs more than
             the 4 GiB that the format can hold.
     """
-    if alpha not in get_args(Alpha):
-        raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
-    if color_type not in get_args(ColorType):
-        raise ValueError(f"color_type must be one of {', '.join(get_args(ColorType))}, got {color_type!r}")
-    if harmonics not in get_args(Harmonics):
-        raise ValueError(f"harmonics must be one of {', '.join(get_args(Harmonics))}, got {harmonics!r}")
+    need_choice(Alpha, alpha=alpha)
+    need_choice(ColorType, color_type=color_type)
+    need_choice(Harmonics, harmonics=harmonics)
     if not len(mesh.faces):
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
     check_attribute_names(mesh)

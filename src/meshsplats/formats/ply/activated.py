@@ -77,7 +77,7 @@ def warn_of(found: dict[Activated, int], where: object) -> None:
     names = list(found)
     warnings.warn(
         f"{where}: its values look as if they were stored after activation ({said}); if so,"
-        f" --set activated={','.join(names)} (activated={names}) reads it right",
+        f" ``activated``={','.join(names)} reads it right",
         DataWarning,
         stacklevel=5,
     )

@@ -21,7 +21,7 @@ from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_in, u
 from meshsplats.formats.ply.table import RowReader
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
-from meshsplats.gaussians import SH_C0
+from meshsplats.gaussians import constant_harmonics
 
 _SHARED = 256
 """Splats that share a chunk's ranges."""
@@ -128,7 +128,7 @@ def _fill(
         rows.means[:] = between(*corners, _unpacked(packed["packed_position"], (11, 10, 11)))
         rows.scales[:] = np.exp(lerp("scale_", "xyz", _unpacked(packed["packed_scale"], (11, 10, 11))))
         rgb = lerp("", "rgb", color[:, :3]) if colored else color[:, :3]
-        rows.sh[:, 0] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
+        rows.sh[:, 0] = constant_harmonics(rgb)
     rows.opacities[:] = color[:, 3]
     turns = packed["packed_rotation"]
     small = (_unpacked(turns << np.uint32(2), (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))

@@ -181,7 +181,7 @@ def _instant(table: FloatTable, motion: Motion, time: float | None, where: objec
     middle = float(times[(len(times) - 1) // 2])
     warnings.warn(
         f"{where}: splats that move in time ({motion.name}, times {times[0]:.4g} to {times[-1]:.4g}), shown"
-        f" at {middle:.4g}; --time T (time=T) chooses another instant",
+        f" at {middle:.4g}; ``time`` chooses another instant",
         DataWarning,
         stacklevel=5,
     )

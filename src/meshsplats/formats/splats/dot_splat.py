@@ -22,7 +22,7 @@ from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.formats.splats._quantising import as_bytes
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.gaussians import SH_C0, GaussianCloud, constant_harmonics
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _AT_ONCE = 1 << 16
@@ -84,7 +84,7 @@ def _fill(records: np.ndarray, origin: np.ndarray, rows: SplatRows) -> None:
     rows.scales[:] = np.where(records["scale"] < 0, np.nan, records["scale"])  # no deviation is negative
     rows.quaternions[:] = _rotations(records)
     rows.opacities[:] = color[:, 3]
-    rows.sh[:, 0] = (color[:, :3] - np.float32(0.5)) / np.float32(SH_C0)
+    rows.sh[:, 0] = constant_harmonics(color[:, :3])
 
 
 def _rotations(records: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
-from meshsplats.gaussians import SH_C0
+from meshsplats.gaussians import constant_harmonics
 
 _HEADER, _SECTION = 4096, 1024
 _AT_ONCE = 1 << 16
@@ -229,7 +229,7 @@ def _fill(records: np.ndarray, places: np.ndarray, degree: int, header: _Header,
     rows.quaternions[:] = records["rotation"]
     color = records["color"] / np.float32(255)
     rows.opacities[:] = color[:, 3]
-    rows.sh[:, 0] = (color[:, :3] - np.float32(0.5)) / np.float32(SH_C0)
+    rows.sh[:, 0] = constant_harmonics(color[:, :3])
     rows.sh[:, 1:] = 0
     stored = records["sh"].astype(np.float32)
     if records["sh"].dtype.kind == "u":

@@ -22,7 +22,7 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
-from meshsplats.gaussians import SH_C0
+from meshsplats.gaussians import constant_harmonics
 
 _MAX_META_BYTES = 4 << 20
 _MAX_LEVELS = 64
@@ -199,7 +199,7 @@ def _fill(
     rows.quaternions[:] = xyzw[:, [3, 0, 1, 2]]
     color = records["color"] / np.float32(255)
     rows.opacities[:] = color[:, 3]
-    rows.sh[:, 0] = (color[:, :3] - np.float32(0.5)) / np.float32(SH_C0)
+    rows.sh[:, 0] = constant_harmonics(color[:, :3])
     if harmonics is not None and scene.harmonics is not None:
         steps = [
             (harmonics >> np.uint32(shift) & np.uint32(most)) / np.float32(most)

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._kinds import need, need_all
+from meshsplats._kinds import need, need_all, need_choice
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
 from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.model import MeshPrior
+from meshsplats.prior.options import LAYERS, Source
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 from meshsplats.prior.shells import DepthViews, render_depth_views
 from meshsplats.surfaces.color_projection import colors_from_views
 
-Source = Literal["auto", "texture", "vertices", "views", "grey"]
 MAX_LAYERS = 16
 MAX_TRIANGLES = 50_000_000
 LAYER_OPACITY = 0.1
@@ -29,8 +29,6 @@ SHELL_OPACITY = 0.3
 FAINT = 0.005
 """Maximum initial opacity of shells that protrude through the base: almost invisible, but unlike 0 it has a
 gradient."""
-LAYERS = 6
-"""Default number of layers."""
 SHELLS_DEPTH = 1 / 30
 """Default depth of all shells together, relative to the diagonal of the base's bounding box."""
 
@@ -211,8 +209,7 @@ def _color_source(base: BaseMesh, colors: Source, views: Sequence[View]) -> Sour
         "views": len(views) > 0,
         "grey": True,
     }
-    if colors not in get_args(Source):
-        raise ValueError(f"colors must be one of {', '.join(get_args(Source))}, got {colors!r}")
+    need_choice(Source, colors=colors)
     if colors == "auto":
         return next(name for name in get_args(Source) if available.get(name))
     if not available[colors]:
