@@ -30,7 +30,7 @@ _AT_ONCE = 1 << 16
 _RUN = 16
 """Records that lie together in a sample of positions."""
 _FARTHEST, _LARGEST = 1e7, 1e5
-"""Positions and standard deviations, at most, of records that can be splats: text and noise have greater ones."""
+"""Greatest positions and standard deviations of what can be splats: text and noise have greater ones."""
 
 
 def _matches(content: Content) -> bool:
