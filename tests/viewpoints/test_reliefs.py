@@ -156,6 +156,12 @@ def test_part_of_a_wide_photograph():
     assert found.cameras[0].world_to_camera[2, :3] @ middle > np.cos(np.radians(1.5))
 
 
+def test_a_flat_image_is_not_seen_from_its_edge():
+    x, y = pixels()
+    cloud = splats(np.stack([x, y, np.full(len(x), 30)], axis=1) / 80, 0.01)
+    assert abs(find_cameras(cloud, 1).cameras[0].world_to_camera[2, 2]) > 0.99
+
+
 def test_two_even_sheets_are_no_photograph():
     """A box without sides: half of its splats are hidden by the others."""
     x, y = pixels()
