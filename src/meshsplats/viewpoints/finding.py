@@ -74,7 +74,7 @@ class FoundCameras:
         told = "sure" if self.up_confidence >= 0.6 else "likely" if self.up_confidence > 0 else "the default"
         what = {
             "object": "an object",
-            "relief": "a photograph with depth, seen from its front",
+            "relief": "a relief, a photograph with depth, seen from its front",
             "ring": "a subject in its surroundings",
             "place": "a place, seen from within",
             "aerial": "a landscape from above",
