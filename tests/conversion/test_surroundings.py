@@ -70,10 +70,12 @@ def _area(mesh: SplatMesh) -> float:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
 
 
-@pytest.mark.parametrize("kind", ["splats", "mesh"])
+@pytest.mark.parametrize("kind", ["splats", "antialiased", "2dgs", "mesh"])
 def test_a_wall_stays_and_what_hangs_before_it_goes(kind: str):
     cloud, what = place()
-    scene: GaussianCloud | SplatMesh = cloud if kind == "splats" else convert(cloud, min_opacity=0)
+    scene: GaussianCloud | SplatMesh = convert(cloud, min_opacity=0) if kind == "mesh" else cloud
+    if kind in ("antialiased", "2dgs"):
+        scene = replace(cloud, kernel=kind)
     found = find(scene)
     assert not found.kept[what == WALL].any()
     assert not found.kept[what == CLUMPS].any()

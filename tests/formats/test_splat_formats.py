@@ -150,6 +150,27 @@ def test_dot_splat(tmp_path, name):
     close(cloud, values, quaternions=0.008, opacities=HALF_BYTE, dc=dc)
 
 
+@pytest.mark.parametrize("length", [0.5, 1.4, "255 q"])
+def test_dot_splat_of_writers_that_do_not_store_unit_rotations(tmp_path, length):
+    """Some leave their quaternions as they were optimised; some write 255 for w of round splats. Viewers of
+    the web show both, for which the name is enough."""
+    values = some_splats(400, degree=0)
+    records = np.frombuffer(encode.dot_splat(values), np.uint8).reshape(-1, 32).copy()
+    q = (records[:, 28:] - 127.5) / 127.5
+    records[:, 28:] = [255, 0, 0, 0] if length == "255 q" else np.clip(128 + 128 * length * q, 0, 255)
+    (tmp_path / "scene.splat").write_bytes(records.tobytes())
+    cloud = load_gaussians(tmp_path / "scene.splat")
+    np.testing.assert_allclose(np.linalg.norm(cloud.quaternions, axis=1), 1, atol=1e-6)
+    expected = expected_cloud(values)
+    np.testing.assert_array_equal(cloud.means, expected["means"])
+    if length == 0.5:
+        turned = np.abs((cloud.quaternions * expected["quaternions"]).sum(axis=1))
+        assert np.degrees(2 * np.arccos(np.minimum(turned, 1))).max() < 3
+    (tmp_path / "scene.bin").write_bytes(records.tobytes())  # without the name, nothing else tells
+    with pytest.raises(FileFormatError, match="not a splat file of a known format"):
+        load_gaussians(tmp_path / "scene.bin")
+
+
 def test_dot_splat_refuses_negative_scales(tmp_path):
     data = bytearray(encode.dot_splat(some_splats(20, degree=0)))
     data[32 + 12 : 32 + 16] = struct.pack("<f", -0.5)

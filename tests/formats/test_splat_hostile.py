@@ -133,7 +133,7 @@ FILES = {
     "cut.splat": (encode.dot_splat(VALUES)[:-1], "not records of 32 bytes"),
     "text.splat": (
         b"This is a letter, of 32 letters.\n"[:32] * 40,
-        "not records of 32 bytes whose rotations",
+        "not records of 32 bytes of splats",
     ),
     "tree of spark.spz": (
         spz_body(version=2, count=1, degree=0, flags=128, rest=bytes(19 + 6)),
@@ -143,7 +143,7 @@ FILES = {
         gzip.decompress(spz_body(version=2, rest=bytes(40))),
         "SPZ of version 2 that is not gzipped",
     ),
-    "zeros.splat": (bytes(3200), "rotations are unit quaternions"),
+    "zeros.splat": (bytes(3200), "positive scales"),
     # SOG archives
     "no meta.sog": (encode.bundle({"a.webp": b""}), "without meta.json is no SOG file"),
     "cut.sog": (encode.bundle(SOG)[:-100], "zip"),

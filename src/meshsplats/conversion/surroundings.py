@@ -118,7 +118,8 @@ def _as_mesh(
     rows = np.sort(np.concatenate([np.flatnonzero(asked), rest]))
     thin = scene.take(rows)
     wider = np.where(asked[rows], 1, step**0.5).astype(np.float32)
-    thin = replace(thin, sh=thin.sh[:, :1], scales=thin.scales * wider[:, None])
+    # Which filter the splats were trained with makes no difference to what is behind what.
+    thin = replace(thin, sh=thin.sh[:, :1], scales=thin.scales * wider[:, None], kernel="3dgs")
     mesh = convert(thin, mode="flat", detail="even", sides=4, rings=1, footprint="filter", threads=threads)
     return mesh, rows
 

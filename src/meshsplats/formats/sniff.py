@@ -125,8 +125,8 @@ def _refusal(content: Content) -> FileFormatError:
     path = content.path
     if content.name.endswith(".splat"):
         return UnreadSplats(
-            f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
-            f" (it has {path.stat().st_size:,} bytes)"
+            f"{path}: named .splat, but not records of 32 bytes of splats: position, positive scales,"
+            f" colour and rotation (it has {path.stat().st_size:,} bytes)"
         )
     if content.container == "html":
         return UnreadSplats(f"{path}: {_page(path)}")

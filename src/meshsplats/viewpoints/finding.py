@@ -24,6 +24,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import FRAGMENTS, preview_camera
 from meshsplats.viewpoints.kind import Kind, kind_from_inside, kind_from_outside, usual_depth
+from meshsplats.viewpoints.relief import Relief, find_relief
 from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
 from meshsplats.viewpoints.upright import find_upright
@@ -33,6 +34,8 @@ MOST = 96
 """Views that are looked for, each checked with all splats; more are variations of these."""
 FINGERPRINT = 20_000
 """Number of splats, at most, by which a scene is known again."""
+AS_HELD = 0.5
+"""How sure up is that of a photograph, where nobody names it: people hold cameras upright."""
 SHIFT = 0.1
 """Greatest shift of a variation, as a share of the mean depth of the view."""
 TURN = 8.0
@@ -49,8 +52,9 @@ class FoundCameras:
     """What ``find_cameras`` found, in the frame of the splats."""
 
     kind: Kind
-    """'object': seen from all around, against nothing. 'ring': a subject in its surroundings, photographed
-    from a ring of cameras or part of one. 'place': seen from within. 'aerial': a landscape from above."""
+    """'object': seen from all around, against nothing. 'relief': a photograph whose pixels were given
+    depth, seen from where it was taken. 'ring': a subject in its surroundings, photographed from a ring
+    of cameras or part of one. 'place': seen from within. 'aerial': a landscape from above."""
     confidence: float
     """How sure the kind is, 0 to 1."""
     up: np.ndarray
@@ -71,6 +75,7 @@ class FoundCameras:
         told = "sure" if self.up_confidence >= 0.6 else "likely" if self.up_confidence > 0 else "the default"
         what = {
             "object": "an object",
+            "relief": "a relief, a photograph with depth, seen from its front",
             "ring": "a subject in its surroundings",
             "place": "a place, seen from within",
             "aerial": "a landscape from above",
@@ -115,9 +120,11 @@ def find_cameras(
 ) -> FoundCameras:
     """Cameras that see a scene as photographs did, found from its splats alone.
 
-    An object is seen from a dome around it. In any other scene the dome shows walls from behind and the noise
-    that no photograph saw, so views are looked for from where splats look small and leave no holes. The
-    result has the same bits on every run, with any number of threads.
+    An object is seen from a dome around it, a photograph whose pixels were given depth from where it was
+    taken, and from close to there: nothing is known of its sides and its back. In any other scene the
+    dome shows walls from behind and the noise that no photograph saw, so views are looked for from where
+    splats look small and leave no holes. The result has the same bits on every run, with any number of
+    threads.
 
     Args:
         cloud: the splats.
@@ -128,8 +135,7 @@ def find_cameras(
         anywhere: look for views also where the scene is an object.
         threads: at most this many; all processors by default.
 
-    Raises ValueError for an empty cloud, one that is invisible from within, or a value out of its range.
-    """
+    Raises ValueError for an empty cloud, one that is invisible from within, or a value out of its range."""
     need(GaussianCloud, cloud=cloud)
     if len(cloud) == 0:
         raise ValueError("the scene is empty: there is nothing to look at")
@@ -139,6 +145,8 @@ def find_cameras(
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     given, first_up = _told_up(cloud, up)
+    if (relief := find_relief(cloud, first_up)) is not None:
+        return _before(cloud, relief, given, count, width, height)
     key, wanted = (_fingerprint(cloud), None if given is None else given.tobytes()), min(count, MOST)
     found = _searched.get(cloud)
     if found is None or found.key != key or found.wanted < wanted or not (anywhere or found.is_place):
@@ -169,6 +177,8 @@ def first_impression(
     if not worth_a_look(cloud):
         return None
     given, first_up = _told_up(cloud, up)
+    if (relief := find_relief(cloud, first_up)) is not None:
+        return replace(_before(cloud, relief, given, 1, 400, 400), cameras=())
     kind, confidence = kind_from_outside(cloud, first_up, threads)
     if kind == "object":
         return replace(_around(cloud, confidence, given, 1, 400, 400), cameras=())
@@ -219,6 +229,19 @@ def _around(
     ground = float((bounds.points @ up).min())
     extent = float(np.linalg.norm(cameras[0].center - bounds.center))
     return FoundCameras("object", confidence, up, float(given is not None), ground, extent, tuple(cameras))
+
+
+def _before(
+    cloud: GaussianCloud, relief: Relief, given: np.ndarray | None, count: int, width: int, height: int
+) -> FoundCameras:
+    """A photograph with depth and ``count`` cameras near its own."""
+    up, sure = (relief.up, AS_HELD) if given is None else (given, 1.0)
+    step = -(-len(cloud) // FINGERPRINT)
+    ground = float(np.quantile(cloud.means[::step] @ up, 0.01))
+    extent = float(np.linalg.norm(relief.target - relief.place))
+    cameras = relief.cameras(count, width, height)
+    cameras = [replace(camera, name=f"view_{i:04d}") for i, camera in enumerate(cameras)]
+    return FoundCameras("relief", relief.confidence, up, sure, ground, extent, tuple(cameras))
 
 
 def _within(

@@ -1,4 +1,4 @@
-"""What kind of scene splats show: an object, a ring around one, a place, a landscape."""
+"""What kind of scene splats show: an object, a relief, a ring around one, a place, a landscape."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.viewpoints.sample import COARSE, AllSplats, Sample
 from meshsplats.viewpoints.search import Places
 
-Kind = Literal["object", "ring", "place", "aerial"]
+Kind = Literal["object", "relief", "ring", "place", "aerial"]
 
 FEWEST = 1000
 """Scenes of fewer splats are objects: there is nothing to find."""

@@ -22,6 +22,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints.finding import find_cameras, worth_a_look
 from meshsplats.viewpoints.kind import kind_from_outside
+from meshsplats.viewpoints.relief import find_relief
 from meshsplats.viewpoints.walking import keys_of, walk
 
 
@@ -94,7 +95,8 @@ def default_views(
         given = cameras_beside(source, scene.origin)
     if given:
         toward = guess_up(scene, given) if up is None else unit_up(up)
-        if kind_from_outside(scene, toward, threads)[0] == "object":
+        around = kind_from_outside(scene, toward, threads)[0] == "object"
+        if around and find_relief(scene, toward) is None:
             return None
         some = _spread(given, keys_of(count) if film else count)
         views = [_in_shape(camera.with_near_plane(scene.means), side) for camera in some]

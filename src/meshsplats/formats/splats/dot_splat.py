@@ -2,7 +2,8 @@
 
 Each record holds position and scales (6 float32), colour and opacity (4 bytes of 255ths), and the rotation
 (4 bytes, w x y z, 128 + 128 times the component, truncated). There is no header, so a file is recognised by
-its rotations, which must have length 1.
+its rotations, which have length 1; some writers do not normalise them, or store 255 times the component, so
+that in a file of that name sizes and positions count.
 """
 
 from __future__ import annotations
@@ -28,15 +29,18 @@ _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1",
 _AT_ONCE = 1 << 16
 _RUN = 16
 """Records that lie together in a sample of positions."""
+_FARTHEST, _LARGEST = 1e7, 1e5
+"""Greatest positions and standard deviations of what can be splats: text and noise have greater ones."""
 
 
 def _matches(content: Content) -> bool:
-    """Whether the file can be `.splat`: whole records, and nine in ten of a sample have unit rotations."""
+    """Whether the file can be `.splat`: whole records, and nine in ten of a sample have unit rotations, or,
+    where the name says so, sizes and positions of splats."""
     with content.open() as file:
-        return _is_dot_splat(file)
+        return _is_dot_splat(file, content.name.endswith(".splat"))
 
 
-def _is_dot_splat(file: BinaryIO) -> bool:
+def _is_dot_splat(file: BinaryIO, named: bool) -> bool:
     size = file.seek(0, io.SEEK_END)
     if size == 0 or size % _RECORD.itemsize:
         return False
@@ -45,8 +49,13 @@ def _is_dot_splat(file: BinaryIO) -> bool:
     for start in sorted({0, count // 3, count - min(count, 256)}):
         file.seek(start * _RECORD.itemsize)
         bytes_ += file.read(256 * _RECORD.itemsize)
-    rotations = _rotations(np.frombuffer(bytes_, _RECORD))
-    return bool((np.abs(np.linalg.norm(rotations, axis=1) - 1) < 0.05).mean() >= 0.9)
+    records = np.frombuffer(bytes_, _RECORD)
+    likely = np.abs(np.linalg.norm(_rotations(records), axis=1) - 1) < 0.05
+    if named:
+        likely |= (np.abs(records["position"]) < _FARTHEST).all(axis=1) & (
+            (records["scale"] > 0) & (records["scale"] < _LARGEST)
+        ).all(axis=1)
+    return bool(likely.mean() >= 0.9)
 
 
 def _open(content: Content, file: BinaryIO, _: Reading) -> SplatReader:
