@@ -178,7 +178,7 @@ def _made(
     own = splats
     for each in waiting if config is None else ():
         if each is level or merges_further(each):
-            seen = level_targets(cloud, each, config, **drawn).test
+            seen = level_targets(cloud, each, config, **drawn).views
             own = merged(splats, each, [view.camera for view in seen], threads)
             splats = own if merges_further(each) else splats
     run = RunOptions(threads=threads, spent=time.perf_counter() - start)

@@ -15,8 +15,9 @@ from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
-from meshsplats.conversion import convert, simplify
+from meshsplats.conversion import simplify
 from meshsplats.conversion.driver import worth_drawing
+from meshsplats.conversion.merging_views import convert_within_limits, merging_views
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.errors import FileFormatError
@@ -88,7 +89,14 @@ class Converter:
         cloud = self.callbacks.load(job.source)
         seen = seen_from(cameras, job.source, cloud.origin)
         read = time.perf_counter()
-        mesh = convert(cloud, product.conversion, preset=product.preset, cameras=seen, up=product.direction)
+        mesh = convert_within_limits(
+            cloud,
+            product.conversion,
+            preset=product.preset,
+            cameras=seen,
+            up=product.direction,
+            source=job.source,
+        )
         mesh = product.files.prepared(mesh, seen)
         times = {"read": read - start, "convert": time.perf_counter() - read}
         opening = self.callbacks.opening(cloud, job.source, seen) if job.preview else None
@@ -197,8 +205,10 @@ class Converter:
             max_splats=None if merging else count,
         )
         if merging and count is not None:
-            seen = seen_from(cameras, job.source, kept.origin)
-            kept = simplify(kept, count, cameras=seen or None)
+            views = seen_from(cameras, job.source, kept.origin) or None
+            if views is None and count < len(kept):
+                views = merging_views(kept, up=product.direction)
+            kept = simplify(kept, count, cameras=views)
         result = self.callbacks.place(scaled(kept, product.scale))
         with self._recorded(job):
             kinds = [written_ending(path.name) for path in job.outputs]

@@ -160,7 +160,7 @@ def _converted_level(
     up: Sequence[float] | np.ndarray | None,
     run: RunOptions | None,
 ) -> SplatMesh:
-    cameras = [view.camera for view in targets.test]
+    cameras = [view.camera for view in targets.views]
     cloud = merged(cloud, level, cameras)
     if options is not None or level.splats == level.finest:
         return convert(cloud, options, cameras=cameras, up=up)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,11 +13,19 @@ from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, convert, load_gaussians, orbit, psnr, render, render_splats, simplify
 from meshsplats._core.structures import MergingStruct
-from meshsplats.conversion import ConversionOptions, merging
+from meshsplats.cameras.trajectories import look_at
+from meshsplats.conversion import ConversionOptions, merging, merging_weights
 from meshsplats.conversion.budget import within_limits
-from meshsplats.conversion.merging import nearest, opacity_of, optical_depth
+from meshsplats.conversion.merging import (
+    FEWEST_OF_BLOCK,
+    opacity_of,
+    optical_depth,
+    simplify_in_blocks,
+)
+from meshsplats.conversion.merging_weights import AROUND, ELSEWHERE, HIDDEN, nearest, pixels_of
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.demo_scene import make_scene
+from meshsplats.demo_scene.room import MIDDLE, make_room
 
 
 def random_cloud(n, seed=0, degree=0, kernel="3dgs"):
@@ -510,3 +519,128 @@ def test_invisible_splats_earn_a_block_no_share():
     faint = replace(cloud, opacities=np.where(left, 0.001, cloud.opacities).astype(np.float32))
     kept = merging.simplify_in_blocks(faint, 200, block=500)
     assert (kept.opacities >= 1 / 255).mean() > 0.95
+
+
+class TestCameras:
+    """With cameras, splats count by the pixels that show them."""
+
+    def test_what_is_near_stays_fine(self):
+        # Two pairs, equal but for their places. That at the camera is nearer together: alone, it goes first.
+        cloud = GaussianCloud(
+            [[0, 0, 2], [0.02, 0, 2], [0, 0, 40], [0.03, 0, 40]],
+            [[1, 0, 0, 0]] * 4,
+            [[0.02] * 3] * 4,
+            [0.9] * 4,
+            np.zeros((4, 1, 3)),
+        )
+        camera = look_at([0, 0, 0], [0, 0, 1], width=64, height=64, fov=60)
+        alone, seen = simplify(cloud, 3, low_pass=0), simplify(cloud, 3, low_pass=0, cameras=[camera])
+        assert sorted(alone.means[:, 2].round().tolist()) == [2, 40, 40]
+        assert sorted(seen.means[:, 2].round().tolist()) == [2, 2, 40]
+
+    def test_what_is_hidden_becomes_coarse(self):
+        # An opaque, motley wall, and the same pairs before and behind it.
+        points = np.stack(np.meshgrid(np.linspace(-1.7, 1.7, 41), np.linspace(-1.7, 1.7, 41), [4.0]), axis=-1)
+        wall = GaussianCloud(
+            points.reshape(-1, 3),
+            np.tile([1, 0, 0, 0], (1681, 1)),
+            np.tile([0.09, 0.09, 0.001], (1681, 1)),
+            np.full(1681, 0.99),
+            np.random.default_rng(0).uniform(-1.5, 1.5, (1681, 1, 3)),
+        )
+        pairs = GaussianCloud(
+            [[x, y, z] for z in (3, 5) for y in np.linspace(-0.5, 0.5, 6) for x in (-0.02, 0.02)],
+            np.tile([1, 0, 0, 0], (24, 1)),
+            np.full((24, 3), 0.05),
+            np.full(24, 0.9),
+            np.zeros((24, 1, 3)),
+        )
+        cloud = GaussianCloud.joined([pairs, wall])
+        camera = look_at([0, 0, 0], [0, 0, 1], width=128, height=128, fov=50)
+        counted = pixels_of(cloud, masses(cloud), [camera])
+        blind, seen = (merging.merge(cloud, len(cloud) - 6, 0.0, counts).group for counts in (None, counted))
+        together = [[i for i in range(0, 24, 2) if group[i] == group[i + 1]] for group in (blind, seen)]
+        assert min(together[0]) < 12
+        assert together[1] == [12, 14, 16, 18, 20, 22]
+
+    def test_neighbours_of_what_is_seen_count_as_seen(self):
+        rng = np.random.default_rng(1)
+        points, values = rng.normal(size=(40, 3)), rng.uniform(size=40)
+        apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+        own = [values[np.argsort(row)[: 1 + AROUND]].max() for row in apart]
+        np.testing.assert_array_equal(merging_weights._greatest_around(points, values, None), own)
+        np.testing.assert_array_equal(
+            merging_weights._greatest_around(points[:1], values[:1], None), values[:1]
+        )
+
+    def test_pixels_by_hand(self):
+        # One splat before the camera, one behind it, one beside the image, one that is hidden.
+        cloud = GaussianCloud(
+            [[0, 0, 2], [0, 0, -2], [4, 0, 2], [0, 0, 4]],
+            [[1, 0, 0, 0]] * 4,
+            [[0.3] * 3, [0.3] * 3, [0.3] * 3, [0.05] * 3],
+            [0.999, 0.5, 0.5, 0.9],
+            np.zeros((4, 1, 3)),
+        )
+        camera = look_at([0, 0, 0], [0, 0, 1], width=200, height=200, fov=90)
+        mass = np.array([1.0, 2, 3, 4])
+        with patch.object(merging_weights, "AROUND", 0):
+            pixels = pixels_of(cloud, mass, [camera])
+        focal, distance = 100.0, np.array([4.0, 4, 20, 16])
+        elsewhere = ELSEWHERE * focal**2 / distance * mass
+        np.testing.assert_allclose(pixels[1:3], elsewhere[1:3], rtol=1e-5)
+        assert pixels[3] == pytest.approx(elsewhere[3] + HIDDEN * focal**2 / 16 * 4, rel=0.05)
+        # The image of the first is about as large as an opaque disc of twice its standard deviation.
+        shown = pixels[0] - elsewhere[0] - HIDDEN * focal**2 / 4
+        assert 0.3 < shown / (np.pi * (focal * 0.6 / 2) ** 2) < 2
+        # Of too many splats no images are rendered.
+        with patch.object(merging_weights, "MOST", 3):
+            many = pixels_of(cloud, mass, [camera])
+        covered = np.where([True, False, False, True], focal**2 / distance, 0) * mass
+        np.testing.assert_allclose(many, elsewhere + covered, rtol=1e-5)
+
+    @pytest.mark.parametrize("simplified", [simplify, simplify_in_blocks])
+    def test_a_room_from_within(self, simplified):
+        cloud = make_room(6000).of_degree(0)
+        how = {} if simplified is simplify else {"block": 1000}
+        cameras = [
+            look_at(MIDDLE + 0.2 * toward, MIDDLE + toward, width=120, height=120, fov=70, near=0.05)
+            for toward in np.random.default_rng(0).normal(size=(20, 3)) * [1, 1, 0.3]
+        ]
+        blind = simplified(cloud, 1500, **how)
+        seen = simplified(cloud, 1500, cameras=cameras[4:], **how)
+        assert len(seen) == len(blind) == 1500
+
+        def likeness(few):
+            views = cameras[:4]
+            return np.mean([psnr(render_splats(few, c).color, render_splats(cloud, c).color) for c in views])
+
+        assert likeness(seen) > likeness(blind) + 1.5
+
+    def test_more_threads_same_bits(self):
+        cloud = random_cloud(300)
+        cameras = orbit(cloud, 4, width=50, height=50)
+        one, many = (simplify(cloud, 90, cameras=cameras, threads=n) for n in (1, 3))
+        for name in ("means", "scales", "quaternions", "opacities", "sh"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+class TestShares:
+    """How many splats blocks keep."""
+
+    def test_by_hand(self):
+        shares = merging._shares(np.array([1.0, 3.0]), np.array([1000, 300]), 800)
+        assert shares.tolist() == [500, 300]  # the second has no more
+        shares = merging._shares(np.array([1.0, 99.0, 0.0]), np.array([1000, 1000, 0]), 1000)
+        assert shares.tolist() == [FEWEST_OF_BLOCK, 990, 0]  # of the first some stay
+
+    @given(st.lists(st.integers(0, 5000), min_size=1, max_size=12), st.integers(0, 100), st.data())
+    def test_laws(self, visible, seed, data):
+        wanted = np.random.default_rng(seed).exponential(size=len(visible)) * (np.array(visible) > 0)
+        total = data.draw(st.integers(1, max(sum(visible), 1)))
+        shares = merging._shares(wanted, np.array(visible), total)
+        assert (shares <= np.array(visible) + 1).all()
+        assert shares.sum() >= min(total, sum(visible)) - len(visible)
+        assert shares.sum() <= total + FEWEST_OF_BLOCK * len(visible) + len(visible)
+        even = merging._shares(np.array(visible), np.array(visible), total)
+        assert abs(even - np.array(visible) * total / max(sum(visible), 1)).max() <= FEWEST_OF_BLOCK + 1

@@ -24,8 +24,9 @@ from meshsplats.blender.plan import in_words
 from meshsplats.blender.subject import views_within
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
-from meshsplats.conversion import convert
+from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.cleaning import cropped
+from meshsplats.conversion.merging_views import convert_within_limits
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.errors import OptionsError
@@ -151,7 +152,8 @@ class PictureOptions:
             return scene
         # Crossed ellipses stand upright on the surface, where they catch too little light.
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
-        return convert(scene, max_splats=self.max_splats or (FAST_SPLATS if self.fast else None), mode=mode)
+        most = self.max_splats or (FAST_SPLATS if self.fast else None)
+        return convert_within_limits(scene, ConversionOptions(max_splats=most, mode=mode))
 
 
 @dataclass(frozen=True)

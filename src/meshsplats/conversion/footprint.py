@@ -114,14 +114,22 @@ class CameraCoverage:
         Concretely, d / f with (f / d)^2 averaged over the cameras that see the splat: close views, in which
         it covers more pixels, count for more.
         """
-        sizes = np.empty(len(self.means), np.float32)
-        for part in chunks(len(sizes), _CHUNK):
-            count, total = np.zeros((2, part.stop - part.start), np.float32)
+        count, total = self._sums()
+        return np.sqrt(np.divide(count, total, out=np.zeros_like(total), where=count > 0))
+
+    def densities(self) -> np.ndarray:
+        """(n,) float32 pixels that a unit of area at each splat covers, on average over all cameras: 0 in
+        those that do not see it."""
+        return self._sums()[1] / np.float32(len(self.cameras))
+
+    def _sums(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) float32 number of cameras that see each splat, and the sum of their weights."""
+        count, total = np.zeros((2, len(self.means)), np.float32)
+        for part in chunks(len(total), _CHUNK):
             for _, _, seen, weight in self._each(part):
-                count += seen
-                total += weight
-            sizes[part] = np.sqrt(np.divide(count, total, out=np.zeros_like(total), where=count > 0))
-        return sizes
+                count[part] += seen
+                total[part] += weight
+        return count, total
 
     def mean_colors(self, sh: np.ndarray) -> np.ndarray:
         """(n, 3) float32 display RGB in [0, 1]: colours of ``sh`` (n, k, 3), averaged over the cameras.

@@ -18,12 +18,13 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._core.library import pointer, processors, run
-from meshsplats._core.structures import MergingStruct, NearestStruct
+from meshsplats._core.structures import MergingStruct
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import SceneSample, SceneViews, widen
+from meshsplats.conversion.merging_weights import nearest, pixels_of
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import GaussianCloud
@@ -75,8 +76,10 @@ def simplify(
     Args:
         cloud: the splats.
         count: how many to keep, at least 1.
-        cameras: where the result will be seen from: they give the size of a pixel at each splat for
-            ``low_pass``. Default: images of 1000 pixels from all sides that just hold the subject.
+        cameras: where the result will be seen from. Splats count by the pixels that show them, so that what
+            is near stays fine, and what is hidden or out of sight becomes coarse; and the cameras give the
+            size of a pixel at each splat for ``low_pass``. Default: images of 1000 pixels from all sides that
+            just hold the subject, whose splats count by their own area.
         low_pass: standard deviation, in scene units, of the low-pass filter that the splats are drawn with:
             one number or (n,), >= 0. Finer differences do not count, and splats narrower than the filter
             count as widened by it (but for 'antialiased'). Default: sqrt(0.3) pixels, sqrt(0.5) for '2dgs'.
@@ -93,33 +96,63 @@ def simplify(
     need_all(Camera, cameras=cameras, optional=True)
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ValueError(f"count must be a whole number of splats, at least 1, got {count!r}")
-    return cloud if count >= len(cloud) else merge(cloud, count, low_pass, cameras, threads).cloud
+    if count >= len(cloud):
+        return cloud
+    if low_pass is None:
+        low_pass = _usual_low_pass(cloud, cameras)
+    counted = None
+    if cameras:
+        width = np.broadcast_to(np.asarray(low_pass, np.float64), len(cloud))
+        counted = pixels_of(cloud, _masses(cloud, width), cameras, threads)
+    return merge(cloud, count, low_pass, counted, threads).cloud
 
 
 def simplify_in_blocks(
-    cloud: GaussianCloud, count: int, *, block: int = BLOCK, threads: int | None = None
+    cloud: GaussianCloud,
+    count: int,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    block: int = BLOCK,
+    threads: int | None = None,
 ) -> GaussianCloud:
     """``simplify`` for large clouds: block by block of space, in half the time and little memory beside the
     cloud's.
 
-    Blocks of at most ``block`` splats, cut at medians, keep equal shares of their visible splats, and pairs
-    across their borders are not merged: images are as good (benchmarks/results/viewer.md). Splats are
-    ordered by block.
+    Blocks of at most ``block`` splats, cut at medians, keep equal shares of their visible splats, or, with
+    ``cameras``, as many as they cover pixels. Pairs across their borders are not merged: images are as good
+    (benchmarks/results/viewer.md). Splats are ordered by block.
     """
     if len(cloud) <= block or count >= len(cloud):
-        return simplify(cloud, count, threads=threads)
-    low_pass = _usual_low_pass(cloud, None)
+        return simplify(cloud, count, cameras=cameras, threads=threads)
+    low_pass = _usual_low_pass(cloud, cameras)
+    counted = None if not cameras else pixels_of(cloud, _masses(cloud, low_pass), cameras, threads)
     blocks = _blocks(cloud.means, np.arange(len(cloud)), block)
-    visible = [int((cloud.opacities[rows] >= MIN_OPACITY).sum()) for rows in blocks]
-    most = max(count, FEWEST_OF_BLOCK * len(blocks))
-    ends = np.rint(np.cumsum(visible) / max(sum(visible), 1) * most).astype(np.int64)
-    shares = np.diff(ends, prepend=0)
-    parts = [
-        simplify(cloud.take(rows), int(share), low_pass=low_pass[rows], threads=threads)
-        for rows, share in zip(blocks, shares, strict=True)
-        if share
-    ]
+    visible = np.array([(cloud.opacities[rows] >= MIN_OPACITY).sum() for rows in blocks])
+    wanted = visible if counted is None else np.array([counted[rows].sum() for rows in blocks])
+    shares = _shares(wanted, visible, max(count, FEWEST_OF_BLOCK * len(blocks)))
+    parts = []
+    for rows, share in zip(blocks, shares.tolist(), strict=True):
+        part = cloud.take(rows)
+        if share >= len(part):
+            parts.append(part)
+        elif share:
+            own = None if counted is None else counted[rows]
+            parts.append(merge(part, share, low_pass[rows], own, threads).cloud)
+    # What is left over is the least of each block: few of all.
     return simplify(GaussianCloud.joined(parts), count, threads=threads)
+
+
+def _shares(wanted: np.ndarray, visible: np.ndarray, total: int) -> np.ndarray:
+    """(b,) int64 numbers of splats, ``total`` together, that blocks keep: in proportion to ``wanted`` (b,),
+    but at most those that are ``visible`` (b,), and at least ``FEWEST_OF_BLOCK`` of them."""
+    free, left = wanted > 0, float(total)
+    while free.any() and ((full := free & (wanted * left > visible * wanted[free].sum())).any()):
+        free &= ~full
+        left = total - visible[(wanted > 0) & ~free].sum()
+    unit = wanted[free].sum() / left if left > 0 and free.any() else 1.0
+    ends = np.rint(np.cumsum(np.where(free, wanted, np.where(wanted > 0, visible * unit, 0))) / unit)
+    shares = np.diff(ends.astype(np.int64), prepend=0)
+    return np.maximum(shares, np.minimum(visible, FEWEST_OF_BLOCK))
 
 
 def _blocks(means: np.ndarray, rows: np.ndarray, most: int) -> list[np.ndarray]:
@@ -146,24 +179,28 @@ class Merged(NamedTuple):
 def merge(
     cloud: GaussianCloud,
     count: int,
-    low_pass: float | np.ndarray | None = None,
-    cameras: Sequence[Camera] | None = None,
+    low_pass: float | np.ndarray,
+    counted: np.ndarray | None = None,
     threads: int | None = None,
 ) -> Merged:
-    """``simplify`` for ``count`` less than the number of splats, which it has checked."""
+    """``simplify`` for ``count`` less than the number of splats, which it has checked. ``counted``: (n,) what
+    each splat counts, > 0 if it is ever drawn; None: its mass."""
     n = len(cloud)
     if n > np.iinfo(np.int32).max:
         raise ValueError(f"at most 2^31 - 1 splats can be merged, got {n}")
-    if low_pass is None:
-        low_pass = _usual_low_pass(cloud, cameras)
     width = np.asarray(low_pass, np.float64)
     if width.shape not in ((), (n,)) or not np.isfinite(width).all() or (width < 0).any():
         raise ValueError(f"low_pass must be one number >= 0, or one for each of the {n} splats")
     width = np.broadcast_to(width, (n,))
-    area = mean_shadow(disc_areas(_drawn(cloud.scales, width, cloud.kernel)))
-    masses = np.where(cloud.opacities < MIN_OPACITY, 0, optical_depth(cloud.opacities) * area)
-    group = _groups(cloud, masses, width, int(count), threads or processors())
+    masses = _masses(cloud, width)
+    group = _groups(cloud, masses if counted is None else counted, width, int(count), threads or processors())
     return Merged(_merged(cloud, masses, width, group), group, masses)
+
+
+def _masses(cloud: GaussianCloud, low_pass: np.ndarray) -> np.ndarray:
+    """(n,) float64 masses of splats, 0 for those that are never drawn."""
+    area = mean_shadow(disc_areas(_drawn(cloud.scales, low_pass, cloud.kernel)))
+    return np.where(cloud.opacities < MIN_OPACITY, 0, optical_depth(cloud.opacities) * area)
 
 
 def optical_depth(opacity: np.ndarray) -> np.ndarray:
@@ -192,30 +229,6 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
     return optical_depth(opacity), opacity
 
 
-def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The ``count`` nearest neighbours of each of ``points`` (n, 3) float64, n > count.
-
-    Returns:
-        (n,) int32 ``order`` of the points in which neighbours lie close to each other; and (n, count) int32:
-        row i holds the positions, in that order, of the neighbours of point ``order[i]``, nearest first.
-    """
-    points = np.ascontiguousarray(points, np.float64)
-    order = np.empty(len(points), np.int32)
-    found = np.empty((len(points), count), np.int32)
-    run(
-        "ms_nearest",
-        NearestStruct(
-            count=len(points),
-            neighbours=count,
-            threads=threads or processors(),
-            points=pointer(points),
-            order=pointer(order),
-            nearest=pointer(found),
-        ),
-    )
-    return order, found
-
-
 def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
     px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
     source = ConversionOptions(footprint="cameras" if cameras else "framing")
@@ -235,7 +248,8 @@ def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:
 def _groups(
     cloud: GaussianCloud, masses: np.ndarray, low_pass: np.ndarray, count: int, threads: int
 ) -> np.ndarray:
-    """(n,) indices, 0 to count - 1, of the merged splats that each becomes part of."""
+    """(n,) indices, 0 to count - 1, of the merged splats that each becomes part of; ``masses``: what each
+    counts."""
     seen = mean_shadow(disc_areas(cloud.scales[masses > 0].astype(np.float64)))
     unit = float(np.sqrt(np.median(seen))) if len(seen) else 0.0
     unit = unit or float(low_pass.max()) or 1.0

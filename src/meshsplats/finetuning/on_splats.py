@@ -136,7 +136,8 @@ class SplatTuning:
         self._cloud = run.cloud
         if self._record.max_splats is not None:
             setup.phase(f"merging {len(run.cloud):,} splats to {self._record.max_splats:,}")
-            self._cloud = simplify_in_blocks(run.cloud, self._record.max_splats, threads=run.threads)
+            most, seen = self._record.max_splats, [view.camera for view in self.dataset.train]
+            self._cloud = simplify_in_blocks(run.cloud, most, cameras=seen, threads=run.threads)
         setup.phase(f"converting {len(self._cloud):,} splats")
         conversion = self._converted()
         self._order = None

@@ -198,7 +198,7 @@ def _fused(
     mesh = scene
     if isinstance(mesh, GaussianCloud):
         # Voxels are far larger than the splats of so many.
-        mesh = simplify_in_blocks(mesh, MOST_SPLATS, threads=threads)
+        mesh = simplify_in_blocks(mesh, MOST_SPLATS, cameras=sources.depth, threads=threads)
         # As wide as viewers draw splats: gaps between them would be holes in the surface.
         mesh = convert(mesh, cameras=sources.depth, look="splats", colors="base", threads=threads)
     grid = (

@@ -17,6 +17,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
+from meshsplats.conversion.merging_views import merging_views
 from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.base_meshes import load_base
@@ -112,9 +113,11 @@ def content_of_splats(
     each = usual_triangles_each()
     count = len(cloud) if max_triangles is None else max(1, max_triangles // each)
     _check_size(each * min(count, len(cloud)))
-    kept = simplify_in_blocks(cloud, count)
+    views = merging_views(cloud) if len(cloud) * each > COARSE_TRIANGLES else None
+    kept = simplify_in_blocks(cloud, count, cameras=views)
     mesh = convert(kept)
-    content = Content(mesh, kept.of_degree(0) if shown else None, _coarse(mesh, kept), kept=len(kept))
+    coarse = _coarse(mesh, kept, views)
+    content = Content(mesh, kept.of_degree(0) if shown else None, coarse, kept=len(kept))
     if kept is cloud:
         return content
     images = (render_splats(each, _camera(cloud, cameras)).color for each in (kept, cloud))
@@ -127,7 +130,8 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     _check_size(len(mesh.faces))
     if splats is None:
         return Content(mesh, None)
-    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats))
+    views = merging_views(splats) if len(mesh.faces) > COARSE_TRIANGLES else None
+    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats, views))
 
 
 def surface_or(load: Callable[[Any], Scene], path: str | os.PathLike[str]) -> Scene | BaseMesh:
@@ -200,12 +204,13 @@ def errors_in_words(result: dict[str, Any]) -> str:
     )
 
 
-def _coarse(mesh: SplatMesh, splats: GaussianCloud) -> SplatMesh | None:
-    """The coarse level of a mesh with many triangles, made of its splats."""
+def _coarse(mesh: SplatMesh, splats: GaussianCloud, views: Sequence[Camera] | None) -> SplatMesh | None:
+    """The coarse level of a mesh with many triangles, made of its splats, for ``views`` of a place."""
     if len(mesh.faces) <= COARSE_TRIANGLES:
         return None
     splats = splats.of_degree(min(mesh.sh_degree, splats.sh_degree))
-    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each()), up=mesh.up)
+    few = simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each(), cameras=views)
+    return convert(few, up=mesh.up)
 
 
 def _check_size(triangles: int) -> None:

@@ -1,0 +1,137 @@
+"""What splats count when similar ones are merged for cameras: the pixels that show them.
+
+A splat that others hide, or that lies where no camera looks, may become coarse: what is merged for a budget
+is then what nobody sees, not what is seen best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats._arrays import subsample
+from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.structures import NearestStruct
+from meshsplats.camera import Camera
+from meshsplats.conversion.driver import Driver
+from meshsplats.conversion.footprint import CameraCoverage, SceneSample, SceneViews
+from meshsplats.conversion.options import ConversionOptions
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.rendering.backward import TapeOptions
+from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.engine import scatter_to_vertices
+
+HIDDEN = 0.1
+"""What a splat counts that others hide from a camera, relative to one that nothing hides."""
+
+AROUND = 8
+"""A splat counts as visible as the most visible one of so many neighbours: what is merged just below a
+surface would come out of it, above all in fur."""
+
+CLEAREST = 2.0
+"""The most that it is taken to be visible, relative to a splat that nothing hides: images have noise."""
+
+ELSEWHERE = 0.005
+"""What a splat that no camera looks at counts, relative to one that all of them see from the nearest one."""
+
+NEAREST = 0.01
+"""Share of the splats that may be nearer to cameras than the distance from which on that counts."""
+
+MOST = 1_000_000
+"""Splats of which images are rendered to see what is hidden; in a larger cloud nothing counts as hidden."""
+
+IMAGES = 16
+SIDE = 400
+"""Number and side of these images, at most."""
+
+
+def pixels_of(
+    cloud: GaussianCloud, masses: np.ndarray, cameras: Sequence[Camera], threads: int | None = None
+) -> np.ndarray:
+    """(n,) float64 pixels of the mean image of ``cameras`` that splats with these ``masses`` (n,) count for:
+    those that show them, and a little more for those that do not.
+
+    Of more than ``MOST`` splats, the pixels that their masses cover are taken instead.
+    """
+    coverage = CameraCoverage(cloud.means, cameras)
+    covered = coverage.densities() * masses
+    square = np.full(len(cloud), np.inf, np.float32)
+    for camera in coverage.cameras:
+        away = cloud.means - camera.center.astype(np.float32)
+        np.minimum(square, np.einsum("ij,ij->i", away, away), out=square)
+    least = max(float(np.quantile(square, NEAREST)), float(np.finfo(np.float32).tiny))
+    focal = float(np.mean([camera.fx * camera.fy for camera in coverage.cameras]))
+    elsewhere = ELSEWHERE * focal * masses / np.maximum(square, np.float32(least))
+    if len(cloud) > MOST:
+        return covered + elsewhere
+    visible = _visible(cloud, masses > 0, coverage.cameras, threads)
+    shown = np.divide(visible, masses, out=np.zeros(len(cloud)), where=masses > 0)
+    clearest = np.minimum(_greatest_around(cloud.means, shown, threads) * masses, CLEAREST * covered)
+    return clearest + HIDDEN * covered + elsewhere
+
+
+def _greatest_around(means: np.ndarray, values: np.ndarray, threads: int | None) -> np.ndarray:
+    """(n,) greatest of the ``values`` (n,) of each splat and of its neighbours."""
+    neighbours = min(AROUND, len(means) - 1)
+    if neighbours < 1:
+        return values
+    order, near = nearest(means, neighbours, threads)
+    own = values[order]
+    result = np.empty(len(values))
+    result[order] = np.maximum(own, own[near].max(axis=1))
+    return result
+
+
+def _visible(
+    cloud: GaussianCloud, drawn: np.ndarray, cameras: Sequence[Camera], threads: int | None
+) -> np.ndarray:
+    """(n,) float64 pixels of the mean image of ``cameras`` that show each splat; 0 for those that are not
+    ``drawn`` (n,)."""
+    options = ConversionOptions(footprint="none", colors="base")
+    chosen = options.resolved("default", has_cameras=False)
+    up = np.array([0.0, 0.0, 1.0])  # of the mesh: nothing here depends on it
+    rows = np.flatnonzero(drawn).astype(np.int32)
+    part = cloud.of_degree(0).take(rows)
+    driver = Driver(chosen, SceneViews(SceneSample.of(part), chosen, None, up), up, cloud.origin)
+    piece = driver.sized(part, rows, None)
+    keep = driver.has_area(piece)
+    result = np.zeros(len(cloud))
+    if not keep.any():
+        return result
+    mesh = driver.mesh(piece, keep)
+    splats, engine = mesh.splats, CpuEngine(threads)
+    owner = splats.numbers[splats.of_vertex]
+    triangles = mesh.triangles._replace(values=np.zeros((len(owner), 1), np.float32))
+    some = subsample(cameras, IMAGES)
+    for own in some:
+        camera = own.within(SIDE).with_near_plane(mesh.vertices)
+        image = engine.tape(triangles, camera, TapeOptions((0, 0, 0)))
+        shown = scatter_to_vertices(image, np.ones((camera.height, camera.width, 1), np.float32))
+        scale = own.width * own.height / (camera.width * camera.height * len(some))
+        result += scale * np.bincount(owner, shown[:, 0], len(cloud))
+    return result
+
+
+def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The ``count`` nearest neighbours of each of ``points`` (n, 3) float64, n > count.
+
+    Returns:
+        (n,) int32 ``order`` of the points in which neighbours lie close to each other; and (n, count) int32:
+        row i holds the positions, in that order, of the neighbours of point ``order[i]``, nearest first.
+    """
+    points = np.ascontiguousarray(points, np.float64)
+    order = np.empty(len(points), np.int32)
+    found = np.empty((len(points), count), np.int32)
+    run(
+        "ms_nearest",
+        NearestStruct(
+            count=len(points),
+            neighbours=count,
+            threads=threads or processors(),
+            points=pointer(points),
+            order=pointer(order),
+            nearest=pointer(found),
+        ),
+    )
+    return order, found
