@@ -110,7 +110,7 @@ def test_coarse_levels_take_the_filter_that_is_nearest():
     cloud = make_scene(2000)
     finest, *_, coarse = plan_levels(2000, 3, width=80)
     targets = level_targets(cloud, coarse, sh_degree=0)
-    cameras = [view.camera for view in targets.test]
+    cameras = [view.camera for view in targets.views]
     mesh = make_level(cloud, coarse, targets)
     tried = {
         px2: convert(cloud, cameras=cameras, max_splats=125, footprint_px2=px2) for px2 in FOOTPRINTS_PX2
@@ -128,7 +128,7 @@ def test_coarse_levels_take_the_filter_that_is_nearest():
     assert min(errors, key=errors.get) == taken[0]
     # The finest one is that of convert, and so is a level with options.
     targets = level_targets(cloud, finest, sh_degree=0)
-    cameras = [view.camera for view in targets.test]
+    cameras = [view.camera for view in targets.views]
     for made, expected in (
         (make_level(cloud, finest, targets), convert(cloud, cameras=cameras)),
         (

@@ -22,7 +22,7 @@ from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import scatter_to_vertices
 
-HIDDEN = 0.1
+HIDDEN = 0.2
 """What a splat counts that others hide from a camera, relative to one that nothing hides."""
 
 AROUND = 8
@@ -41,7 +41,7 @@ NEAREST = 0.01
 MOST = 1_000_000
 """Splats of which images are rendered to see what is hidden; in a larger cloud nothing counts as hidden."""
 
-IMAGES = 16
+IMAGES = 8
 SIDE = 400
 """Number and side of these images, at most."""
 
@@ -88,7 +88,8 @@ def _visible(
 ) -> np.ndarray:
     """(n,) float64 pixels of the mean image of ``cameras`` that show each splat; 0 for those that are not
     ``drawn`` (n,)."""
-    options = ConversionOptions(footprint="none", colors="base")
+    # Round splats that are seen edge-on have neighbours that are not.
+    options = ConversionOptions(mode="flat", sides=4, footprint="none", colors="base")
     chosen = options.resolved("default", has_cameras=False)
     up = np.array([0.0, 0.0, 1.0])  # of the mesh: nothing here depends on it
     rows = np.flatnonzero(drawn).astype(np.int32)

@@ -1,0 +1,59 @@
+"""Views for which splats are merged where nobody names any."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshsplats import convert, orbit
+from meshsplats.cameras.framing import guess_up
+from meshsplats.conversion.merging_views import SIDE, VIEWS, convert_within_limits, merging_views
+from meshsplats.conversion.options import ConversionOptions
+from meshsplats.demo_scene import make_scene
+from meshsplats.demo_scene.room import HALF, MIDDLE, make_room
+
+
+@pytest.fixture(scope="module")
+def room():
+    return make_room(4000)
+
+
+def same(one, other):
+    for name in ("vertices", "faces", "colors", "harmonics", "up"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_an_object_is_seen_from_all_around():
+    cloud = make_scene(2000)
+    views = merging_views(cloud)
+    assert len(views) == VIEWS
+    assert {(view.width, view.height) for view in views} == {(SIDE, SIDE)}
+    heights = [(view.center - cloud.means.mean(axis=0)) @ guess_up(cloud) for view in views]
+    assert min(heights) < 0 < max(heights)
+
+
+def test_a_room_is_seen_from_within(room):
+    views = merging_views(room)
+    inside = [(np.abs(view.center - MIDDLE) < HALF).all() for view in views]
+    assert len(views) > VIEWS // 2
+    assert np.mean(inside) > 0.9
+
+
+def test_nothing_but_the_merging_follows_from_the_views(room):
+    limit = ConversionOptions(max_splats=700)
+    made = convert_within_limits(room, limit)
+    seen = {"cameras": merging_views(room), "up": guess_up(room)}
+    same(made, convert(room, limit, footprint="framing", **seen))
+    assert not np.array_equal(made.vertices, convert(room, limit).vertices)
+
+
+def test_without_merging_no_views_are_looked_for(room, monkeypatch):
+    monkeypatch.setattr("meshsplats.conversion.merging_views.merging_views", None)
+    same(convert_within_limits(room), convert(room))
+    generous = ConversionOptions(max_splats=len(room))
+    same(convert_within_limits(room, generous), convert(room))
+    dropping = ConversionOptions(max_splats=100, budget="drop")
+    same(convert_within_limits(room, dropping), convert(room, dropping))
+    cameras = orbit(room, 3, width=50, height=50)
+    limit = ConversionOptions(max_splats=700)
+    same(convert_within_limits(room, limit, cameras=cameras), convert(room, limit, cameras=cameras))
