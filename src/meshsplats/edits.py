@@ -15,10 +15,11 @@ from meshsplats._kinds import as_path
 from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
-from meshsplats.conversion import bake_filter, simplify
+from meshsplats.conversion import bake_filter
 from meshsplats.conversion.cleaning import Findings, find, remove, save_strip
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
+from meshsplats.conversion.merging import simplify_large
 from meshsplats.conversion.merging_views import merging_views
 from meshsplats.conversion.surroundings import floaters
 from meshsplats.datasets.scene_files import SceneReading
@@ -175,7 +176,7 @@ def simplify_file(
     start = time.perf_counter()
     if cameras is None and options.wanted(len(cloud)) < len(cloud):
         cameras = merging_views(cloud, threads=threads)
-    kept = simplify(cloud, options.wanted(len(cloud)), cameras=cameras, threads=threads)
+    kept = simplify_large(cloud, options.wanted(len(cloud)), cameras, threads)
     seconds = time.perf_counter() - start
     placed = own.place(kept)
     with together():

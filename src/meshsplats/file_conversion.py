@@ -15,8 +15,8 @@ from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
-from meshsplats.conversion import simplify
 from meshsplats.conversion.driver import worth_drawing
+from meshsplats.conversion.merging import simplify_large
 from meshsplats.conversion.merging_views import convert_within_limits, merging_views
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
@@ -208,7 +208,7 @@ class Converter:
             views = seen_from(cameras, job.source, kept.origin) or None
             if views is None and count < len(kept):
                 views = merging_views(kept, up=product.direction)
-            kept = simplify(kept, count, cameras=views)
+            kept = simplify_large(kept, count, views)
         result = self.callbacks.place(scaled(kept, product.scale))
         with self._recorded(job):
             kinds = [written_ending(path.name) for path in job.outputs]

@@ -7,6 +7,7 @@ import pytest
 
 from meshsplats import convert, orbit
 from meshsplats.cameras.framing import guess_up
+from meshsplats.conversion import merging
 from meshsplats.conversion.merging_views import SIDE, VIEWS, convert_within_limits, merging_views
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.demo_scene import make_scene
@@ -57,3 +58,14 @@ def test_without_merging_no_views_are_looked_for(room, monkeypatch):
     cameras = orbit(room, 3, width=50, height=50)
     limit = ConversionOptions(max_splats=700)
     same(convert_within_limits(room, limit, cameras=cameras), convert(room, limit, cameras=cameras))
+
+
+def test_many_splats_are_merged_in_blocks(room, monkeypatch):
+    monkeypatch.setattr(merging, "LARGE", 1000)
+    monkeypatch.setitem(merging.simplify_in_blocks.__kwdefaults__, "block", 500)
+    views = merging_views(room)[:8]
+    many = merging.simplify_large(room, 800, views)
+    np.testing.assert_array_equal(many.means, merging.simplify_in_blocks(room, 800, cameras=views).means)
+    assert not np.array_equal(many.means, merging.simplify(room, 800, cameras=views).means)
+    alone = merging.simplify_large(room, 800, None)
+    np.testing.assert_array_equal(alone.means, merging.simplify(room, 800).means)

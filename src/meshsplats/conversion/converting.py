@@ -17,7 +17,7 @@ from meshsplats.conversion.detail import FIRST_STAR, LEVELS, OnImage, choose_lev
 from meshsplats.conversion.driver import Driver, drawn_part, filter_of, worth_drawing
 from meshsplats.conversion.fan_sizes import ellipse
 from meshsplats.conversion.footprint import SceneSample, SceneViews
-from meshsplats.conversion.merging import simplify
+from meshsplats.conversion.merging import simplify_large
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
 from meshsplats.conversion.selection import most_important, refuse_empty_box, within
 from meshsplats.conversion.stars import STARS
@@ -90,7 +90,7 @@ def convert(
     chosen, count = within_limits(given, chosen, len(part))
     whole = part
     if chosen.budget == "merge" and count < len(part):
-        cloud = part = simplify(part, count, cameras=cameras)
+        cloud = part = simplify_large(part, count, cameras)
         rows = np.arange(count, dtype=np.int32)
     views = SceneViews(SceneSample.of(part), chosen, cameras, direction, whole=True)
     driver = Driver(chosen, views, direction, cloud.origin, filter_px2)
