@@ -103,11 +103,10 @@ def simplify(
         return cloud
     if low_pass is None:
         low_pass = _usual_low_pass(cloud, cameras)
-    counted = None
+    width, counted = _checked_width(low_pass, len(cloud)), None
     if cameras:
-        width = np.broadcast_to(np.asarray(low_pass, np.float64), len(cloud))
         counted = pixels_of(cloud, _masses(cloud, width), cameras, threads)
-    return merge(cloud, count, low_pass, counted, threads).cloud
+    return merge(cloud, count, width, counted, threads).cloud
 
 
 def simplify_large(
@@ -200,13 +199,18 @@ def merge(
     n = len(cloud)
     if n > np.iinfo(np.int32).max:
         raise ValueError(f"at most 2^31 - 1 splats can be merged, got {n}")
-    width = np.asarray(low_pass, np.float64)
-    if width.shape not in ((), (n,)) or not np.isfinite(width).all() or (width < 0).any():
-        raise ValueError(f"low_pass must be one number >= 0, or one for each of the {n} splats")
-    width = np.broadcast_to(width, (n,))
+    width = _checked_width(low_pass, n)
     masses = _masses(cloud, width)
     group = _groups(cloud, masses if counted is None else counted, width, int(count), threads or processors())
     return Merged(_merged(cloud, masses, width, group), group, masses)
+
+
+def _checked_width(low_pass: float | np.ndarray, n: int) -> np.ndarray:
+    """(n,) float64. ValueError for other than one number >= 0, or one for each of the n splats."""
+    width = np.asarray(low_pass, np.float64)
+    if width.shape not in ((), (n,)) or not np.isfinite(width).all() or (width < 0).any():
+        raise ValueError(f"low_pass must be one number >= 0, or one for each of the {n} splats")
+    return np.broadcast_to(width, (n,))
 
 
 def _masses(cloud: GaussianCloud, low_pass: np.ndarray) -> np.ndarray:

@@ -24,6 +24,18 @@ VIEWS, SIDE = 32, 800
 """Number of views and side of their images in pixels."""
 
 
+def views_of_place(
+    cloud: GaussianCloud,
+    source: Path | None = None,
+    *,
+    up: np.ndarray | None = None,
+    threads: int | None = None,
+) -> list[Camera] | None:
+    """``merging_views`` of a scene that is no object; None for one."""
+    found = default_views(cloud, source, VIEWS, side=(SIDE, SIDE), up=up, threads=threads)
+    return None if found is None else found[0]
+
+
 def merging_views(
     cloud: GaussianCloud,
     source: Path | None = None,
@@ -38,9 +50,9 @@ def merging_views(
         up: (3,) direction, where the user names it.
         threads: at most this many; all processors by default.
     """
-    found = default_views(cloud, source, VIEWS, side=(SIDE, SIDE), up=up, threads=threads)
-    if found is not None:
-        return found[0]
+    views = views_of_place(cloud, source, up=up, threads=threads)
+    if views is not None:
+        return views
     toward = guess_up(cloud) if up is None else unit_up(up)
     return list(dome(cloud, VIEWS, whole=True, up=toward, width=SIDE, height=SIDE))
 

@@ -17,7 +17,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
-from meshsplats.conversion.merging_views import merging_views
+from meshsplats.conversion.merging_views import merging_views, views_of_place
 from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.base_meshes import load_base
@@ -113,7 +113,11 @@ def content_of_splats(
     each = usual_triangles_each()
     count = len(cloud) if max_triangles is None else max(1, max_triangles // each)
     _check_size(each * min(count, len(cloud)))
-    views = merging_views(cloud) if len(cloud) * each > COARSE_TRIANGLES else None
+    views = None
+    if count < len(cloud):
+        views = merging_views(cloud)
+    elif each * len(cloud) > COARSE_TRIANGLES:
+        views = views_of_place(cloud)  # an object is shown coarsely while it moves only
     kept = simplify_in_blocks(cloud, count, cameras=views)
     mesh = convert(kept)
     coarse = _coarse(mesh, kept, views)
@@ -130,7 +134,7 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     _check_size(len(mesh.faces))
     if splats is None:
         return Content(mesh, None)
-    views = merging_views(splats) if len(mesh.faces) > COARSE_TRIANGLES else None
+    views = views_of_place(splats) if len(mesh.faces) > COARSE_TRIANGLES else None
     return Content(mesh, splats.of_degree(0), _coarse(mesh, splats, views))
 
 

@@ -12,6 +12,7 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.conversion.cleaning import cropped
+from meshsplats.conversion.merging_views import VIEWS
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import MissingOfData, check_photographs
@@ -195,8 +196,9 @@ def _cameras(
     first = [] if opening is None else [opening]
     if beside is not None:
         return [*first, *beside]
-    found = default_views(scene, source, FOUND_VIEWS, up=optional_up(options.up))
+    # As many as splats are merged for: looking for them once is enough.
+    found = default_views(scene, source, max(FOUND_VIEWS, VIEWS), up=optional_up(options.up))
     if found is None:
         return first
     say(found[1])
-    return found[0]
+    return found[0][:FOUND_VIEWS]
