@@ -445,7 +445,7 @@ def test_the_image_is_that_of_the_whole_mesh(splats, tileset):
         assert psnr(fine.color, whole.color) > 60
         np.testing.assert_allclose(fine.mean_depth(empty=0), whole.mean_depth(empty=0), rtol=0.02)
         assert psnr(render_tiles(found, camera, samples=2).color, whole.color) > 40
-    far = orbit(mesh, 1, elevation=20, width=120, height=90, distance=4)[0]
+    far = orbit(mesh, 1, elevation=20, width=120, height=90, distance=8)[0]
     tiles, worst = choose_tiles(found, [far])
     assert worst <= 1
     assert sum(tile.triangles for tile in tiles) < 0.3 * len(mesh.faces)

@@ -378,7 +378,7 @@ def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys, monkeyp
             searches.append(find_cameras(*arguments, **options))
         return searches[0]
 
-    monkeypatch.setattr("meshsplats.cli.cameras.find_cameras", once)
+    monkeypatch.setattr("meshsplats.viewpoints.finding.find_cameras", once)
     save_gaussians(room(4000, 600), tmp_path / "room.ply")
     out = tmp_path / "cameras.json"
     options = ["--count", "3", "--width", "64", "--height", "48", "--threads", "2"]
