@@ -8,8 +8,9 @@ called.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from meshsplats._lazy import lazy_names
 
 if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at run time
     from meshsplats.base_mesh import BaseMesh
@@ -206,15 +207,12 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:  # a checker would take any name for one that this finds
+    _loaded = lazy_names(__name__, _HOME)
 
     def __getattr__(name: str) -> Any:
-        if name == "__version__":
-            value = _version()
-        elif name in _MODULES:
-            value = getattr(importlib.import_module(_MODULES[name]), name)
-        else:
-            raise AttributeError(f"module 'meshsplats' has no attribute {name!r}")
-        globals()[name] = value
+        if name != "__version__":
+            return _loaded(name)
+        globals()[name] = value = _version()
         return value
 
 

@@ -19,8 +19,7 @@ from meshsplats.conversion import bake_filter
 from meshsplats.conversion.cleaning import Findings, find, remove, save_strip
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
-from meshsplats.conversion.merging import simplify_large
-from meshsplats.conversion.merging_views import merging_views
+from meshsplats.conversion.merging_views import simplify_for_views
 from meshsplats.conversion.surroundings import floaters
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import cameras_named
@@ -174,9 +173,7 @@ def simplify_file(
     if cameras is None:
         cameras = cameras_beside(source, cloud.origin)
     start = time.perf_counter()
-    if cameras is None and options.wanted(len(cloud)) < len(cloud):
-        cameras = merging_views(cloud, threads=threads)
-    kept = simplify_large(cloud, options.wanted(len(cloud)), cameras, threads)
+    kept = simplify_for_views(cloud, options.wanted(len(cloud)), cameras, threads=threads)
     seconds = time.perf_counter() - start
     placed = own.place(kept)
     with together():

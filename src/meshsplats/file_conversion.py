@@ -16,8 +16,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
 from meshsplats.conversion.driver import worth_drawing
-from meshsplats.conversion.merging import simplify_large
-from meshsplats.conversion.merging_views import convert_within_limits, merging_views
+from meshsplats.conversion.merging_views import convert_within_limits, simplify_for_views
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.errors import FileFormatError
@@ -205,10 +204,8 @@ class Converter:
             max_splats=None if merging else count,
         )
         if merging and count is not None:
-            views = seen_from(cameras, job.source, kept.origin) or None
-            if views is None and count < len(kept):
-                views = merging_views(kept, up=product.direction)
-            kept = simplify_large(kept, count, views)
+            seen = seen_from(cameras, job.source, kept.origin)
+            kept = simplify_for_views(kept, count, seen, up=product.direction)
         result = self.callbacks.place(scaled(kept, product.scale))
         with self._recorded(job):
             kinds = [written_ending(path.name) for path in job.outputs]

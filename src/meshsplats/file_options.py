@@ -42,8 +42,8 @@ class SimplifyOptions:
     """Share of the splats to keep, above 0 to 1: 0.25 keeps a quarter."""
     cameras: Path | None = None
     """Cameras that the splats will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
-    folder that has one. Detail finer than their pixels goes first. Default: those of the input if it is a
-    model folder, else images of 1000 pixels that hold the subject."""
+    folder that has one. What they do not see, and detail finer than their pixels, goes first. Default: those
+    of the input if it is a model folder, else found ones of a place, and some all around an object."""
     data: Path | None = None
     """Data set of photographs, in place of ``cameras``: the cameras of its training views."""
     missing: MissingOfData = "few"

@@ -46,7 +46,8 @@ class Product:
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
     cameras: Path | None = None
     """Cameras that the mesh will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
-    folder that has one. Default: those of the input if it is a model folder, else none."""
+    folder that has one. Default: those of the input if it is a model folder, else none; limits then keep what
+    found views of a place show, or views from all around an object."""
     data: Path | None = None
     """Data set of photographs, in place of ``cameras``: the cameras of its training views."""
     missing: MissingOfData = "few"

@@ -51,7 +51,7 @@ def test_even_light_shows_the_unlit_image(ball, tmp_path):
     unlit = render(mesh, view, samples=2)
     inside = unlit.alpha > 0.02
     assert np.sqrt(np.square(lit - unlit.color)[inside].mean()) < 0.04
-    assert np.abs(light_of(made.obj) - 1).max() < 0.03, "nothing shades a ball"
+    assert np.abs(light_of(made.obj) - 1).max() < 0.04, "nothing shades a ball"
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ def test_splats_look_like_the_surface_they_were_taken_from(ball):
     splats, solid, _, covered = ball
     assert psnr(display(splats), display(solid)) > 29
     inside = covered > 0.99
-    assert 0.95 < splats[inside].mean() / solid[inside].mean() < 1.03
+    assert 0.94 < splats[inside].mean() / solid[inside].mean() < 1.03
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, convert, load_gaussians, orbit, psnr, render, render_splats, simplify
+from meshsplats._core.neighbours import nearest
 from meshsplats._core.structures import MergingStruct
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.conversion import ConversionOptions, merging, merging_weights
@@ -22,7 +23,7 @@ from meshsplats.conversion.merging import (
     optical_depth,
     simplify_in_blocks,
 )
-from meshsplats.conversion.merging_weights import AROUND, ELSEWHERE, HIDDEN, nearest, pixels_of
+from meshsplats.conversion.merging_weights import AROUND, ELSEWHERE, HIDDEN, pixels_of
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.room import MIDDLE, make_room
@@ -558,7 +559,8 @@ class TestCameras:
         cloud = GaussianCloud.joined([pairs, wall])
         camera = look_at([0, 0, 0], [0, 0, 1], width=128, height=128, fov=50)
         counted = pixels_of(cloud, masses(cloud), [camera])
-        blind, seen = (merging.merge(cloud, len(cloud) - 6, 0.0, counts).group for counts in (None, counted))
+        own, count, thin = masses(cloud), len(cloud) - 6, np.zeros(len(cloud))
+        blind, seen = (merging._merge(cloud, count, thin, own, c, None).group for c in (own, counted))
         together = [[i for i in range(0, 24, 2) if group[i] == group[i + 1]] for group in (blind, seen)]
         assert min(together[0]) < 12
         assert together[1] == [12, 14, 16, 18, 20, 22]

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from meshsplats import Camera, GaussianCloud, SplatMesh, draw_splats, render, render_splats, simplify
 from meshsplats._core.kernels import AdamStep, adam_rows, compare_images, round_fans
-from meshsplats.conversion.merging_weights import nearest
+from meshsplats._core.neighbours import nearest
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, TapeOptions
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.ordering import drawing_order

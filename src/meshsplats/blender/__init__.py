@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from meshsplats._lazy import lazy_names
 from meshsplats.blender.levels import LevelMeshes
 from meshsplats.blender.options import MAX_LAYERS, Engine, Ground, LightOptions, SceneOptions
 from meshsplats.camera import Camera
@@ -37,12 +38,8 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("BlenderError", "Progress"):
-        from meshsplats.blender import launch
-
-        return getattr(launch, name)
-    raise AttributeError(f"module 'meshsplats.blender' has no attribute {name!r}")
+if not TYPE_CHECKING:
+    __getattr__ = lazy_names(__name__, {"meshsplats.blender.launch": ("BlenderError", "Progress")})
 
 
 def draw(

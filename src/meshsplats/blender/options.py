@@ -116,7 +116,7 @@ class Effort:
 
 
 CAREFUL = Effort()
-FAST = Effort(steps=9, fit_views=4, normal_views=8, surface_views=12, resolution=48, samples=4)
+FAST = Effort(steps=12, fit_views=4, normal_views=8, surface_views=12, resolution=48, samples=4)
 """For previews: see docs/blender.md for what it costs and loses."""
 FAST_SPLATS, FAST_SAMPLES = 30_000, 4
 """What the command's previews have by default."""

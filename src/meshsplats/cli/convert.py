@@ -183,7 +183,6 @@ class Convert(Command):
 
     def _convert(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Does ``job``; its result, for JSON."""
-
         import meshsplats
 
         with warnings_kept() as warned, job.claimed(self.force):

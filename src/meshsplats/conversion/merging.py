@@ -18,13 +18,14 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.neighbours import nearest
 from meshsplats._core.structures import MergingStruct
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import SceneSample, SceneViews, widen
-from meshsplats.conversion.merging_weights import nearest, pixels_of
+from meshsplats.conversion.merging_weights import pixels_of
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import GaussianCloud
@@ -103,10 +104,10 @@ def simplify(
         return cloud
     if low_pass is None:
         low_pass = _usual_low_pass(cloud, cameras)
-    width, counted = _checked_width(low_pass, len(cloud)), None
-    if cameras:
-        counted = pixels_of(cloud, _masses(cloud, width), cameras, threads)
-    return merge(cloud, count, width, counted, threads).cloud
+    width = _checked_width(low_pass, len(cloud))
+    masses = _masses(cloud, width)
+    counted = pixels_of(cloud, masses, cameras, threads) if cameras else masses
+    return _merge(cloud, count, width, masses, counted, threads).cloud
 
 
 def simplify_large(
@@ -136,10 +137,11 @@ def simplify_in_blocks(
     if len(cloud) <= block or count >= len(cloud):
         return simplify(cloud, count, cameras=cameras, threads=threads)
     low_pass = _usual_low_pass(cloud, cameras)
-    counted = None if not cameras else pixels_of(cloud, _masses(cloud, low_pass), cameras, threads)
+    masses = _masses(cloud, low_pass)
+    counted = pixels_of(cloud, masses, cameras, threads) if cameras else masses
     blocks = _blocks(cloud.means, np.arange(len(cloud)), block)
     visible = np.array([(cloud.opacities[rows] >= MIN_OPACITY).sum() for rows in blocks])
-    wanted = visible if counted is None else np.array([counted[rows].sum() for rows in blocks])
+    wanted = np.array([counted[rows].sum() for rows in blocks]) if cameras else visible
     shares = _shares(wanted, visible, max(count, FEWEST_OF_BLOCK * len(blocks)))
     parts = []
     for rows, share in zip(blocks, shares.tolist(), strict=True):
@@ -147,8 +149,8 @@ def simplify_in_blocks(
         if share >= len(part):
             parts.append(part)
         elif share:
-            own = None if counted is None else counted[rows]
-            parts.append(merge(part, share, low_pass[rows], own, threads).cloud)
+            own = (low_pass[rows], masses[rows], counted[rows])
+            parts.append(_merge(part, share, *own, threads).cloud)
     # What is left over is the least of each block: few of all.
     return simplify(GaussianCloud.joined(parts), count, threads=threads)
 
@@ -187,22 +189,28 @@ class Merged(NamedTuple):
     """(n,) float64 masses of the old splats, >= 0."""
 
 
-def merge(
+def merge(cloud: GaussianCloud, count: int, low_pass: np.ndarray, threads: int | None = None) -> Merged:
+    """``simplify`` for ``count`` less than the number of splats and ``low_pass`` (n,) float64, which it has
+    checked, without cameras."""
+    masses = _masses(cloud, low_pass)
+    return _merge(cloud, count, low_pass, masses, masses, threads)
+
+
+def _merge(
     cloud: GaussianCloud,
     count: int,
-    low_pass: float | np.ndarray,
-    counted: np.ndarray | None = None,
-    threads: int | None = None,
+    low_pass: np.ndarray,
+    masses: np.ndarray,
+    counted: np.ndarray,
+    threads: int | None,
 ) -> Merged:
-    """``simplify`` for ``count`` less than the number of splats, which it has checked. ``counted``: (n,) what
-    each splat counts, > 0 if it is ever drawn; None: its mass."""
+    """``merge`` of splats with these ``masses`` (n,), of which each counts as ``counted`` (n,), > 0 if it is
+    ever drawn."""
     n = len(cloud)
     if n > np.iinfo(np.int32).max:
         raise ValueError(f"at most 2^31 - 1 splats can be merged, got {n}")
-    width = _checked_width(low_pass, n)
-    masses = _masses(cloud, width)
-    group = _groups(cloud, masses if counted is None else counted, width, int(count), threads or processors())
-    return Merged(_merged(cloud, masses, width, group), group, masses)
+    group = _groups(cloud, counted, low_pass, int(count), threads or processors())
+    return Merged(_merged(cloud, masses, low_pass, group), group, masses)
 
 
 def _checked_width(low_pass: float | np.ndarray, n: int) -> np.ndarray:
@@ -251,7 +259,7 @@ def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> n
     views = SceneViews(SceneSample.of(cloud), source, cameras, guess_up(cloud, cameras), whole=True)
     pixel = views.pixel_sizes(cloud.means)
     assert pixel is not None
-    return np.sqrt(px2) * pixel
+    return np.sqrt(px2) * pixel.astype(np.float64)
 
 
 def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:

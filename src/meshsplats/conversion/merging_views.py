@@ -15,6 +15,7 @@ from meshsplats.cameras.trajectories import dome
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.converting import convert
 from meshsplats.conversion.driver import worth_drawing
+from meshsplats.conversion.merging import simplify_large
 from meshsplats.conversion.options import ConversionOptions, Preset
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -55,6 +56,21 @@ def merging_views(
         return views
     toward = guess_up(cloud) if up is None else unit_up(up)
     return list(dome(cloud, VIEWS, whole=True, up=toward, width=SIDE, height=SIDE))
+
+
+def simplify_for_views(
+    cloud: GaussianCloud,
+    count: int,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    up: np.ndarray | None = None,
+    threads: int | None = None,
+) -> GaussianCloud:
+    """``simplify_large``; without ``cameras`` for ``merging_views``."""
+    if count >= len(cloud):
+        return cloud
+    views = cameras or merging_views(cloud, up=up, threads=threads)
+    return simplify_large(cloud, count, views, threads)
 
 
 def convert_within_limits(

@@ -11,16 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats._core.library import pointer, processors, run
-from meshsplats._core.structures import NearestStruct
+from meshsplats._core.neighbours import nearest
 from meshsplats.camera import Camera
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import CameraCoverage, SceneSample, SceneViews
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
-from meshsplats.rendering.engine import scatter_to_vertices
+from meshsplats.rendering.engine import visible_pixels
 
 HIDDEN = 0.2
 """What a splat counts that others hide from a camera, relative to one that nothing hides."""
@@ -103,36 +101,10 @@ def _visible(
     mesh = driver.mesh(piece, keep)
     splats, engine = mesh.splats, CpuEngine(threads)
     owner = splats.numbers[splats.of_vertex]
-    triangles = mesh.triangles._replace(values=np.zeros((len(owner), 1), np.float32))
     some = subsample(cameras, IMAGES)
     for own in some:
         camera = own.within(SIDE).with_near_plane(mesh.vertices)
-        image = engine.tape(triangles, camera, TapeOptions((0, 0, 0)))
-        shown = scatter_to_vertices(image, np.ones((camera.height, camera.width, 1), np.float32))
+        shown = visible_pixels(engine, mesh.triangles, camera)
         scale = own.width * own.height / (camera.width * camera.height * len(some))
-        result += scale * np.bincount(owner, shown[:, 0], len(cloud))
+        result += scale * np.bincount(owner, shown, len(cloud))
     return result
-
-
-def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The ``count`` nearest neighbours of each of ``points`` (n, 3) float64, n > count.
-
-    Returns:
-        (n,) int32 ``order`` of the points in which neighbours lie close to each other; and (n, count) int32:
-        row i holds the positions, in that order, of the neighbours of point ``order[i]``, nearest first.
-    """
-    points = np.ascontiguousarray(points, np.float64)
-    order = np.empty(len(points), np.int32)
-    found = np.empty((len(points), count), np.int32)
-    run(
-        "ms_nearest",
-        NearestStruct(
-            count=len(points),
-            neighbours=count,
-            threads=threads or processors(),
-            points=pointer(points),
-            order=pointer(order),
-            nearest=pointer(found),
-        ),
-    )
-    return order, found

@@ -103,24 +103,22 @@ def content_of_splats(
     *,
     max_triangles: int | None = None,
     shown: bool = True,
+    up: np.ndarray | None = None,
 ) -> Content:
     """The content of a page of splats, merged until their mesh has at most ``max_triangles``.
 
-    ``cameras``: where they are seen from. ``shown``: whether the splats are in the page, too.
+    ``cameras``: where they are seen from. ``shown``: whether the splats are in the page, too. ``up``: (3,)
+    direction, where the user names it.
 
     Raises TooManyTrianglesError above ``MOST_TRIANGLES``.
     """
     each = usual_triangles_each()
     count = len(cloud) if max_triangles is None else max(1, max_triangles // each)
     _check_size(each * min(count, len(cloud)))
-    views = None
-    if count < len(cloud):
-        views = merging_views(cloud)
-    elif each * len(cloud) > COARSE_TRIANGLES:
-        views = views_of_place(cloud)  # an object is shown coarsely while it moves only
+    views = merging_views(cloud, up=up) if count < len(cloud) else None
     kept = simplify_in_blocks(cloud, count, cameras=views)
     mesh = convert(kept)
-    coarse = _coarse(mesh, kept, views)
+    coarse = _coarse(mesh, kept, views, up)
     content = Content(mesh, kept.of_degree(0) if shown else None, coarse, kept=len(kept))
     if kept is cloud:
         return content
@@ -134,8 +132,7 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     _check_size(len(mesh.faces))
     if splats is None:
         return Content(mesh, None)
-    views = views_of_place(splats) if len(mesh.faces) > COARSE_TRIANGLES else None
-    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats, views))
+    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats))
 
 
 def surface_or(load: Callable[[Any], Scene], path: str | os.PathLike[str]) -> Scene | BaseMesh:
@@ -208,10 +205,17 @@ def errors_in_words(result: dict[str, Any]) -> str:
     )
 
 
-def _coarse(mesh: SplatMesh, splats: GaussianCloud, views: Sequence[Camera] | None) -> SplatMesh | None:
-    """The coarse level of a mesh with many triangles, made of its splats, for ``views`` of a place."""
+def _coarse(
+    mesh: SplatMesh,
+    splats: GaussianCloud,
+    views: Sequence[Camera] | None = None,
+    up: np.ndarray | None = None,
+) -> SplatMesh | None:
+    """The coarse level of a mesh with many triangles, made of its splats, for ``views``: by default those of
+    a place. An object is shown so while it moves only."""
     if len(mesh.faces) <= COARSE_TRIANGLES:
         return None
+    views = views or views_of_place(splats, up=up)
     splats = splats.of_degree(min(mesh.sh_degree, splats.sh_degree))
     few = simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each(), cameras=views)
     return convert(few, up=mesh.up)

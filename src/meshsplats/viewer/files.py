@@ -165,7 +165,8 @@ def _content(scene: Shown, options: ViewingOptions, cameras: Sequence[Camera]) -
             advice = "leave ``whole`` out, or make 'meshsplats tiles'"
             most = None if options.whole else options.max_triangles or content.TRIANGLES
             shown = not options.without_splats
-            made = content_of_splats(scene, cameras, max_triangles=most, shown=shown)
+            up = optional_up(options.up)
+            made = content_of_splats(scene, cameras, max_triangles=most, shown=shown, up=up)
             return replace(made, surface=beside)
         advice = "fine-tune it with ``max_triangles``, or make 'meshsplats tiles'"
         splats = None

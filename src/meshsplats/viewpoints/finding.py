@@ -104,7 +104,9 @@ class _Search:
 
 _searched: WeakKeyDictionary[GaussianCloud, _Search] = WeakKeyDictionary()
 """The last search within each scene that is in use: commands ask for views of several sizes and numbers."""
-_outsides: WeakKeyDictionary[GaussianCloud, tuple[_Key, tuple[Kind | None, float]]] = WeakKeyDictionary()
+_Outside = tuple[Relief | None, Kind | None, float]
+"""The relief that a scene is, or else what ``kind_from_outside`` says of it."""
+_outsides: WeakKeyDictionary[GaussianCloud, tuple[_Key, _Outside]] = WeakKeyDictionary()
 """And what it looked like from outside, also where it is an object, in which nothing is searched."""
 
 
@@ -145,12 +147,12 @@ def find_cameras(
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     given, first_up = _told_up(cloud, up)
-    if (relief := find_relief(cloud, first_up)) is not None:
-        return _before(cloud, relief, given, count, width, height)
     key, wanted = (_fingerprint(cloud), None if given is None else given.tobytes()), min(count, MOST)
     found = _searched.get(cloud)
     if found is None or found.key != key or found.wanted < wanted or not (anywhere or found.is_place):
-        kind, confidence = _from_outside(cloud, key, first_up, threads)
+        relief, kind, confidence = _from_outside(cloud, key, first_up, threads)
+        if relief is not None:
+            return _before(cloud, relief, given, count, width, height)
         if kind == "object" and not anywhere:
             return _around(cloud, confidence, given, count, width, height)
         if not cloud.opacities.any():
@@ -208,13 +210,17 @@ def _told_up(
     return given, guess_up(cloud) if given is None else given
 
 
-def _from_outside(
-    cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int | None
-) -> tuple[Kind | None, float]:
-    """As ``kind_from_outside``, which looks once at splats that did not change."""
+def _from_outside(cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int | None) -> _Outside:
+    """What splats look like from outside. It looks once at splats that did not change."""
     known = _outsides.get(cloud)
     if known is None or known[0] != key:
-        known = _outsides[cloud] = key, kind_from_outside(cloud, up, threads)
+        relief = find_relief(cloud, up)
+        seen: _Outside = (
+            (None, *kind_from_outside(cloud, up, threads))
+            if relief is None
+            else (relief, "relief", relief.confidence)
+        )
+        known = _outsides[cloud] = key, seen
     return known[1]
 
 
