@@ -15,7 +15,7 @@ from meshsplats import GaussianCloud, convert, load_gaussians, orbit, psnr, rend
 from meshsplats._core.neighbours import nearest
 from meshsplats._core.structures import MergingStruct
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.conversion import ConversionOptions, merging, merging_weights
+from meshsplats.conversion import ConversionOptions, merging, merging_groups, merging_weights
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.merging import (
     FEWEST_OF_BLOCK,
@@ -23,6 +23,7 @@ from meshsplats.conversion.merging import (
     optical_depth,
     simplify_in_blocks,
 )
+from meshsplats.conversion.merging_groups import Moments, clumps
 from meshsplats.conversion.merging_weights import AROUND, ELSEWHERE, HIDDEN, pixels_of
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.demo_scene import make_scene
@@ -263,7 +264,7 @@ class TestTwins:
         mass, colors = rng.uniform(0.1, 2, n), rng.uniform(0, 1, (n, 3))
         upper = spread[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         for wanted in (6, 3, 1):
-            group, left = merging._merge_neighbours(merging._Moments(means, upper, mass, colors), wanted, 1)
+            group, left = merging_groups._merge_neighbours(Moments(means, upper, mass, colors), wanted, 1)
             assert left == wanted
             members = {frozenset(np.flatnonzero(group == g)) for g in range(left)}
             assert members == greedy(means, spread, mass, colors, wanted)
@@ -274,20 +275,20 @@ class TestTwins:
         found = np.empty(4, np.int32)
         zeros = np.zeros((4, 6))
         with pytest.raises(ValueError, match="neighbour 9 of 0 is not another of 4"):
-            merging.run(
+            merging_groups.run(
                 "ms_merge_pairs",
                 MergingStruct(
                     count=4,
                     wanted=1,
                     neighbours=2,
                     threads=1,
-                    means=merging.pointer(points),
-                    covariances=merging.pointer(zeros),
-                    masses=merging.pointer(zeros),
-                    colors=merging.pointer(points),
-                    nearest=merging.pointer(wrong),
+                    means=merging_groups.pointer(points),
+                    covariances=merging_groups.pointer(zeros),
+                    masses=merging_groups.pointer(zeros),
+                    colors=merging_groups.pointer(points),
+                    nearest=merging_groups.pointer(wrong),
                     color_weight=1.0,
-                    group=merging.pointer(found),
+                    group=merging_groups.pointer(found),
                 ),
             )
 
@@ -646,3 +647,55 @@ class TestShares:
         assert shares.sum() <= total + FEWEST_OF_BLOCK * len(visible) + len(visible)
         even = merging._shares(np.array(visible), np.array(visible), total)
         assert abs(even - np.array(visible) * total / max(sum(visible), 1)).max() <= FEWEST_OF_BLOCK + 1
+
+
+class TestClumps:
+    """Cells of an octree that are put together before pairs are merged."""
+
+    def test_by_hand(self):
+        """Two corners of a cube: three points in one cell, of which two share a finer one."""
+        points = np.array([[9.0, 9, 9], [0, 0, 0], [0.1, 0, 0], [3, 3, 3], [10, 10, 10]])
+        masses = np.array([1.0, 1, 1, 1, 1])
+        assert clumps(points, masses, 5.0).tolist() == [0, 0, 0, 0, 0]
+        assert clumps(points, masses, 3.0).tolist() == [0, 1, 1, 1, 0]
+        assert clumps(points, masses, 2.0).tolist() == [0, 1, 1, 2, 0]
+        assert clumps(points, masses, 0.5).tolist() == [0, 1, 2, 3, 4]
+
+    @given(n=st.integers(1, 400), seed=st.integers(0, 99), share=st.floats(0.001, 1))
+    def test_laws(self, n, seed, share):
+        """No group counts more than it may, but those of one splat; and none lies inside another's cell."""
+        rng = np.random.default_rng(seed)
+        points, masses = rng.normal(size=(n, 3)), rng.exponential(size=n)
+        most = share * masses.sum() * (1 + 1e-9)
+        group = clumps(points, masses, most)
+        first = np.unique(group, return_index=True)[1]
+        assert (np.diff(first) > 0).all()
+        assert len(first) == group.max() + 1
+        sums, sizes = np.bincount(group, masses), np.bincount(group)
+        assert (sums[sizes > 1] <= most * (1 + 1e-9)).all()
+        if share == 1:
+            assert len(sums) == 1
+
+    def test_far_fewer_splats_are_as_good(self, monkeypatch):
+        """Of every 40 splats one is left: as good as pair by pair, and what counts much stays alone."""
+        cloud = make_room(20_000)
+        views = look_around(cloud)
+        made = simplify(cloud, 500, cameras=views)
+        monkeypatch.setattr(merging_groups, "CLUMPED", 10**9)
+        pairs = simplify(cloud, 500, cameras=views)
+        assert len(made) == len(pairs) == 500
+        assert not np.array_equal(made.means, pairs.means)
+
+        def likeness(few):
+            return np.mean([psnr(shown(few, view), shown(cloud, view)) for view in views])
+
+        assert likeness(made) > likeness(pairs) - 0.3
+
+
+def look_around(cloud):
+    ahead = [np.array([np.cos(a), np.sin(a), 0]) for a in range(6)]
+    return [look_at(MIDDLE, MIDDLE + a, width=120, height=90) for a in ahead]
+
+
+def shown(cloud, view):
+    return render_splats(cloud, view, background=(0, 0, 0)).color.clip(0, 1)

@@ -8,7 +8,13 @@ import pytest
 from meshsplats import convert, orbit
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import merging
-from meshsplats.conversion.merging_views import SIDE, VIEWS, convert_within_limits, merging_views
+from meshsplats.conversion.merging_views import (
+    SIDE,
+    VIEWS,
+    convert_within_limits,
+    merged_within_limits,
+    merging_views,
+)
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.room import HALF, MIDDLE, make_room
@@ -69,3 +75,29 @@ def test_many_splats_are_merged_in_blocks(room, monkeypatch):
     assert not np.array_equal(many.means, merging.simplify(room, 800, cameras=views).means)
     alone = merging.simplify_large(room, 800, None)
     np.testing.assert_array_equal(alone.means, merging.simplify(room, 800).means)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        ConversionOptions(max_splats=700),
+        ConversionOptions(max_triangles=5000),
+        ConversionOptions(max_triangles=5000, mode="flat"),
+        ConversionOptions(max_triangles=20_000, mode="flat"),
+        ConversionOptions(max_triangles=5000, mode="flat", sides=4),
+    ],
+)
+def test_merged_once_a_conversion_keeps_to_the_limits(room, limits):
+    views = merging_views(room)[:8]
+    merged, options = merged_within_limits(room, limits, views)
+    made = convert(merged, options)
+    for_views = convert(room, limits, cameras=views, footprint="framing")
+    assert made.splat_count == for_views.splat_count == len(merged) < len(room)
+    assert len(made.faces) == len(for_views.faces)
+    np.testing.assert_array_equal(merged.means, merging.simplify(room, len(merged), cameras=views).means)
+
+
+def test_nothing_is_merged_without_a_limit_that_wants_it(room):
+    views = orbit(room, 3, width=50, height=50)
+    for options in (ConversionOptions(max_splats=len(room)), ConversionOptions(max_splats=9, budget="drop")):
+        assert merged_within_limits(room, options, views) == (room, options)

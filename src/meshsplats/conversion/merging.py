@@ -17,30 +17,17 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats._core.library import pointer, processors, run
-from meshsplats._core.neighbours import nearest
-from meshsplats._core.structures import MergingStruct
+from meshsplats._core.library import processors
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import SceneSample, SceneViews, widen
+from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import GaussianCloud
-
-NEIGHBOURS = 8
-"""Nearest splats with which each may be merged at first; a merged one has the neighbours of both. With 16,
-results are at most 0.1 dB better, in twice the time."""
-
-COLOR_WEIGHT = 1.0
-"""Cost of a difference in colour relative to growth of the area: e-fold growth of both splats costs as much
-as half the square of a difference of 1. Between 1 and 4 nothing changes."""
-
-FINEST = 0.5
-"""Least width of a splat when it is compared with others, as a share of the median splat's. Values between a
-quarter and 1 differ by 0.2 dB."""
 
 FILTER_PX2 = 0.3
 """Variance in square pixels of the low-pass filter of splat renderers."""
@@ -209,7 +196,7 @@ def _merge(
     n = len(cloud)
     if n > np.iinfo(np.int32).max:
         raise ValueError(f"at most 2^31 - 1 splats can be merged, got {n}")
-    group = _groups(cloud, counted, low_pass, int(count), threads or processors())
+    group = groups_of(cloud, counted, low_pass, int(count), threads or processors())
     return Merged(_merged(cloud, masses, low_pass, group), group, masses)
 
 
@@ -269,115 +256,6 @@ def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:
     return widen(scales.astype(np.float64), low_pass, 1.0, kernel)
 
 
-def _groups(
-    cloud: GaussianCloud, masses: np.ndarray, low_pass: np.ndarray, count: int, threads: int
-) -> np.ndarray:
-    """(n,) indices, 0 to count - 1, of the merged splats that each becomes part of; ``masses``: what each
-    counts."""
-    seen = mean_shadow(disc_areas(cloud.scales[masses > 0].astype(np.float64)))
-    unit = float(np.sqrt(np.median(seen))) if len(seen) else 0.0
-    unit = unit or float(low_pass.max()) or 1.0
-    colors = cloud.colors.astype(np.float64)
-    means = (cloud.means - np.median(cloud.means, axis=0).astype(np.float64)) / unit
-    covariances = _covariances(cloud) / unit**2
-    # Differences finer than the filter, or than a share of the median splat, do not count. Otherwise, merging
-    # flat or thin splats with anything beside them would have an unbounded cost.
-    covariances[:, [0, 3, 5]] += np.square(np.maximum(low_pass / unit, FINEST))[:, None]
-    group = np.arange(len(cloud))
-    all_moments = _Moments(means, covariances, masses, colors)
-    moments = all_moments
-    while True:
-        part, left = _merge_neighbours(moments, count, threads)
-        group = part[group]
-        if left <= count:
-            return group
-        # Neighbours ran out. Among the few splats that are left, others are neighbours.
-        moments = all_moments.together(_Groups(group, masses))
-
-
-def _merge_neighbours(moments: _Moments, count: int, threads: int) -> tuple[np.ndarray, int]:
-    """(n,) indices of groups, in the order of their first members, and their count: ``count``, or more where
-    neighbours ran out."""
-    n = len(moments.means)
-    neighbours = min(NEIGHBOURS, n - 1)
-    order, near = nearest(moments.means, neighbours, threads)
-    in_order = _Moments(*(np.take(values, order, axis=0) for values in moments))
-    found = np.empty(n, np.int32)
-    merging = MergingStruct(
-        count=n,
-        wanted=count,
-        neighbours=neighbours,
-        threads=threads,
-        means=pointer(in_order.means),
-        covariances=pointer(in_order.covariances),
-        masses=pointer(in_order.masses),
-        colors=pointer(in_order.colors),
-        nearest=pointer(near),
-        color_weight=COLOR_WEIGHT,
-        group=pointer(found),
-    )
-    run("ms_merge_pairs", merging)
-    group = np.empty(n, np.int64)
-    group[order] = found
-    first, group = np.unique(group, return_index=True, return_inverse=True)[1:]
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[group], merging.remaining
-
-
-class _Moments(NamedTuple):
-    """Moments and colours of n splats or groups, float64."""
-
-    means: np.ndarray
-    """(n, 3)"""
-    covariances: np.ndarray
-    """(n, 6) xx, xy, xz, yy, yz, zz."""
-    masses: np.ndarray
-    """(n,)"""
-    colors: np.ndarray
-    """(n, 3) RGB."""
-
-    def together(self, groups: _Groups) -> _Moments:
-        """The moments of each group: those of all its members together."""
-        middle = groups.averages(self.means)
-        apart = self.means - middle[groups.group]
-        spread = apart[:, [0, 0, 0, 1, 1, 2]] * apart[:, [0, 1, 2, 1, 2, 2]]
-        spread += self.covariances
-        return _Moments(middle, groups.averages(spread), groups.masses, groups.averages(self.colors))
-
-
-class _Groups:
-    """Sums over the members of groups 0 to g - 1; members are added in the order of their rows."""
-
-    def __init__(self, group: np.ndarray, masses: np.ndarray) -> None:
-        self.group = group
-        self.order = np.argsort(group, kind="stable")
-        sizes = np.bincount(group)
-        self.starts = np.cumsum(sizes) - sizes
-        self.masses = self.sums(masses)
-        total = self.masses[group]
-        # In a group without mass, all members count alike.
-        self.weights = np.where(
-            total > 0, np.divide(masses, total, where=total > 0, out=np.zeros_like(masses)), 1 / sizes[group]
-        )
-
-    def sums(self, values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(np.take(values, self.order, axis=0), self.starts, axis=0)
-
-    def averages(self, values: np.ndarray) -> np.ndarray:
-        """(g, k) float64 means of ``values`` (n, k), weighted by mass."""
-        return self.sums(self.weights[:, None] * values)
-
-
-def _covariances(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 6) float64 xx, xy, xz, yy, yz, zz."""
-    axes = cloud.rotations.astype(np.float64)
-    axes *= cloud.scales[:, None, :]
-    return np.stack(
-        [np.einsum("ij,ij->i", axes[:, i], axes[:, j]) for i in range(3) for j in range(i, 3)], axis=1
-    )
-
-
 def _merged(
     cloud: GaussianCloud, masses: np.ndarray, low_pass: np.ndarray, group: np.ndarray
 ) -> GaussianCloud:
@@ -391,8 +269,8 @@ def _merged(
     index = np.zeros(len(sizes), np.int64)
     index[changed] = np.arange(len(changed))
     own = index[group[rows]]
-    all_moments = _Moments(part.means.astype(np.float64), _covariances(part), masses[rows], part.colors)
-    groups = _Groups(own, masses[rows])
+    all_moments = Moments(part.means.astype(np.float64), covariances_of(part), masses[rows], part.colors)
+    groups = Groups(own, masses[rows])
     means, covariances, mass, _ = all_moments.together(groups)
     width = groups.averages(low_pass[rows, None])[:, 0]
     matrices = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)

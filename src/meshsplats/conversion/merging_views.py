@@ -85,7 +85,7 @@ def convert_within_limits(
 ) -> SplatMesh:
     """``convert``; without ``cameras``, splats that a limit wants merged are merged for ``merging_views``."""
     given = ConversionOptions() if options is None else options
-    if not cameras and _merges(cloud, given, preset):
+    if not cameras and _limited(cloud, given, preset) is not None:
         chosen = given.resolved(preset, has_cameras=False)
         cameras = merging_views(cloud, source, up=up, threads=threads)
         # All else is as without them.
@@ -94,7 +94,29 @@ def convert_within_limits(
     return convert(cloud, given, preset=preset, cameras=cameras, up=up, threads=threads)
 
 
-def _merges(cloud: GaussianCloud, given: ConversionOptions, preset: Preset) -> bool:
+def merged_within_limits(
+    cloud: GaussianCloud,
+    options: ConversionOptions,
+    cameras: Sequence[Camera],
+    *,
+    preset: Preset = "default",
+    threads: int | None = None,
+) -> tuple[GaussianCloud, ConversionOptions]:
+    """``cloud`` merged for ``cameras`` as far as the limits of ``options`` want it, and the options without
+    these limits: a conversion without cameras then keeps to them."""
+    limited = _limited(cloud, options, preset)
+    if limited is None:
+        return cloud, options
+    chosen, count = limited
+    merged = simplify_large(cloud, count, cameras, threads)
+    return merged, replace(options, sides=chosen.sides, max_splats=None, max_triangles=None)
+
+
+def _limited(
+    cloud: GaussianCloud, given: ConversionOptions, preset: Preset
+) -> tuple[ConversionOptions, int] | None:
+    """Options and number of splats that the limits of ``given`` leave, if these want splats merged."""
     chosen = given.resolved(preset, has_cameras=False)
-    count = len(worth_drawing(cloud, chosen))
-    return chosen.budget == "merge" and within_limits(given, chosen, count)[1] < count
+    drawn = len(worth_drawing(cloud, chosen))
+    within, count = within_limits(given, chosen, drawn)
+    return (within, count) if chosen.budget == "merge" and count < drawn else None

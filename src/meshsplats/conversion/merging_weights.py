@@ -13,6 +13,7 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._core.neighbours import nearest
 from meshsplats.camera import Camera
+from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import CameraCoverage, SceneSample, SceneViews
 from meshsplats.conversion.options import ConversionOptions
@@ -39,6 +40,9 @@ NEAREST = 0.01
 MOST = 1_000_000
 """Splats of which images are rendered to see what is hidden; in a larger cloud nothing counts as hidden."""
 
+CHUNK = 1 << 13
+"""Splats whose distances are computed together: so many stay in the cache."""
+
 IMAGES = 8
 SIDE = 400
 """Number and side of these images, at most."""
@@ -54,10 +58,7 @@ def pixels_of(
     """
     coverage = CameraCoverage(cloud.means, cameras)
     covered = coverage.densities() * masses
-    square = np.full(len(cloud), np.inf, np.float32)
-    for camera in coverage.cameras:
-        away = cloud.means - camera.center.astype(np.float32)
-        np.minimum(square, np.einsum("ij,ij->i", away, away), out=square)
+    square = _nearest_squares(cloud.means, coverage.cameras)
     least = max(float(np.quantile(square, NEAREST)), float(np.finfo(np.float32).tiny))
     focal = float(np.mean([camera.fx * camera.fy for camera in coverage.cameras]))
     elsewhere = ELSEWHERE * focal * masses / np.maximum(square, np.float32(least))
@@ -67,6 +68,18 @@ def pixels_of(
     shown = np.divide(visible, masses, out=np.zeros(len(cloud)), where=masses > 0)
     clearest = np.minimum(_greatest_around(cloud.means, shown, threads) * masses, CLEAREST * covered)
     return clearest + HIDDEN * covered + elsewhere
+
+
+def _nearest_squares(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """(n,) float32 squares of the distances of ``means`` (n, 3) from the nearest of ``cameras``."""
+    square = np.full(len(means), np.inf, np.float32)
+    centers = [camera.center.astype(np.float32)[:, None] for camera in cameras]
+    for part in chunks(len(means), CHUNK):
+        points = np.ascontiguousarray(means[part].T)
+        for center in centers:
+            x, y, z = points - center
+            np.minimum(square[part], x * x + y * y + z * z, out=square[part])
+    return square
 
 
 def _greatest_around(means: np.ndarray, values: np.ndarray, threads: int | None) -> np.ndarray:

@@ -15,10 +15,18 @@ from meshsplats.choices import Device
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
+from meshsplats.conversion.merging_views import merged_within_limits
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.draw_order import DrawOrder
-from meshsplats.finetuning.baseline import SHARES, SizeScores, converted, measure_baseline, partly
+from meshsplats.finetuning.baseline import (
+    SHARES,
+    SizeScores,
+    converted,
+    measure_baseline,
+    partly,
+    without_cameras,
+)
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import starting_mesh
 from meshsplats.finetuning.journal import Journal
@@ -134,6 +142,7 @@ class SplatTuning:
             self.config = of_brief_run(self.config, self._record.brief_steps, set(run.fixed))
             self.dataset = run.targets(self.config, BRIEF_ZOOMS)
         self._cloud = run.cloud
+        self._merged: tuple[GaussianCloud, ConversionOptions] | None = None
         if self._record.max_splats is not None:
             setup.phase(f"merging {len(run.cloud):,} splats to {self._record.max_splats:,}")
             most, seen = self._record.max_splats, [view.camera for view in self.dataset.train]
@@ -212,7 +221,10 @@ class SplatTuning:
 
     def _converted(self) -> SplatMesh:
         cameras = [view.camera for view in self.dataset.train]
-        return converted(self._cloud, self.config, self._options, cameras)
+        if self._merged is None:
+            wanted = without_cameras(self._options)
+            self._merged = merged_within_limits(self._cloud, wanted, cameras, threads=self._run.threads)
+        return converted(self._merged[0], self.config, self._merged[1], cameras)
 
     def _started(self) -> SplatMesh:
         """The starting mesh of a run that is not brief. The record notes the images that there was time for,

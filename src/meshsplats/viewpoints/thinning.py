@@ -56,6 +56,7 @@ class ByPlace:
         likely = probabilities(sizes_of(cloud.scales) * cloud.opacities, POOL)
         rows = np.flatnonzero(rng.random(len(cloud)) < likely)
         self.pool = without_harmonics(cloud, rows)
+        self._columns = np.ascontiguousarray(self.pool.means.T)
         self.stands_for = 1 / likely[rows]
         """How many splats each of the pool stands for."""
         self.size = sizes_of(self.pool.scales).astype(np.float64)
@@ -64,7 +65,7 @@ class ByPlace:
 
     def seen_from(self, place: np.ndarray, near: float) -> tuple[GaussianCloud, np.ndarray]:
         """The splats to show from ``place`` (3,), widened; and their sizes (k,) before that."""
-        x, y, z = (self.pool.means[:, k] - np.float32(place[k]) for k in range(3))
+        x, y, z = self._columns - place.astype(np.float32)[:, None]
         angle = self.area / np.maximum(x * x + y * y + z * z, np.float32(near) ** 2)
         likely = probabilities(angle, self.most)
         rows = np.flatnonzero(self.lot < likely)
