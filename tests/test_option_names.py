@@ -28,7 +28,6 @@ STILL = {
     "blender/__init__.py": {"--max-triangles"},
     "blender/launch.py": {"--executable", "--engine"},
     "blender/inside/__init__.py": {"--executable"},
-    "finetuning/plans.py": {"--resume", "--minutes"},
     "surfaces/atlas.py": {"--texture"},
 }
 """Ours that are left. Take out what does not stand there any more; put nothing in."""

@@ -15,7 +15,7 @@ from meshsplats._files.atomic import together
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options, of_presets
 from meshsplats.cli.common import draw_preview, written
-from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.cli.messages import UsageError, command_line, say, with_flags
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, in_plain_words, write_configuration
 from meshsplats.errors import OtherRunError
@@ -199,7 +199,9 @@ class TrainingCommand(Command):
             return 128 + (stop.signal or signal.SIGINT)
         most = SCORED_VIEWS if self.has_photographs else self.target.held_out
         result = RunResult(files, trained, time.perf_counter() - start, scored, most, earlier)
-        lines = () if self.json else (*result.in_words(), *self.next_steps(files, config, plan))
+        lines = (
+            () if self.json else (*map(with_flags, result.in_words()), *self.next_steps(files, config, plan))
+        )
         self.finish(result.to_dict(), *lines)
         return 0
 

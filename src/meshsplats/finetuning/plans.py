@@ -24,6 +24,9 @@ from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
+MANY_TRIANGLES, FEWER_TRIANGLES = 2_000_000, 1_000_000
+"""Of more, a run that had no time for a step names the limit that would have left it some."""
+
 
 @dataclass(frozen=True)
 class Trained:
@@ -143,7 +146,7 @@ class RunResult:
         }
 
     def in_words(self) -> Iterator[str]:
-        """Lines with the same, and what they mean."""
+        """Lines with the same, and what they mean; names of options stand in double backquotes."""
         lines, files = self._lines, self.files
         scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
         steps = lines[-1]["step"] if lines else 0
@@ -158,6 +161,8 @@ class RunResult:
         made = f"{files.mesh} ({in_words(files.mesh.stat().st_size)}, {self.trained.summary})"
         yield f"{made}: {steps:,} steps in {self._total:.1f} s{resumed}{quality}"
         yield from _sizes_in_words(self.trained.sizes, steps if lines or self.trained.sizes else None)
+        if steps == 0 and self.trained.sizes and self.trained.counts.get("triangles", 0) > MANY_TRIANGLES:
+            yield f"  or fewer triangles: ``max_triangles`` {FEWER_TRIANGLES}"
         yield f"preview: {files.preview}" + (f"; metrics: {files.folder}/metrics.jsonl" if lines else "")
 
 
@@ -177,6 +182,6 @@ def _sizes_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[str
         where = ", ".join(str(width) for width in sizes.worse_at)
         count = f"{steps or 0:,} step" + ("" if steps == 1 else "s")
         yield f"the conversion is written: after {count}, the mesh was worse at {where} px;"
-        yield "  a longer run helps, a new one rather than --resume, which keeps the start of a short one"
+        yield "  a longer run helps, a new one rather than ``resume``, which keeps the start of a short one"
     elif steps == 0:
-        yield "there was no time for steps: this is the mesh at the start; more --minutes help"
+        yield "there was no time for steps: this is the mesh at the start; more ``minutes`` help"
