@@ -3,10 +3,12 @@
     python benchmarks/surfaces.py --data ../shared/data playbot guitar truck
     python benchmarks/surfaces.py --data ../shared/data --faces 40000 lego
     python benchmarks/surfaces.py --data ../shared/data --fans playbot guitar
+    python benchmarks/surfaces.py --data ../shared/data --views 32 --size 400 --rounds 0 building stone
 
 For each scene the surface with default options, by images of degree 0. Its images, 2 x 2 samples, are
 compared with those of the splats (degree 0, means over areas, on white) from the standard cameras, eight of
-400 pixels at the given distances. lego is fitted to photographs and compared with those that are held out.
+400 pixels at the given distances; places from the first eight views that are found, from which no surface is
+made. lego is fitted to photographs and compared with those that are held out.
 "colours" is the same surface with colours of vertices, as fused; "opaque" are the splats' own images, each
 pixel opaque in its own colour or white: what an opaque surface of these colours could reach at best. With
 --fans the splats as triangles are compared in place of surfaces: `convert`, no fine-tuning, `.glb`.
@@ -25,15 +27,28 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from _common import DATA, PHOTOGRAPHED, SCENES, Report, Stopwatch, arguments, mean_psnr
+from _common import DATA, PHOTOGRAPHED, SCENES, Report, Scene, Stopwatch, arguments, mean_psnr
 
 import meshsplats as ms
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.datasets.splat_targets import HELD_OUT as HELD_OUT_VIEWS
+from meshsplats.surfaces.options import SurfaceOptions
 
 DISTANCES = ("mid", "close")
 SOLID = 0.5
 """Alpha from which a pixel of "opaque" is."""
 HELD_OUT = "held-out photographs"
+PLACES = {
+    name: Scene(name, f"places/{path}")
+    for name, path in (
+        ("building", "building_300k_sh3/lod-meta.json"),
+        ("stone", "stone_186k_sh3/meta.json"),
+        ("park", "park_526k_sh0/meta.json"),
+    )
+}
+FOUND = "found views"
+NUMBERS = ("faces", "texture", "views", "size", "rounds", "resolution")
+"""Options of surfaces, by default theirs."""
 
 
 class Truth(NamedTuple):
@@ -53,11 +68,12 @@ def truths(name: str, data: Path, photographs: ms.Dataset | None, threads: int |
         images = [view.load().over((1, 1, 1)) for view in views]
         yield Truth(HELD_OUT, [view.camera for view in views], images, [])
         return
-    scene = SCENES[name]
-    for distance in DISTANCES:
-        cameras = scene.cameras(data, distance)
+    scene = PLACES.get(name) or SCENES[name]
+    cloud = scene.cloud(data)
+    for distance in [FOUND] if name in PLACES else DISTANCES:
+        cameras = scene.cameras(data, distance) if distance != FOUND else found_views(cloud)
         drawn = [
-            ms.draw_splats(scene.cloud(data), camera, sh_degree=0, background=(0, 0, 0), threads=threads)
+            ms.draw_splats(cloud, camera, sh_degree=0, background=(0, 0, 0), threads=threads)
             for camera in cameras
         ]
         opaque = []
@@ -66,6 +82,12 @@ def truths(name: str, data: Path, photographs: ms.Dataset | None, threads: int |
             opaque.append(np.where(image.alpha[..., None] >= SOLID, own, 1))
         images = [image.color + (1 - image.alpha)[..., None] for image in drawn]
         yield Truth(distance, cameras, images, opaque)
+
+
+def found_views(cloud: ms.GaussianCloud) -> list[ms.Camera]:
+    """Those that are held out of surfaces."""
+    more = HELD_OUT_VIEWS + SurfaceOptions().views
+    return list(ms.find_cameras(cloud, more).cameras[:HELD_OUT_VIEWS])
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> float:
@@ -109,9 +131,10 @@ def of_fans(options: Namespace) -> None:
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("scenes", nargs="+", choices=[*SCENES, "lego"])
+    parser.add_argument("scenes", nargs="+", choices=[*SCENES, *PLACES, "lego"])
     parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--faces", type=int, default=20_000)
+    for name in NUMBERS:
+        parser.add_argument(f"--{name}", type=int)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--fans", action="store_true")
     options = parser.parse_args()
@@ -125,11 +148,12 @@ def main() -> None:
             *("opaque dB", "MB", "seconds"),
         )
         for name in options.scenes:
-            scene = SCENES.get(name) or PHOTOGRAPHED[name]
+            scene = SCENES.get(name) or PLACES.get(name) or PHOTOGRAPHED[name]
             cloud = scene.cloud(options.data)
             photographs = ms.load_dataset(options.data / scene.photographs) if scene.photographs else None
-            more = {"faces": options.faces, "sh_degree": 0, "threads": threads}
-            plain = ms.make_surface(cloud, photographs, texture=0, rounds=0, **more)
+            chosen = {part: getattr(options, part) for part in NUMBERS if getattr(options, part) is not None}
+            more = {"sh_degree": 0, "threads": threads} | chosen
+            plain = ms.make_surface(cloud, photographs, **more | {"texture": 0, "rounds": 0})
             watch = Stopwatch()
             surface = ms.make_surface(cloud, photographs, **more)
             seconds = watch.processor

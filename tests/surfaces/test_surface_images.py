@@ -178,10 +178,11 @@ def test_cells_do_not_overlap(count, more):
 
 
 @needs_atlas
-def test_charts_of_an_atlas_do_not_overlap():
+@pytest.mark.parametrize("fast", [False, True])
+def test_charts_of_an_atlas_do_not_overlap(fast):
     points, faces = unit_ball(3)
     side = 256
-    uv = unwrap(points, faces, side).astype(np.float64) * side
+    uv = unwrap(points, faces, side, fast=fast).astype(np.float64) * side
     assert uv.min() >= 0
     assert uv.max() <= side
     y, x = np.mgrid[:side, :side] + 0.5

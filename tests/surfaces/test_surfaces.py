@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from _glb import read_glb
+from _meshes import unit_ball
 from conftest import shared_data
 
 from meshsplats import (
@@ -23,18 +24,22 @@ from meshsplats import (
     look_at,
     psnr,
     save_base,
+    save_cameras,
     save_gaussians,
+    save_mesh,
 )
+from meshsplats._core.surfaces import Grid
 from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
 from meshsplats.surfaces import make_surface, making
+from meshsplats.surfaces.files import SurfaceFileOptions, SurfaceRun
 from meshsplats.surfaces.fusion import TRUNCATION, grid_of, isosurface
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.manifold import split_pinches
-from meshsplats.surfaces.options import SurfaceOptions, level_options
+from meshsplats.surfaces.options import CLOSED, OPEN, SurfaceOptions, level_options
 
 _TAGS = {"vertex": "xyz", "triangle": ("v1", "v2", "v3")}
 """Elements of a model in 3MF, and their numbers."""
@@ -270,7 +275,7 @@ def test_levels_of_detail_have_a_quarter_of_the_triangles_each(tmp_path, capsys)
 
 
 def test_levels_are_halved_until_they_would_be_too_small():
-    options = SurfaceOptions(faces=640, texture=256, size=80)
+    options = SurfaceOptions(faces=640, texture=256, size=80).sized(closed=True)
     levels = level_options(options, 3)
     assert [(o.faces, o.texture, o.size) for o in levels] == [(640, 256, 80), (160, 128, 40), (40, 64, 20)]
     assert [o.faces for o in level_options(replace(options, faces=0, texture=0), 3)] == [0, 0, 0]
@@ -392,6 +397,76 @@ def test_a_wall_that_is_seen_from_one_side_is_open():
     # Closed, the same is a slab.
     solid = make_surface(mesh, cameras=cameras, shape="closed", **options)
     assert open_edges(solid.faces) == 0
+
+
+@needs_extra
+def test_a_wall_is_where_it_is_behind_a_veil():
+    behind, side = wall(), 1.0
+    square = np.array([(-side, -side, -1.0), (side, -side, -1), (side, side, -1), (-side, side, -1)])
+    mesh = SplatMesh(
+        np.concatenate([square, behind.vertices]),
+        np.concatenate([[(0, 2, 1), (0, 3, 2)], behind.faces + 4]),
+        np.concatenate([np.full((4, 4), 0.4), behind.colors]),
+    )
+    cameras = [
+        look_at((x, 0, -4), (0, 0, 0), up=(0, -1, 0), width=96, height=96, fov=50) for x in (-1.0, 0, 1)
+    ]
+    base = make_surface(mesh, cameras=cameras, shape="open", **{**QUICK, "resolution": 48})
+    inner = np.abs(base.vertices[:, :2]).max(axis=1) < 1.3
+    assert inner.sum() > 50
+    assert np.abs(base.vertices[inner, 2]).max() < 0.05
+
+
+def test_surfaces_of_places_have_more_triangles_and_texels_unless_a_number_is_named():
+    for closed, size in ((True, CLOSED), (False, OPEN)):
+        sized = SurfaceOptions(views=12).sized(closed)
+        assert (sized.faces, sized.texture, sized.views) == (*size, 12)
+        named = SurfaceOptions(faces=0, texture=0).sized(closed)
+        assert (named.faces, named.texture) == (0, 0)
+    assert np.greater(OPEN, CLOSED).all()
+
+
+@needs_extra
+@pytest.mark.slow
+def test_the_default_size_of_an_open_surface_is_said(tmp_path):
+    save_mesh(wall(), tmp_path / "wall.npz")
+    cameras = [look_at((x, 0, -4), (0, 0, 0), up=(0, -1, 0), width=48, height=48) for x in (-1, 0, 1)]
+    save_cameras(cameras, tmp_path / "cameras.json")
+    for named, said in (
+        ({}, ["an open surface: by default at most 60,000 triangles, a texture of 4096 texels"]),
+        ({"texture": 64}, ["an open surface: by default at most 60,000 triangles"]),
+        ({"faces": 90, "texture": 0}, []),
+    ):
+        heard: list[str] = []
+        options = SurfaceOptions(shape="open", resolution=16, size=48, rounds=0, **named)
+        files = SurfaceFileOptions(options, cameras=tmp_path / "cameras.json", no_preview=True)
+        run = SurfaceRun(tmp_path / "wall.npz", tmp_path / "wall.glb", files, threads=1, say=heard.append)
+        ((_, base),) = run.save(force=True)[1]
+        assert heard == said
+        side = len(base.textures[0].pixels) if base.textures else 0
+        assert side == named.get("texture", 4096)
+
+
+@needs_extra
+def test_an_atlas_that_fails_has_fewer_triangles_unless_their_number_is_named(monkeypatch):
+    counts = []
+
+    def unwrap(vertices, faces, side, fast):
+        counts.append(len(faces))
+        if len(faces) > 300:
+            raise ValueError("too many")
+        return np.zeros((len(faces), 3, 2), np.float32)
+
+    monkeypatch.setattr(making, "unwrap", unwrap)
+    monkeypatch.setattr(making, "CLOSED", (100, 64))
+    points, faces = unit_ball(3)
+    even = Grid(np.zeros(3), 1.0, ())
+    assert 200 < len(making._blank(points, faces, even, 64).faces) <= 300
+    assert counts[0] == len(faces)
+    counts.clear()
+    with pytest.raises(ValueError, match="too many"):
+        making._blank(points, faces, even, 64, least=len(faces))
+    assert counts == [len(faces)]
 
 
 @needs_extra

@@ -391,3 +391,9 @@ def test_real_scenes(name):
     view = orbit(mesh, 4, width=120, height=120)[1]
     gpu, core = both(mesh, view)
     assert_same_image(gpu, core, least=85, most=1 / 5000)
+
+
+def test_median_depths_are_refused():
+    need_gpu()
+    with pytest.raises(ValueError, match="median_depth needs device 'cpu'"):
+        render(soup(1), camera(), device="gpu", median_depth=True)

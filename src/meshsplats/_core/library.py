@@ -28,7 +28,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 15
+INTERFACE_VERSION = 16
 
 
 def pointer(array: np.ndarray | None) -> int | None:

@@ -57,7 +57,10 @@ class SplatsStruct(CoreStruct):
 
 
 class ImageStruct(CoreStruct):
-    _fields_ = [*pointers("color", "alpha", "depth", "normals", "attributes"), *int64("fragments")]
+    _fields_ = [
+        *pointers("color", "alpha", "depth", "normals", "attributes", "median_depth"),
+        *int64("fragments"),
+    ]
 
 
 class ImageGradientsStruct(CoreStruct):

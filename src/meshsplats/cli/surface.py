@@ -19,10 +19,10 @@ from meshsplats.cli.records import write_configuration
 from meshsplats.formats.base_meshes import PRINTED
 from meshsplats.mesh import SplatMesh
 from meshsplats.surfaces.files import SurfaceFileOptions, SurfaceRun
-from meshsplats.surfaces.options import SurfaceOptions
+from meshsplats.surfaces.options import SurfaceOptions, default_in_words
 
 
-@as_cli_options(defaults=lambda name: f"(default: {getattr(SurfaceOptions(), name)})")
+@as_cli_options(defaults=default_in_words)
 class Options(SurfaceOptions):
     """What is made, and how."""
 

@@ -1,6 +1,8 @@
 // Blends the fragments of one tile front to back and resolves its samples to pixels.
 #pragma once
 
+#include <limits>
+
 #include "fragment_queue.h"
 #include "ramp.h"
 #include "scene.h"
@@ -9,15 +11,17 @@
 
 namespace ms {
 
-// Layout of the sums of one sample for the outputs besides colour: depth, normals, attributes, in this order.
+// Layout of the sums of one sample for the outputs besides colour: depth, normals, attributes, in this order;
+// for the median depth, the weight so far and the depth at which it reached a half, 0 before.
 struct ExtraChannels {
     int count = 0;
-    int depth = -1, normals = -1, attributes = -1;  // first channel, or -1
+    int depth = -1, normals = -1, attributes = -1, median = -1;  // first channel, or -1
 
     ExtraChannels(const MsImage &image, const MsMesh &mesh) {
         if (image.depth) depth = count, count += 1;
         if (image.normals) normals = count, count += 3;
         if (image.attributes) attributes = count, count += mesh.attribute_count;
+        if (image.median_depth) median = count, count += 2;
     }
     bool any() const { return count > 0; }
 };
@@ -178,6 +182,7 @@ class ImageTile {
                 if (extras_.attributes >= 0)
                     resolve_extra(image_.attributes, extras_.attributes, scene_.mesh.attribute_count, x, y,
                                   pixel);
+                if (extras_.median >= 0) image_.median_depth[pixel] = median_of(x, y);
             }
         }
     }
@@ -276,6 +281,11 @@ class ImageTile {
         }
         for (int k = 0; k < 3; ++k) b[k] = total > 0 ? b[k] / total : k == 0;
         if (extras_.depth >= 0) sum[extras_.depth] += weight * z;
+        if (extras_.median >= 0) {
+            float &stopped = sum[extras_.median], &median = sum[extras_.median + 1];
+            stopped += weight;
+            if (stopped >= 0.5f && !(median > 0)) median = z;
+        }
         if (extras_.normals >= 0) add_normal(sample, corner, b, weight, sum + extras_.normals);
         if (extras_.attributes >= 0) {
             int channels = mesh.attribute_count;
@@ -337,6 +347,21 @@ class ImageTile {
                         extra_sums_[(size_t)TileArea::sample_index(x + i, y + j) * extras_.count + first + c];
             out[pixel * channels + c] = sum * share;
         }
+    }
+
+    // The mean of the median depths of the samples of the pixel at the tile's sample (x, y) that have one;
+    // infinite where fewer than half have.
+    float median_of(int x, int y) const {
+        const int s = grid_.samples;
+        float sum = 0;
+        int found = 0;
+        for (int j = 0; j < s; ++j)
+            for (int i = 0; i < s; ++i) {
+                const size_t sample = TileArea::sample_index(x + i, y + j);
+                const float depth = extra_sums_[sample * extras_.count + extras_.median + 1];
+                if (depth > 0) sum += depth, ++found;
+            }
+        return 2 * found >= s * s ? sum / found : std::numeric_limits<float>::infinity();
     }
 
     const Scene &scene_;

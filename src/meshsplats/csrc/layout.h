@@ -90,7 +90,7 @@ constexpr MsField FIELDS[] = {
               attributes, attribute_count, by_splat, filter_px2),
     MS_STRUCT(MsSplats, count, means, quaternions, scales, opacities, sh, sh_stored, sh_used, kernel,
               dilation),
-    MS_STRUCT(MsImage, color, alpha, depth, normals, attributes, fragments),
+    MS_STRUCT(MsImage, color, alpha, depth, normals, attributes, median_depth, fragments),
     MS_STRUCT(MsImageGradients, color, alpha, attributes, expected_weight, target),
     MS_STRUCT(MsVertexGradients, vertices, colors, attributes),
     MS_STRUCT(MsComparison, count, height, width, channels, threads, image, target, mask, gradient, l1_rate,

@@ -57,12 +57,13 @@ struct MsSplats {
 };
 
 struct MsImage {
-    float *color;       // (height, width, 3) over the background
-    float *alpha;       // (height, width)
-    float *depth;       // (height, width), or null
-    float *normals;     // (height, width, 3), or null
-    float *attributes;  // (height, width, attribute_count), or null
-    int64_t fragments;  // out: number of blended fragments
+    float *color;         // (height, width, 3) over the background
+    float *alpha;         // (height, width)
+    float *depth;         // (height, width), or null
+    float *normals;       // (height, width, 3), or null
+    float *attributes;    // (height, width, attribute_count), or null
+    float *median_depth;  // (height, width): where half of the light is stopped, else infinite; or null
+    int64_t fragments;    // out: number of blended fragments
 };
 
 // Gradients of a loss with respect to an image.

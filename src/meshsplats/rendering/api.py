@@ -35,6 +35,9 @@ class Rendering:
     """The requested vertex attributes, (h, w) or (h, w, c) float32, summed with the same weights."""
     fragments: int = 0
     """Count of blended fragments: triangles, or splats, at samples."""
+    median_depth: np.ndarray | None = None
+    """(h, w) float32 camera depth z of the fragment that leaves half or less of the light, the mean of the
+    samples that have one; infinite in pixels where fewer than half of them have."""
 
     def mean_depth(self, *, min_alpha: float = 0.0, empty: float = np.inf) -> np.ndarray:
         """(h, w) float32 mean depth z of the fragments in each pixel, weighted as their colours are.
@@ -60,6 +63,7 @@ def render(
     max_layers: int | None = None,
     min_transmittance: float = MIN_TRANSMITTANCE,
     depth: bool = False,
+    median_depth: bool = False,
     normals: bool = False,
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
@@ -104,7 +108,9 @@ def render(
         max_layers: blend at most this many of the nearest triangles at each sample, as depth peeling does
             with that many passes.
         min_transmittance: early termination of samples with less transmittance than this; 0: none.
-        depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
+        depth, median_depth, normals, attributes: further outputs; ``attributes`` names some of
+            ``mesh.attributes``. Median depths are the CPU's alone. They are those of one of two surfaces
+            where the mean lies between them.
         filter_px2: overrides ``mesh.filter_px2``; 0 draws the triangles as they are.
         cutoff: least opacity that is drawn, as opaque; 0 to 1. None: blended with the opacity.
         order: 'fragment' or 'splat', overrides ``mesh.order``. With a cutoff always 'fragment'.
@@ -165,12 +171,19 @@ def render(
         order=order,
         cutoff=cutoff,
         depth=depth,
+        median_depth=median_depth,
         normals=normals,
         values=values,
     )
     drawn = engine(device, threads).render(mesh, camera, options)
     return Rendering(
-        drawn.color, drawn.alpha, drawn.depth, drawn.normals, named(drawn.values), drawn.fragments
+        drawn.color,
+        drawn.alpha,
+        drawn.depth,
+        drawn.normals,
+        named(drawn.values),
+        drawn.fragments,
+        drawn.median_depth,
     )
 
 
@@ -249,6 +262,6 @@ def render_splats(
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
-    image = structures.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
+    image = structures.ImageStruct(keep(color), keep(alpha))
     library.call("ms_render_splats", splats, camera_struct(camera), options, image)
     return Rendering(color, alpha, fragments=int(image.fragments))

@@ -136,7 +136,9 @@ class TapedRendering:
         self.alpha = np.empty((h, w), np.float32)
         self.attributes = np.empty((h, w, width), np.float32)
         image = structures.ImageStruct(
-            keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
+            keep(self.color),
+            keep(self.alpha),
+            attributes=keep(self.attributes if width else None),
         )
         if tape_bytes is None:
             library.call("ms_render_mesh", self._mesh, self._camera, self._options, image)

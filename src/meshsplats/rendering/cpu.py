@@ -42,9 +42,10 @@ class CpuEngine:
             np.empty((h, w), np.float32) if options.depth else None,
             np.empty((h, w, 3), np.float32) if options.normals else None,
             np.empty((h, w, width), np.float32) if width else None,
+            np.empty((h, w), np.float32) if options.median_depth else None,
             0,
         )
-        image = structures.ImageStruct(*map(keep, drawn[:5]), 0)
+        image = structures.ImageStruct(*map(keep, drawn[:6]), 0)
         library.call("ms_render_mesh", mesh_struct(keep, triangles), camera_struct(camera), wanted, image)
         return drawn._replace(fragments=int(image.fragments))
 

@@ -54,6 +54,7 @@ class ImageOptions:
     order: Order = "fragment"
     cutoff: float | None = None
     depth: bool = False
+    median_depth: bool = False
     normals: bool = False
     values: np.ndarray | None = None
     """(v, k) float32 further values of the vertices to blend."""
@@ -72,6 +73,8 @@ class Drawn(NamedTuple):
     """(h, w, 3)."""
     values: np.ndarray | None
     """(h, w, k)."""
+    median_depth: np.ndarray | None
+    """(h, w)."""
     fragments: int
 
 

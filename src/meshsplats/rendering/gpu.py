@@ -70,6 +70,8 @@ class GpuEngine:
             check_limits(device, mesh)
 
     def render(self, mesh: SplatMesh, camera: Camera, options: ImageOptions) -> Drawn:
+        if options.median_depth:
+            raise ValueError("median_depth needs device 'cpu'")
         settings = DrawSettings(
             samples=options.samples,
             max_layers=options.max_layers,
@@ -89,6 +91,7 @@ class GpuEngine:
             drawn.depth,
             drawn.normals,
             drawn.values,
+            None,
             drawn.work.fragments,
         )
 

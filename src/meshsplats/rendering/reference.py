@@ -48,6 +48,7 @@ def render(
     max_layers: int | None = None,
     min_transmittance: float = 0.0,
     depth: bool = False,
+    median_depth: bool = False,
     normals: bool = False,
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
@@ -72,6 +73,8 @@ def render(
     'fragment', that of a depth buffer.
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
+    ``median_depth`` is the depth of the first fragment up to which these weights add up to half or more, the
+    mean over the samples that have one, infinite if fewer than half have.
 
     Raises ValueError for options out of range, a background of another shape, or a missing attribute.
     """
@@ -114,6 +117,7 @@ def render(
         color=blended(rgba[:, :3]) + through * backdrop,
         alpha=1 - through[..., 0],
         depth=blended(sheet.depth[:, None])[..., 0] if depth else None,
+        median_depth=_median_depths(sheet, share, camera, samples) if median_depth else None,
         normals=blended(_facing_normals(mesh, camera, sheet, x, y)) if normals else None,
         attributes=extra,
         fragments=int(np.count_nonzero(share)),
@@ -376,6 +380,20 @@ def _front_to_back(
         share[fragments] = transmittance[here] * alpha[fragments]
         transmittance[here] *= 1 - alpha[fragments]
     return share, transmittance
+
+
+def _median_depths(sheet: Fragments, share: np.ndarray, camera: Camera, samples: int) -> np.ndarray:
+    """(h, w): see ``render``. The fragments of each sample follow each other, and blended ones have a share
+    above 0."""
+    count = camera.width * camera.height * samples**2
+    total = np.cumsum(share)
+    before = np.concatenate([[0.0], total])[np.searchsorted(sheet.sample, np.arange(count))]
+    half = np.flatnonzero((total - before[sheet.sample] >= 0.5) & (share > 0))
+    found, first = np.unique(sheet.sample[half], return_index=True)
+    depths, has = np.zeros((count, 1)), np.zeros((count, 1))
+    depths[found, 0], has[found, 0] = sheet.depth[half[first]], 1
+    sums, shares = (pixel_means(values, camera, samples)[..., 0] for values in (depths, has))
+    return np.where(shares >= 0.5, sums / np.maximum(shares, 1e-9), np.inf)
 
 
 def _facing_normals(

@@ -10,9 +10,11 @@ GUTTER = 3
 """Texels between the charts of an atlas, and at its border."""
 
 
-def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
+def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int, *, fast: bool = False) -> np.ndarray:
     """(f, 3, 2) float32 texture coordinates of the corners of triangles, u to the right, v down, in charts
     that do not overlap, at least ``GUTTER`` texels apart in a texture of ``side`` x ``side``.
+
+    ``fast``: packed in a tenth of the time, a sixth more loosely.
 
     Raises:
         ValueError: the charts do not fit, or the library fails.
@@ -28,7 +30,10 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
     points = np.ascontiguousarray(vertices, np.float32)
     try:
         atlas = uvunwrap.generate(
-            [uvunwrap.Mesh(points, np.ascontiguousarray(faces, np.uint32))], page_size=side, padding=GUTTER
+            [uvunwrap.Mesh(points, np.ascontiguousarray(faces, np.uint32))],
+            page_size=side,
+            padding=GUTTER,
+            packing="fast" if fast else "shape",
         )
     except uvunwrap.UnwrapError as error:
         raise ValueError(f"the surface does not fit into a texture of {side} texels: {error}") from error

@@ -71,7 +71,9 @@ class SurfaceFileOptions:
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise OptionsError(f"``scale`` must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}
-        return level_options(SurfaceOptions(**given), self.levels)[0]
+        options = SurfaceOptions(**given).checked()
+        level_options(options.sized(closed=True), self.levels)  # open surfaces have more of everything
+        return options
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class SurfaceRun:
             path
             for mesh in meshes
             for path in base_meshes.companions(mesh, chosen.image)
-            if options.texture and textured
+            if options.texture != 0 and textured
         ]
         previews = [] if chosen.no_preview else [self.preview]
         outputs = [*meshes, *more, beside(self.output, CONFIGURATION), *previews]
@@ -129,6 +131,11 @@ class SurfaceRun:
             data = load_dataset(chosen.data, **how, origin=scene.origin)
         given = None if chosen.cameras is None else load_cameras(chosen.cameras, origin=scene.origin)
         sources = sources_of(scene, data, given, options, self.threads)
+        sized = options.sized(sources.closed)
+        chosen_here = [f"at most {sized.faces:,} triangles"] if options.faces is None else []
+        chosen_here += [f"a texture of {sized.texture} texels"] if options.texture is None else []
+        if chosen_here and not sources.closed:
+            self.say(f"an open surface: by default {', '.join(chosen_here)}")
         bases = surfaces_from(scene, sources, options, chosen.levels, threads=self.threads, progress=progress)
         files = base_meshes.level_files(self.output, chosen.levels)
         save = partial(

@@ -37,7 +37,7 @@ from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
 from meshsplats.surfaces.manifold import split_pinches
 from meshsplats.surfaces.normal_maps import Relief, normal_map, relief_of
-from meshsplats.surfaces.options import SurfaceOptions, level_options
+from meshsplats.surfaces.options import CLOSED, SizedOptions, SurfaceOptions, level_options
 from meshsplats.surfaces.views import Sources, reduced, smaller, sources_of
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ MOST_SPLATS = 1_000_000
 """Splats of which depth images are drawn; more are merged. Their mesh takes about a gigabyte."""
 _COARSE = 2
 """The first rounds compare images, and have textures, whose sides are smaller by this factor."""
+_FEWER = 0.75
+"""Share of the triangles that are left where an atlas of all of them fails."""
 _MAP = 4
 """Sides of normal maps are smaller than those of textures by this factor: voxels are coarser than texels."""
 _LATER = 0.3
@@ -124,9 +126,9 @@ def surfaces_from(
 
     Raises ValueError as ``make_surface``, and for more levels than triangles, texels or pixels allow.
     """
-    levels = level_options(chosen, count)
+    levels = level_options(chosen.sized(sources.closed), count)
     said = progress or (lambda *_: None)
-    vertices, faces, relief, grid = _fused(scene, sources, chosen, threads, said)
+    vertices, faces, relief, grid = _fused(scene, sources, levels[0], threads, said)
     result = []
     for number, level in enumerate(levels):
         if number:
@@ -134,7 +136,10 @@ def surfaces_from(
             vertices = grid.in_scene(vertices)
         views = tuple(reduced(view, level.size) for view in sources.views)
         seen = replace(sources, views=views)
-        base, fitted, uv = _surface_of(scene, vertices, faces, grid, seen, level, threads, said)
+        least = 0 if chosen.faces is None else len(faces)
+        blank = _blank(vertices, faces, grid, level.texture, least=least, fast=not sources.closed)
+        base, fitted = _surface_of(scene, blank, seen, level, threads, said)
+        vertices, faces, uv = blank.vertices, blank.faces, blank.uv
         if level.texture and relief is not None:
             side = -(-level.texture // _MAP)
             base = replace(base, normal_map=normal_map(vertices, faces, uv, side, relief))
@@ -143,30 +148,44 @@ def surfaces_from(
     return result
 
 
+def _blank(
+    vertices: np.ndarray, faces: np.ndarray, grid: Grid, side: int, *, least: int = 0, fast: bool = False
+) -> Surface:
+    """The surface of these triangles with a texture without colours. Its charts are as large as on the
+    ``grid``: what is far from all cameras of a place needs few texels. Where they do not fit, or the library
+    fails, it has fewer triangles, but not fewer than ``least``. ``fast``: as for ``unwrap``."""
+    while True:
+        try:
+            uv, texels = _blank_texture(grid.contracted(vertices), faces, side, fast)
+            return Surface(vertices, faces, uv, texels)
+        except ValueError:
+            fewer = int(_FEWER * len(faces))
+            if fewer < max(least, CLOSED[0]):
+                raise
+            points, faces = collapsed(grid.contracted(vertices), faces, fewer)
+            vertices = grid.in_scene(points)
+
+
 def _surface_of(
     scene: GaussianCloud | SplatMesh,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    grid: Grid,
+    blank: Surface,
     sources: Sources,
-    chosen: SurfaceOptions,
+    chosen: SizedOptions,
     threads: int | None,
     progress: ProgressOf,
-) -> tuple[BaseMesh, np.ndarray, np.ndarray]:
-    """The surface of these triangles with their texture, and where fitting put the vertices; the texture
-    coordinates (f, 3, 2) of the triangles as given. Its charts are as large as on the ``grid``: what is far
-    from all cameras of a place needs few texels."""
-    surface = Surface(vertices, faces, *_blank_texture(grid.contracted(vertices), faces, chosen.texture))
+) -> tuple[BaseMesh, np.ndarray]:
+    """The surface with its colours, and where fitting put the vertices of ``blank``."""
+    surface, faces = blank, blank.faces
     if chosen.texture or chosen.rounds:
         surface = _fitted(surface, sources, chosen, threads, progress)
-    fitted, uv = surface.vertices, surface.uv
+    fitted = surface.vertices
     if sources.closed:
         sheets = split_pinches(surface.vertices, faces, surface.uv)
         faces = sheets.faces
         surface = surface._replace(vertices=sheets.vertices, uv=sheets.corners.astype(np.float32))
     base = BaseMesh(surface.vertices.astype(np.float32), faces, up=guess_up(scene), origin=scene.origin)
     if not chosen.texture:
-        return replace(base, colors=_vertex_colors(base, sources.views, threads)), fitted, uv
+        return replace(base, colors=_vertex_colors(base, sources.views, threads)), fitted
     pixels = np.full((*surface.texels.shape[:2], 4), 255, np.uint8)
     pixels[..., :3] = np.rint(255 * surface.texels)
     textured = replace(
@@ -175,13 +194,15 @@ def _surface_of(
         face_texture=np.zeros(len(faces), np.int32),
         textures=(Texture(pixels, ("clamp", "clamp")),),
     )
-    return textured, fitted, uv
+    return textured, fitted
 
 
-def _blank_texture(vertices: np.ndarray, faces: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+def _blank_texture(
+    vertices: np.ndarray, faces: np.ndarray, side: int, fast: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates, and texels without colours; for a ``side`` of 0 those of triangles one by one."""
     if side:
-        return unwrap(vertices, faces, side), np.zeros((side, side, 3), np.float32)
+        return unwrap(vertices, faces, side, fast=fast), np.zeros((side, side, 3), np.float32)
     side = cells_side(len(faces))
     return cells(len(faces), side), np.zeros((side, side, 3), np.float32)
 
@@ -189,7 +210,7 @@ def _blank_texture(vertices: np.ndarray, faces: np.ndarray, side: int) -> tuple[
 def _fused(
     scene: GaussianCloud | SplatMesh,
     sources: Sources,
-    options: SurfaceOptions,
+    options: SizedOptions,
     threads: int | None,
     progress: ProgressOf,
 ) -> tuple[np.ndarray, np.ndarray, Relief | None, Grid]:
@@ -212,6 +233,7 @@ def _fused(
         sources.depth,
         grid,
         unseen=-1.0 if sources.closed else None,
+        median=not sources.closed,
         threads=threads,
         each=lambda *_: done(),
     )
@@ -254,7 +276,8 @@ def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, thre
     points = []
     for camera in cameras:
         small = camera.scaled(_BOX_SIDE / max(camera.width, camera.height)).with_near_plane(mesh.vertices)
-        depth = render(mesh, small, depth=True, threads=threads).mean_depth(min_alpha=0.5)
+        depth = render(mesh, small, median_depth=True, threads=threads).median_depth
+        assert depth is not None
         rows, columns = np.nonzero(np.isfinite(depth))
         away = depth[rows, columns].astype(np.float64)
         x = (columns + 0.5 - small.cx) / small.fx * away

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, TypedDict
 
 from meshsplats._options import Advanced, Range, With, check_options
@@ -16,16 +16,20 @@ LEVEL_FACTOR = 2
 square."""
 MAX_TEXTURE = 8192
 """Largest side of a texture."""
+CLOSED, OPEN = (20_000, 2048), (60_000, 4096)
+"""Default numbers of triangles, and sides of the texture, of closed surfaces and of open ones."""
 
 
 @dataclass(frozen=True)
 class SurfaceOptions:
     """The options of ``make_surface``."""
 
-    faces: Annotated[int, Range(0, 10_000_000)] = 20_000
-    """Approximate largest number of triangles; 0: as many as the voxels give."""
-    texture: Annotated[int, Range(0, MAX_TEXTURE)] = 2048
-    """Side of the texture in texels; 0: colours of vertices instead."""
+    faces: Annotated[int | None, Range(0, 10_000_000)] = None
+    """Approximate largest number of triangles; 0: as many as the voxels give. None: 20,000 of closed
+    surfaces, 60,000 of open ones, or as many as an atlas can be made of."""
+    texture: Annotated[int | None, Range(0, MAX_TEXTURE)] = None
+    """Side of the texture in texels; 0: colours of vertices instead. None: 2048 for closed surfaces, 4096 for
+    open ones."""
     normal_map: Annotated[bool, With("texture")] = True
     """Keep the relief of the finest triangles as a normal map, of a quarter of the texture's side."""
     shape: Shape = "auto"
@@ -51,15 +55,38 @@ class SurfaceOptions:
 
     def checked(self) -> SurfaceOptions:
         """The same options. Raises ValueError for one out of its range."""
-        check_options(self)
-        if 0 < self.faces < 4:
-            raise ValueError(f"faces must be 4 or more, or 0 for all, got {self.faces}")
-        if 0 < self.texture < 64:
-            raise ValueError(f"texture must be 64 texels or more, or 0 for none, got {self.texture}")
+        sized = self.sized(closed=True)
+        check_options(sized)
+        if 0 < sized.faces < 4:
+            raise ValueError(f"faces must be 4 or more, or 0 for all, got {sized.faces}")
+        if 0 < sized.texture < 64:
+            raise ValueError(f"texture must be 64 texels or more, or 0 for none, got {sized.texture}")
         return self
 
+    def sized(self, closed: bool) -> SizedOptions:
+        """These options, with the default numbers of triangles and texels of a closed surface, or of an open
+        one, where they name none."""
+        faces, texture = CLOSED if closed else OPEN
+        values = {part.name: getattr(self, part.name) for part in fields(SurfaceOptions)}
+        chosen = {"faces": faces, "texture": texture}
+        return SizedOptions(**values | {name: n for name, n in chosen.items() if values[name] is None})
 
-def level_options(options: SurfaceOptions, count: int) -> list[SurfaceOptions]:
+
+@dataclass(frozen=True)
+class SizedOptions(SurfaceOptions):
+    """The options of a surface of a known kind."""
+
+    faces: int = CLOSED[0]
+    texture: int = CLOSED[1]
+
+
+def default_in_words(name: str) -> str:
+    """The default of an option, and that of open surfaces, where it is another."""
+    closed, place = (getattr(SurfaceOptions().sized(kind), name) for kind in (True, False))
+    return f"(default: {closed})" if closed == place else f"(default: {closed}; open surfaces: {place})"
+
+
+def level_options(options: SizedOptions, count: int) -> list[SizedOptions]:
     """The options of ``count`` levels of detail, from the finest on; ``faces`` of 0 stay, as each level has a
     quarter of the triangles of the one before. ValueError for levels that are too small, or none."""
     if count < 1:
@@ -87,8 +114,8 @@ def level_options(options: SurfaceOptions, count: int) -> list[SurfaceOptions]:
 class SurfaceChanges(TypedDict, total=False):
     """The fields of ``SurfaceOptions`` as keywords, for type checkers and editors."""
 
-    faces: int
-    texture: int
+    faces: int | None
+    texture: int | None
     normal_map: bool
     shape: Shape
     resolution: int
