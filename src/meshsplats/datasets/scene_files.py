@@ -56,7 +56,7 @@ class SceneReading:
         stands, unless ``look`` is False, or the folder has cameras, which know. FileFormatError for a mesh,
         and what ``load_gaussians`` raises."""
         from meshsplats.cameras.files import model_folder
-        from meshsplats.cameras.framing import warn_of_strays_in
+        from meshsplats.cameras.framing import warn_of_strays_in, warn_of_unseen
         from meshsplats.formats.gaussians import load_gaussians
         from meshsplats.formats.sniff import identify
         from meshsplats.viewpoints.finding import unusual_up
@@ -69,6 +69,7 @@ class SceneReading:
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
         warn_of_strays_in(cloud)
+        warn_of_unseen(cloud)
         if up is None and cloud.up is not None:
             self.tell(f"up: {direction_in_words(cloud.up)}, from the file's header")
         looked_at = up is None and look and cloud.up is None and model_folder(path) is None

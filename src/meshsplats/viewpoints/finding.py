@@ -137,10 +137,10 @@ def find_cameras(
     """Cameras that see a scene as photographs did, found from its splats alone.
 
     An object is seen from a dome around it, a photograph whose pixels were given depth from where it was
-    taken, and from close to there: nothing is known of its sides and its back. In any other scene the
-    dome shows walls from behind and the noise that no photograph saw, so views are looked for from where
-    splats look small and leave no holes. The result has the same bits on every run, with any number of
-    threads.
+    taken, and from close to there: nothing is known of its sides and its back. Splats that are too faint or
+    small to be seen from anywhere count as an object. In any other scene the dome shows walls from behind
+    and the noise that no photograph saw, so views are looked for from where splats look small and leave no
+    holes. The result has the same bits on every run, with any number of threads.
 
     Args:
         cloud: the splats.
@@ -174,6 +174,10 @@ def find_cameras(
             raise ValueError("no splat has any opacity: there is nothing to look at")
         sample = Sample(cloud, first_up, threads)
         places = find_places(sample)
+        if not places.worth.any():
+            if anywhere:
+                raise ValueError("the splats are so faint or small that nothing can be seen from within")
+            return _around(cloud, outside._replace(confidence=0.0), count, width, height)
         scene = _within(sample, places, kind, confidence, given)
         views = choose_views(sample, places, scene.up, wanted)
         found = _searched[cloud] = _Search(key, wanted, kind != "object", scene, views)
@@ -200,7 +204,10 @@ def first_impression(
     if outside.kind == "object":
         return replace(_around(cloud, outside, 1, 400, 400), cameras=())
     sample = Sample(cloud, first_up, threads, SMALL_SAMPLE)
-    return _within(sample, find_places(sample, FEW), outside.kind, outside.confidence, given)
+    places = find_places(sample, FEW)
+    if not places.worth.any():
+        return replace(_around(cloud, outside._replace(confidence=0.0), 1, 400, 400), cameras=())
+    return _within(sample, places, outside.kind, outside.confidence, given)
 
 
 def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> np.ndarray | None:
@@ -244,7 +251,7 @@ def _from_outside(cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int 
     """What splats look like from outside. It looks once at splats that did not change."""
     known = _outsides.get(cloud)
     if known is None or known[0] != key:
-        relief, sure = find_relief(cloud, up), 1.0
+        relief, sure = find_relief(cloud, up), 0.0 if key[1] is None else 1.0
         kind, confidence = ("relief", relief.confidence) if relief else kind_from_outside(cloud, up, threads)
         if kind == "object" and key[1] is None:
             up, sure = find_stance(cloud, threads) if len(cloud) >= FEWEST else (up, 0.0)
