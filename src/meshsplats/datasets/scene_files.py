@@ -98,8 +98,8 @@ class SceneReading:
 
     def _tell_found(self, up: np.ndarray) -> None:
         self.tell(
-            f"up: {direction_in_words(up)}, as the object stands (likely); with the usual -y it would tip"
-            " over; --up -y keeps that"
+            f"up: {direction_in_words(up)}, as the object stands (likely): with the usual -y it would tip"
+            " over; if that is wrong, give --up -y, or write it down by 'convert --as-splats --up -y'"
         )
 
     def load_scene(
