@@ -99,7 +99,7 @@ class SceneReading:
     def _tell_found(self, up: np.ndarray) -> None:
         self.tell(
             f"up: {direction_in_words(up)}, as the object stands (likely): with the usual -y it would tip"
-            " over; if that is wrong, name it by ``up``, which 'meshsplats convert' can also write into a file"
+            " over; if that is wrong, name it by ``up``, which 'meshsplats convert' can write into a file"
         )
 
     def load_scene(
