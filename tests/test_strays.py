@@ -12,10 +12,10 @@ from _gpu import need_gpu
 from conftest import shared_data
 
 import meshsplats as ms
-from meshsplats.cameras.framing import STRAY, warn_of_strays
+from meshsplats.cameras.framing import STRAY, UNSEEN, scene_bounds, warn_of_strays, warn_of_unseen
 from meshsplats.cli import main
 from meshsplats.conversion.cleaning import find
-from meshsplats.errors import StraysWarning
+from meshsplats.errors import DataWarning, StraysWarning
 from meshsplats.rendering import render, render_splats
 from meshsplats.tiles.building import TileOptions, build_tiles
 from meshsplats.tiles.drawing import choose_tiles, render_tiles
@@ -162,3 +162,35 @@ def test_the_threshold():
             warnings.simplefilter("always")
             warn_of_strays(cloud, cloud.means.min(axis=0), high, 0.0)
         assert bool(found) == warned
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scales": np.full((1500, 3), 0.002, np.float32)}, "so small for their distances (usually 0.002"),
+        ({"opacities": np.full(1500, 0.001, np.float32)}, "so faint (95% have an opacity below 0.001)"),
+    ],
+)
+def test_splats_that_pictures_do_not_show(change, words, tmp_path, capsys):
+    """By hand: 1500 balls of 0.05 have 2 pi 1500 0.05^2 = 23.6 of area, over pi: 7.5 times the disc."""
+    plain = ball()
+    ms.save_gaussians(plain, tmp_path / "plain.ply")
+    ms.save_gaussians(replace(plain, **change), tmp_path / "unseen.ply")
+    assert main(["info", str(tmp_path / "plain.ply")]) == 0
+    assert capsys.readouterr().err == ""
+    for words_of in (["info"], ["cameras", "-o", str(tmp_path / "c.json")]):
+        assert main([words_of[0], str(tmp_path / "unseen.ply"), *words_of[1:]]) == 0
+        said = capsys.readouterr().err
+        assert said.count("hardly anything can be seen") == 1
+        assert words in said
+
+
+def test_how_much_is_seen():
+    """Shares on both sides of the limit, by hand."""
+    at = np.sqrt(UNSEEN / 0.95 / 0.9 / (2 * 1500)) * scene_bounds(ball()).radius
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_unseen(ball(size=1.02 * at))
+        warn_of_unseen(ball(count=999, size=0.001))
+    with pytest.warns(DataWarning, match="about 5% of the pictures"):
+        warn_of_unseen(ball(size=0.98 * at))

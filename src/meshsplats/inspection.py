@@ -16,7 +16,7 @@ from meshsplats._origin import choose_origin
 from meshsplats.camera import Camera
 from meshsplats.cameras.camera_path import is_camera_path
 from meshsplats.cameras.files import cameras_beside, load_cameras
-from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds, warn_of_strays_in
+from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds, warn_of_strays_in, warn_of_unseen
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import PhotoFile
@@ -59,6 +59,7 @@ def describe(path: str | os.PathLike[str], reading: Mapping[str, Any] | None = N
     elif kind == "splats":
         cloud = load_gaussians(path, **(reading or {}))
         warn_of_strays_in(cloud)
+        warn_of_unseen(cloud)
         found |= {"format": format_of(path)} | _in_time(path) | _splats(cloud)
         cameras = cameras_beside(path, np.zeros(3))
         if cameras:

@@ -408,7 +408,7 @@ def test_kinds_of_real_scenes(name, kinds, tmp_path):
     found = find_cameras(cloud, 4, threads=2)
     assert found.kind in kinds
     if found.kind == "object":
-        train = splat_dataset(cloud, train=1, test=4, width=16, threads=2)
+        train = splat_dataset(cloud, train=1, test=4, width=16, up=found.up, threads=2)
         assert [v.camera.name for v in train.test] == [f"view_{i:04d}" for i in range(4)]
         for view, camera in zip(train.test, found.cameras, strict=True):
             same = view.camera.world_to_camera == camera.world_to_camera

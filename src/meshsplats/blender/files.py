@@ -239,8 +239,8 @@ class PictureRun:
     def _scenes(self, chain: Chain | None) -> list[GaussianCloud | SplatMesh]:
         """The scene, or those of the levels of a chain, relative to the origin of the finest."""
         files = [level.path for level in chain.levels] if chain else [self.source]
-        part, reading = self.options.part, self.options.reading
-        first, *others = (cropped(reading.load_scene(file), part.crop) for file in files)
+        part, reading, up = self.options.part, self.options.reading, self.options.views.up
+        first, *others = (cropped(reading.load_scene(file, up=up), part.crop) for file in files)
         return [first, *(level.relative_to(first.origin) for level in others)]
 
     def _chain(self, suffix: str) -> Chain | None:

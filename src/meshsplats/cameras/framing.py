@@ -13,7 +13,7 @@ from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
 from meshsplats._kinds import need_array
 from meshsplats.camera import Camera
-from meshsplats.errors import StraysWarning
+from meshsplats.errors import DataWarning, StraysWarning
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -55,6 +55,12 @@ of its base."""
 STRAY = 10_000.0
 """Distance from the subject, and size, in its radii, from which on splats are strays. In captures that were
 tried, floaters are at most 1,100 radii away."""
+
+MANY = 1000
+"""Number of splats from which on a scene is expected to be visible..."""
+UNSEEN = 0.05
+"""...by so large a share: shadows of splats times their opacity, over the area of the subject. In captures
+that were tried, splats have 0.4 to 10, points that were written as splats 0.01 to 0.2."""
 
 Framable = GaussianCloud | SplatMesh | np.ndarray
 """Whatever cameras can be placed around: splats, a mesh, or points (n, 3)."""
@@ -223,6 +229,35 @@ def warn_of_strays_in(scene: GaussianCloud | SplatMesh) -> None:
     if len(points):
         size = float(scene.scales.max()) if isinstance(scene, GaussianCloud) else 0.0
         warn_of_strays(scene, points.min(axis=0), points.max(axis=0), size)
+
+
+def warn_of_unseen(cloud: GaussianCloud) -> None:
+    """Issues a DataWarning if pictures of many splats show hardly anything: they are too faint, or as small
+    as the points of a scan."""
+    if len(cloud) < MANY:
+        return
+    step, bounds = -(-len(cloud) // SAMPLE), scene_bounds(cloud)
+    scales, opacities = cloud.scales[::step].astype(np.float64), cloud.opacities[::step].astype(np.float64)
+    near = np.linalg.norm(cloud.means[::step] - bounds.center, axis=1) <= bounds.radius
+    # The mean shadow of a splat, over the disc that the subject covers.
+    shadows = 2 * np.pi / 3 * (scales * np.roll(scales, 1, axis=1)).sum(axis=1) * near
+    shares = step * np.array([(opacities * shadows).sum(), shadows.sum()]) / (np.pi * bounds.radius**2)
+    if shares[0] >= UNSEEN:
+        return
+    if shares[1] >= UNSEEN:
+        most = float(np.quantile(opacities, 0.95))
+        why = f"so faint (95% have an opacity below {max(most, 0.001):.2g})"
+        cure = "the program that wrote the file may have spoilt its opacities"
+    else:
+        sizes = f"usually {np.median(scales):.2g} units, in a scene of {bounds.radius:.2g}"
+        why = f"so small for their distances ({sizes})"
+        cure = "it looks like a scan of points, which has to be written with larger ones"
+    warnings.warn(
+        f"hardly anything can be seen: the splats are {why} that they cover about {100 * shares[0]:.1g}% of"
+        f" the pictures; {cure}",
+        DataWarning,
+        stacklevel=2,
+    )
 
 
 def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np.ndarray:

@@ -15,7 +15,7 @@ import tyro
 from meshsplats._files import atomic
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.messages import flag, one_line, say
+from meshsplats.cli.messages import flag, one_line, say, with_flags
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.formats.outputs import Scene, placed
 
@@ -35,7 +35,7 @@ class SplatOptions(SceneReading):
     """How splat files are read."""
 
     def tell(self, text: str) -> None:
-        say(text)
+        say(with_flags(text))
 
     def again(self) -> list[str]:
         """The words with which another command reads the file in the same way."""

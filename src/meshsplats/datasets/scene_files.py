@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -43,12 +43,24 @@ class SceneReading:
     def tell(self, text: str) -> None:
         """Gets what headers say that changes the scene."""
 
-    def load(self, path: Path, origin: np.ndarray | None = None, *, up: str | None = None) -> GaussianCloud:
+    def load(
+        self,
+        path: Path,
+        origin: np.ndarray | None = None,
+        *,
+        up: str | None = None,
+        look: bool = True,
+    ) -> GaussianCloud:
         """The splats of a file, relative to ``origin`` (3,). Tells what its header names; ``up``: the option
-        that counts in its place. FileFormatError for a mesh, and what ``load_gaussians`` raises."""
-        from meshsplats.cameras.framing import warn_of_strays_in
+        that counts in its place. An object that would tip over the usual way up gets the one in which it
+        stands, unless ``look`` is False, or the folder has cameras, which know. FileFormatError for a mesh,
+        and what ``load_gaussians`` raises."""
+        from meshsplats.cameras.files import model_folder
+        from meshsplats.cameras.framing import warn_of_strays_in, warn_of_unseen
         from meshsplats.formats.gaussians import load_gaussians
         from meshsplats.formats.sniff import identify
+        from meshsplats.viewpoints.finding import unusual_up
+        from meshsplats.viewpoints.standing import thinned
 
         try:
             cloud = load_gaussians(path, origin=origin, **self.arguments)
@@ -57,8 +69,13 @@ class SceneReading:
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
         warn_of_strays_in(cloud)
+        warn_of_unseen(cloud)
         if up is None and cloud.up is not None:
             self.tell(f"up: {direction_in_words(cloud.up)}, from the file's header")
+        looked_at = up is None and look and cloud.up is None and model_folder(path) is None
+        if looked_at and (found := unusual_up(thinned([cloud]))) is not None:
+            cloud = replace(cloud, up=found)
+            self._tell_found(found)
         if self.kernel == "auto" and cloud.kernel != "3dgs":
             self.tell(f"kernel: {cloud.kernel}, from the file")
         return cloud
@@ -68,15 +85,28 @@ class SceneReading:
     ) -> SplatStream:
         """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
         from meshsplats.formats.streaming import stream_gaussians
+        from meshsplats.viewpoints.finding import unusual_up
+        from meshsplats.viewpoints.standing import thinned
 
         stream = stream_gaussians(path, origin=origin, **self.arguments)
         if up is None and (told := stream.up) is not None:
             self.tell(f"up: {direction_in_words(told)}, from the files' headers")
+        elif up is None and (found := unusual_up(thinned(stream))) is not None:
+            stream.found_to_stand(found)
+            self._tell_found(found)
         return stream
 
-    def load_scene(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh:
-        """The splats or the mesh at ``path``; ``up`` as for ``load``. FileFormatError for cameras, and
-        OptionsError as by ``refuse_for``."""
+    def _tell_found(self, up: np.ndarray) -> None:
+        self.tell(
+            f"up: {direction_in_words(up)}, as the object stands (likely): with the usual -y it would tip"
+            " over; if that is wrong, name it by ``up``, which 'meshsplats convert' can write into a file"
+        )
+
+    def load_scene(
+        self, path: Path, *, up: str | None = None, look: bool = True
+    ) -> GaussianCloud | SplatMesh:
+        """The splats or the mesh at ``path``; ``up`` and ``look`` as for ``load``. FileFormatError for
+        cameras, and OptionsError as by ``refuse_for``."""
         from meshsplats.cameras.framing import warn_of_strays_in
         from meshsplats.formats.sniff import identify
 
@@ -86,7 +116,7 @@ class SceneReading:
                 f"{path}: a JSON file; expected splats or a mesh (``cameras`` takes cameras)"
             )
         if kind == "splats":
-            return self.load(path, up=up)
+            return self.load(path, up=up, look=look)
         self.refuse_for(path)
         from meshsplats.formats.meshes import load_mesh
 

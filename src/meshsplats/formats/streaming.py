@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,7 @@ class SplatStream:
         self._origin = None if origin is None else checked_array("origin", origin, np.float64, (3,))
         self.count = 0
         """Splats that the last iteration has given so far."""
+        self._found_up: np.ndarray | None = None
 
     @property
     def origin(self) -> np.ndarray:
@@ -108,7 +110,8 @@ class SplatStream:
             for block in splats.blocks(self.block, strict=self.strict, origin=own):
                 finished = self._reading.finished(block, splats)
                 if len(finished):
-                    yield finished.transformed(turn)
+                    finished = finished.transformed(turn)
+                    yield finished if self._found_up is None else replace(finished, up=self._found_up)
 
     @property
     def reading(self) -> list[Any]:
@@ -121,6 +124,10 @@ class SplatStream:
     def up(self) -> np.ndarray | None:
         """(3,) unit direction that points up, where all of the files say so, and the same."""
         return shared_up([self._up(path) for path in self.paths])
+
+    def found_to_stand(self, up: np.ndarray) -> None:
+        """Gives ``up``, a (3,) unit direction, to all blocks: the files name none, and the splats show it."""
+        self.up = self._found_up = up
 
     def _up(self, path: Path) -> np.ndarray | None:
         with content_of(path) as content:

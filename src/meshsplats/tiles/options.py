@@ -113,7 +113,7 @@ class TilingOptions:
     """Only splats with their centre in this box, in the coordinates of the file."""
     up: str | None = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
-    files, else -y."""
+    files, else -y, or as an object stands."""
     lit: bool = False
     """A material that takes light and shadow, not one that shows the colours as they are."""
     alpha: TilesAlpha = "auto"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,10 +24,11 @@ from meshsplats.choices import MAX_SIDE
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import FRAGMENTS, preview_camera
-from meshsplats.viewpoints.kind import Kind, kind_from_inside, kind_from_outside, usual_depth
+from meshsplats.viewpoints.kind import FEWEST, Kind, kind_from_inside, kind_from_outside, usual_depth
 from meshsplats.viewpoints.relief import Relief, find_relief
 from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
+from meshsplats.viewpoints.standing import find_stance, tips_over
 from meshsplats.viewpoints.upright import find_upright
 from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, Checked, choose_views
 
@@ -104,8 +106,20 @@ class _Search:
 
 _searched: WeakKeyDictionary[GaussianCloud, _Search] = WeakKeyDictionary()
 """The last search within each scene that is in use: commands ask for views of several sizes and numbers."""
-_Outside = tuple[Relief | None, Kind | None, float]
-"""The relief that a scene is, or else what ``kind_from_outside`` says of it."""
+
+
+class _Outside(NamedTuple):
+    """What a scene looks like from outside."""
+
+    relief: Relief | None
+    """That it is, or else what ``kind_from_outside`` says of it."""
+    kind: Kind | None
+    confidence: float
+    up: np.ndarray
+    """(3,) of an object: as it stands, where nobody names it."""
+    up_confidence: float
+
+
 _outsides: WeakKeyDictionary[GaussianCloud, tuple[_Key, _Outside]] = WeakKeyDictionary()
 """And what it looked like from outside, also where it is an object, in which nothing is searched."""
 
@@ -123,10 +137,10 @@ def find_cameras(
     """Cameras that see a scene as photographs did, found from its splats alone.
 
     An object is seen from a dome around it, a photograph whose pixels were given depth from where it was
-    taken, and from close to there: nothing is known of its sides and its back. In any other scene the
-    dome shows walls from behind and the noise that no photograph saw, so views are looked for from where
-    splats look small and leave no holes. The result has the same bits on every run, with any number of
-    threads.
+    taken, and from close to there: nothing is known of its sides and its back. Splats that are too faint or
+    small to be seen from anywhere count as an object. In any other scene the dome shows walls from behind
+    and the noise that no photograph saw, so views are looked for from where splats look small and leave no
+    holes. The result has the same bits on every run, with any number of threads.
 
     Args:
         cloud: the splats.
@@ -147,18 +161,23 @@ def find_cameras(
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     given, first_up = _told_up(cloud, up)
-    key, wanted = (_fingerprint(cloud), None if given is None else given.tobytes()), min(count, MOST)
+    key, wanted = _key(cloud, given), min(count, MOST)
     found = _searched.get(cloud)
     if found is None or found.key != key or found.wanted < wanted or not (anywhere or found.is_place):
-        relief, kind, confidence = _from_outside(cloud, key, first_up, threads)
-        if relief is not None:
-            return _before(cloud, relief, given, count, width, height)
+        outside = _from_outside(cloud, key, first_up, threads)
+        if outside.relief is not None:
+            return _before(cloud, outside.relief, given, count, width, height)
+        kind, confidence = outside.kind, outside.confidence
         if kind == "object" and not anywhere:
-            return _around(cloud, confidence, given, count, width, height)
+            return _around(cloud, outside, count, width, height)
         if not cloud.opacities.any():
             raise ValueError("no splat has any opacity: there is nothing to look at")
         sample = Sample(cloud, first_up, threads)
         places = find_places(sample)
+        if not places.worth.any():
+            if anywhere:
+                raise ValueError("the splats are so faint or small that nothing can be seen from within")
+            return _around(cloud, outside._replace(confidence=0.0), count, width, height)
         scene = _within(sample, places, kind, confidence, given)
         views = choose_views(sample, places, scene.up, wanted)
         found = _searched[cloud] = _Search(key, wanted, kind != "object", scene, views)
@@ -179,13 +198,31 @@ def first_impression(
     if not worth_a_look(cloud):
         return None
     given, first_up = _told_up(cloud, up)
-    if (relief := find_relief(cloud, first_up)) is not None:
-        return replace(_before(cloud, relief, given, 1, 400, 400), cameras=())
-    kind, confidence = kind_from_outside(cloud, first_up, threads)
-    if kind == "object":
-        return replace(_around(cloud, confidence, given, 1, 400, 400), cameras=())
+    outside = _from_outside(cloud, _key(cloud, given), first_up, threads)
+    if outside.relief is not None:
+        return replace(_before(cloud, outside.relief, given, 1, 400, 400), cameras=())
+    if outside.kind == "object":
+        return replace(_around(cloud, outside, 1, 400, 400), cameras=())
     sample = Sample(cloud, first_up, threads, SMALL_SAMPLE)
-    return _within(sample, find_places(sample, FEW), kind, confidence, given)
+    places = find_places(sample, FEW)
+    if not places.worth.any():
+        return replace(_around(cloud, outside._replace(confidence=0.0), 1, 400, 400), cameras=())
+    return _within(sample, places, outside.kind, outside.confidence, given)
+
+
+def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> np.ndarray | None:
+    """(3,) unit direction that is up for an object whose file names none, where it would tip over the usual
+    way up and stands well another way; None for any other scene, of most of which it says so at once."""
+    if cloud.up is not None or len(cloud) < FEWEST or not (worth_a_look(cloud) and tips_over(cloud)):
+        return None
+    given, first_up = _told_up(cloud, None)
+    outside = _from_outside(cloud, _key(cloud, given), first_up, threads)
+    stands = outside.kind == "object" and outside.up_confidence > 0
+    return outside.up if stands and not np.array_equal(outside.up, first_up) else None
+
+
+def _key(cloud: GaussianCloud, given: np.ndarray | None) -> _Key:
+    return _fingerprint(cloud), None if given is None else given.tobytes()
 
 
 def _fingerprint(cloud: GaussianCloud) -> bytes:
@@ -214,27 +251,24 @@ def _from_outside(cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int 
     """What splats look like from outside. It looks once at splats that did not change."""
     known = _outsides.get(cloud)
     if known is None or known[0] != key:
-        relief = find_relief(cloud, up)
-        seen: _Outside = (
-            (None, *kind_from_outside(cloud, up, threads))
-            if relief is None
-            else (relief, "relief", relief.confidence)
-        )
+        relief, sure = find_relief(cloud, up), 0.0 if key[1] is None else 1.0
+        kind, confidence = ("relief", relief.confidence) if relief else kind_from_outside(cloud, up, threads)
+        if kind == "object" and key[1] is None:
+            up, sure = find_stance(cloud, threads) if len(cloud) >= FEWEST else (up, 0.0)
+        seen = _Outside(relief, kind, confidence, up, sure)
         known = _outsides[cloud] = key, seen
     return known[1]
 
 
-def _around(
-    cloud: GaussianCloud, confidence: float, given: np.ndarray | None, count: int, width: int, height: int
-) -> FoundCameras:
+def _around(cloud: GaussianCloud, seen: _Outside, count: int, width: int, height: int) -> FoundCameras:
     """An object and ``count`` cameras of a dome around it."""
-    up = guess_up(cloud) if given is None else given
+    up = seen.up
     elevations = SURROUNDED_ELEVATIONS if has_surroundings(cloud) else OBJECT_ELEVATIONS
     cameras = outside_cameras(cloud, count, elevations=elevations, up=up, width=width, height=height)
     bounds = scene_bounds(cloud)
     ground = float((bounds.points @ up).min())
     extent = float(np.linalg.norm(cameras[0].center - bounds.center))
-    return FoundCameras("object", confidence, up, float(given is not None), ground, extent, tuple(cameras))
+    return FoundCameras("object", seen.confidence, up, seen.up_confidence, ground, extent, tuple(cameras))
 
 
 def _before(
