@@ -199,10 +199,9 @@ class TrainingCommand(Command):
             return 128 + (stop.signal or signal.SIGINT)
         most = SCORED_VIEWS if self.has_photographs else self.target.held_out
         result = RunResult(files, trained, time.perf_counter() - start, scored, most, earlier)
-        lines = (
-            () if self.json else (*map(with_flags, result.in_words()), *self.next_steps(files, config, plan))
-        )
-        self.finish(result.to_dict(), *lines)
+        words = () if self.json else map(with_flags, result.in_words())
+        following = () if self.json else self.next_steps(files, config, plan)
+        self.finish(result.to_dict(), *words, *following)
         return 0
 
     def preview_camera(self, plan: Plan) -> Camera | None:
