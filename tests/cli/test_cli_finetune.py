@@ -595,3 +595,13 @@ def test_what_has_no_order_of_its_own_is_refused_before_the_work(splats, tmp_pat
         assert run(splats, *options, "--order", "file", "--steps", "3", *SMALL) != 0
         assert message in " ".join(capsys.readouterr().err.split())
         assert not list(tmp_path.iterdir())
+
+
+def test_splats_too_faint_for_opaque_triangles(tmp_path, capsys):
+    cloud = make_scene(1200)
+    path = tmp_path / "faint.ply"
+    save_gaussians(replace(cloud, opacities=np.full(len(cloud), 0.012, np.float32)), path)
+    words = (path, "-o", tmp_path / "t.glb", "--opacity", "cutoff", "--steps", "2", *SMALL)
+    assert run(*words) == 2
+    assert "no triangle is as opaque as" in capsys.readouterr().err
+    assert not (tmp_path / "t.glb").exists()

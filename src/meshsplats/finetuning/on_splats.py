@@ -19,6 +19,7 @@ from meshsplats.conversion.merging_views import merged_within_limits
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.draw_order import DrawOrder
+from meshsplats.errors import OptionsError
 from meshsplats.finetuning.baseline import (
     SHARES,
     SizeScores,
@@ -187,7 +188,17 @@ class SplatTuning:
         return {name: getattr(self.config, name) for name in BRIEF_RATES} if self.is_brief else {}
 
     def optimise(self, options: RunOptions, show: Display) -> Tuned:
-        """The tuned mesh, or the conversion where that is better at some size."""
+        """The tuned mesh, or the conversion where that is better at some size. OptionsError if no triangle of
+        it is opaque enough to stay."""
+        best = self._best(options, show)
+        if not len(best.mesh.faces):
+            raise OptionsError(
+                f"no triangle is as opaque as {self.config.cutoff:g}, the cutoff, before the run or after it:"
+                " ``opacity`` 'blended' shows splats as faint as these"
+            )
+        return best
+
+    def _best(self, options: RunOptions, show: Display) -> Tuned:
         run, baseline, config = self._run, self._baseline, self.config
         if not run.resumed:
             if not self._has_time():
