@@ -13,6 +13,8 @@ from _stock_viewer import stock_image
 from meshsplats import ConversionOptions, convert, load_mesh, orbit, psnr, render, save_gaussians, simplify
 from meshsplats.chains import make_chain
 from meshsplats.cli import main
+from meshsplats.conversion import merging
+from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.demo_scene import make_scene
 from meshsplats.file_options import ChainOptions
 from meshsplats.formats.gltf.document import GltfDocument
@@ -23,6 +25,7 @@ from meshsplats.levels import (
     level_targets,
     likeness,
     make_level,
+    merged,
     plan_levels,
     views_to_score,
 )
@@ -254,12 +257,12 @@ def test_levels_are_merged_from_those_above(splats, tmp_path, monkeypatch, least
     monkeypatch.setattr(module, "MERGED_FROM", least)
     sizes = []
 
-    def counts(cloud, count, **options):
+    def counts(cloud, count, cameras, threads):
         if count < len(cloud):
             sizes.append((len(cloud), count))
-        return simplify(cloud, count, **options)
+        return simplify(cloud, count, cameras=cameras, threads=threads)
 
-    monkeypatch.setattr(module, "simplify", counts)
+    monkeypatch.setattr(module, "simplify_large", counts)
     three = ("--no-tune", "--width", 64, "--levels", 3)
     assert run(splats, "-o", tmp_path / "chain", *three) == 0
     assert sizes == ([(400, 100), (100, 25)] if least == 50 else [(400, 100), (400, 25)])
@@ -273,6 +276,16 @@ def test_levels_are_merged_from_those_above(splats, tmp_path, monkeypatch, least
     last.unlink()
     assert run(splats, "-o", tmp_path / "other", *three, "--resume") == 0
     assert (tmp_path / "other" / "level_2.glb").read_bytes() == expected
+
+
+def test_levels_of_many_splats_are_merged_in_blocks(monkeypatch):
+    monkeypatch.setattr(merging, "LARGE", 1000)
+    monkeypatch.setitem(merging.simplify_in_blocks.__kwdefaults__, "block", 500)
+    cloud = make_scene(2000)
+    cameras = orbit(cloud, 4, width=60, height=60)
+    made = merged(cloud, Level(400, 60, 2000), cameras)
+    np.testing.assert_array_equal(made.means, simplify_in_blocks(cloud, 400, cameras=cameras).means)
+    assert not np.array_equal(made.means, simplify(cloud, 400, cameras=cameras).means)
 
 
 @pytest.mark.slow

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.footprint import FILTER_PX2
+from meshsplats.conversion.merging import simplify_large
 from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.draw_order import DrawOrder
@@ -198,7 +199,7 @@ def merged(
     cloud: GaussianCloud, level: Level, cameras: Sequence[Camera], threads: int | None = None
 ) -> GaussianCloud:
     """The splats of ``level``: similar ones of ``cloud`` merged, for images from ``cameras``."""
-    return simplify(cloud, level.splats, cameras=cameras, threads=threads)
+    return simplify_large(cloud, level.splats, cameras, threads)
 
 
 def merges_further(level: Level) -> bool:
