@@ -185,7 +185,7 @@ def test_a_file_that_is_read_stands(tmp_path):
     assert cloud.up.tolist() == [0, 0, 1]
     assert len(reading.told) == 1
     assert reading.told[0].startswith("up: z, as the object stands (likely): ")
-    assert reading.load(path, look=False).up is None
+    assert reading.load(path, find_up=False).up is None
     assert reading.load(path, up="-y").up is None
     stream = reading.stream(path)
     assert stream.up.tolist() == [0, 0, 1]

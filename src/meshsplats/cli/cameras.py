@@ -62,7 +62,7 @@ class Cameras(Command):
             raise UsageError(f"cameras are written as .json, got {self.output.name!r}")
         preview = beside(self.output, PREVIEW)
         check_outputs([self.output, preview], self.force, inputs=[self.input])
-        scene = self.reading.load_scene(self.input, up=self.up, look=False)
+        scene = self.reading.load_scene(self.input, up=self.up, find_up=False)
         if not isinstance(scene, GaussianCloud):
             raise UsageError(f"{self.input} is a mesh: cameras are found from the splats it was made of")
         up = optional_up(self.up)

@@ -83,10 +83,7 @@ def clumps(means: np.ndarray, masses: np.ndarray, most: float) -> np.ndarray:
         code = code >> np.uint64(3)
     found = np.empty_like(order)
     found[order] = first
-    leading, group = np.unique(found, return_index=True, return_inverse=True)[1:]
-    rank = np.empty(len(leading), np.int64)
-    rank[np.argsort(leading)] = np.arange(len(leading))
-    return rank[group]
+    return _in_order(found)
 
 
 def _merge_neighbours(moments: Moments, count: int, threads: int) -> tuple[np.ndarray, int]:
@@ -113,10 +110,15 @@ def _merge_neighbours(moments: Moments, count: int, threads: int) -> tuple[np.nd
     run("ms_merge_pairs", merging)
     group = np.empty(n, np.int64)
     group[order] = found
+    return _in_order(group), merging.remaining
+
+
+def _in_order(group: np.ndarray) -> np.ndarray:
+    """The groups (n,), numbered in the order of their first members."""
     first, group = np.unique(group, return_index=True, return_inverse=True)[1:]
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    return rank[group], merging.remaining
+    return rank[group]
 
 
 class Moments(NamedTuple):

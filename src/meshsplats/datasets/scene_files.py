@@ -49,12 +49,12 @@ class SceneReading:
         origin: np.ndarray | None = None,
         *,
         up: str | None = None,
-        look: bool = True,
+        find_up: bool = True,
     ) -> GaussianCloud:
         """The splats of a file, relative to ``origin`` (3,). Tells what its header names; ``up``: the option
         that counts in its place. An object that would tip over the usual way up gets the one in which it
-        stands, unless ``look`` is False, or the folder has cameras, which know. FileFormatError for a mesh,
-        and what ``load_gaussians`` raises."""
+        stands, unless ``find_up`` is False, or the folder has cameras, which know. FileFormatError for a
+        mesh, and what ``load_gaussians`` raises."""
         from meshsplats.cameras.files import model_folder
         from meshsplats.cameras.framing import warn_of_strays_in, warn_of_unseen
         from meshsplats.formats.gaussians import load_gaussians
@@ -72,7 +72,7 @@ class SceneReading:
         warn_of_unseen(cloud)
         if up is None and cloud.up is not None:
             self.tell(f"up: {direction_in_words(cloud.up)}, from the file's header")
-        looked_at = up is None and look and cloud.up is None and model_folder(path) is None
+        looked_at = up is None and find_up and cloud.up is None and model_folder(path) is None
         if looked_at and (found := unusual_up(thinned([cloud]))) is not None:
             cloud = replace(cloud, up=found)
             self._tell_found(found)
@@ -103,9 +103,9 @@ class SceneReading:
         )
 
     def load_scene(
-        self, path: Path, *, up: str | None = None, look: bool = True
+        self, path: Path, *, up: str | None = None, find_up: bool = True
     ) -> GaussianCloud | SplatMesh:
-        """The splats or the mesh at ``path``; ``up`` and ``look`` as for ``load``. FileFormatError for
+        """The splats or the mesh at ``path``; ``up`` and ``find_up`` as for ``load``. FileFormatError for
         cameras, and OptionsError as by ``refuse_for``."""
         from meshsplats.cameras.framing import warn_of_strays_in
         from meshsplats.formats.sniff import identify
@@ -116,7 +116,7 @@ class SceneReading:
                 f"{path}: a JSON file; expected splats or a mesh (``cameras`` takes cameras)"
             )
         if kind == "splats":
-            return self.load(path, up=up, look=look)
+            return self.load(path, up=up, find_up=find_up)
         self.refuse_for(path)
         from meshsplats.formats.meshes import load_mesh
 

@@ -142,13 +142,14 @@ class SplatTuning:
         if self._record.brief_steps is not None:
             self.config = of_brief_run(self.config, self._record.brief_steps, set(run.fixed))
             self.dataset = run.targets(self.config, BRIEF_ZOOMS)
-        self._cloud = run.cloud
-        self._merged: tuple[GaussianCloud, ConversionOptions] | None = None
-        if self._record.max_splats is not None:
-            setup.phase(f"merging {len(run.cloud):,} splats to {self._record.max_splats:,}")
-            most, seen = self._record.max_splats, [view.camera for view in self.dataset.train]
-            self._cloud = simplify_in_blocks(run.cloud, most, cameras=seen, threads=run.threads)
+        self._cloud, cameras = run.cloud, [view.camera for view in self.dataset.train]
+        if (most := self._record.max_splats) is not None:
+            setup.phase(f"merging {len(run.cloud):,} splats to {most:,}")
+            self._cloud = simplify_in_blocks(run.cloud, most, cameras=cameras, threads=run.threads)
         setup.phase(f"converting {len(self._cloud):,} splats")
+        wanted = without_cameras(self._options)
+        self._to_convert = merged_within_limits(self._cloud, wanted, cameras, threads=run.threads)
+        """Splats and options of the conversion."""
         conversion = self._converted()
         self._order = None
         if self.config.order == "file":
@@ -156,9 +157,9 @@ class SplatTuning:
             conversion = conversion.plain  # as files have it
             check_for_file_order(conversion, self.config)
             # Views from all sides, too: around an object in its surroundings, none trains from below.
-            cameras = subsample([view.camera for view in self.dataset.train], VIEWS // 2)
             around = subsample(default_views(conversion), VIEWS // 2)
-            self._order = drawing_order(conversion, [*cameras, *around], threads=run.threads)
+            views = [*subsample(cameras, VIEWS // 2), *around]
+            self._order = drawing_order(conversion, views, threads=run.threads)
         setup.phase("scoring the conversion")
         seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
         self._baseline = measure_baseline(
@@ -232,10 +233,8 @@ class SplatTuning:
 
     def _converted(self) -> SplatMesh:
         cameras = [view.camera for view in self.dataset.train]
-        if self._merged is None:
-            wanted = without_cameras(self._options)
-            self._merged = merged_within_limits(self._cloud, wanted, cameras, threads=self._run.threads)
-        return converted(self._merged[0], self.config, self._merged[1], cameras)
+        cloud, options = self._to_convert
+        return converted(cloud, self.config, options, cameras)
 
     def _started(self) -> SplatMesh:
         """The starting mesh of a run that is not brief. The record notes the images that there was time for,
