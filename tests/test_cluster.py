@@ -238,6 +238,7 @@ def test_without_dask_the_extra_is_named(monkeypatch):
 # ---- Commands
 
 
+@pytest.mark.slow
 def test_tiles_of_a_cluster_have_the_same_bits(splats, scheduler, tmp_path, capsys):
     build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
     words = ["tiles", str(splats), "-o", str(tmp_path / "there"), "--max-triangles", "4096"]

@@ -164,6 +164,7 @@ def test_the_threshold():
         assert bool(found) == warned
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -373,6 +373,7 @@ def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
     assert (tmp_path / "t.npz.run" / "checkpoint.safetensors").is_file()
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):

@@ -209,6 +209,7 @@ def test_the_command_says_what_goes_and_draws_it(file, tmp_path, capsys):
     assert red[:, :third].sum() == red[:, 2 * third :].sum() == 0
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("kind", ["splats", "mesh"])
 def test_the_command_keeps_to_its_threads(file, tmp_path, monkeypatch, kind):
     """Without the option, images ask for the number of processors."""

@@ -70,6 +70,7 @@ def _area(mesh: SplatMesh) -> float:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("kind", ["splats", "antialiased", "2dgs", "mesh"])
 def test_a_wall_stays_and_what_hangs_before_it_goes(kind: str):
     cloud, what = place()

@@ -44,6 +44,7 @@ def test_the_best_variant_is_that_of_the_flags_that_linux_lists():
         assert best_variant(path) == expected
 
 
+@pytest.mark.slow(keep=3)
 @x86_64
 @linux
 @pytest.mark.parametrize(

@@ -386,6 +386,7 @@ def test_the_khronos_validator_finds_nothing_but_the_names_of_the_extension(tmp_
     assert all("/attributes/KHR_gaussian_splatting:" in pointer for pointer in named), named
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("name", ["a.compressed.ply", "a.splat", "a.spz", "b.spz", "a.sog"])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_splat_transform_reads_what_is_written(tmp_path, node_package, name, degree):

@@ -79,6 +79,7 @@ def test_nobody_waits_for_the_preview_of_a_runaway_scene(tmp_path, capsys, monke
     assert not list(tmp_path.glob("*.png"))
 
 
+@pytest.mark.slow
 def test_long_images_are_announced(tmp_path, capsys):
     runaway(tmp_path / "a.ply", 2000)
     # One thread, so that the estimate is the same on all machines; the image itself is small.

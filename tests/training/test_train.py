@@ -217,6 +217,7 @@ def test_changing_light_is_fitted(ball):
     assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("start_found_once")
 def test_exposures_are_fitted_where_photographs_differ(ball, room):
     rng, size = np.random.default_rng(5), {"start_splats": 1500, "max_splats": 2000}

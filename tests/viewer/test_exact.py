@@ -65,6 +65,7 @@ def assert_within_one_level(page: Page, image: np.ndarray) -> None:
     assert (difference > 0).mean() < 0.1  # harmonics have 8 bits
 
 
+@pytest.mark.slow
 def test_the_image_is_that_of_render(page, mesh, cameras):
     assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
 
@@ -116,6 +117,7 @@ def test_the_crop_box_leaves_the_same_triangles_as_the_option(page, mesh, camera
     assert page.statistics()["triangles"] == f"{count:,}"
 
 
+@pytest.mark.slow
 def test_splats_stand_left_of_the_divider_and_the_exact_mesh_right_of_it(page, mesh, cloud, cameras):
     page.run("document.querySelector('[value=both]').click()")
     page.still(PATIENCE)

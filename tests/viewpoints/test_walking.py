@@ -42,6 +42,7 @@ def test_it_passes_every_view_and_begins_at_the_first():
     assert np.isclose(frames[0].near, keys[0].near)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("seed", range(4))
 def test_it_has_no_jump_and_no_corner_where_it_closes_neither(seed):
     def roughness(count: int, order: int) -> float:

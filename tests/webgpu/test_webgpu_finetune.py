@@ -404,6 +404,7 @@ def check_resumed(dataset, mesh, config, tmp_path):
     assert np.array_equal(tuned.faces, whole.faces)
 
 
+@pytest.mark.slow
 def test_a_run_gets_better_and_is_scored_and_pruned(scene, tmp_path):
     need_gpu()
     dataset, mesh = scene

@@ -255,10 +255,13 @@ class FragmentQueue {
         for (int i = 0; i < n; ++i) left_keys_[i] = select(pending_[i].lanes, key(i), broadcast(DONE));
         for (int round = 1;; ++round) {
             Lanes nearest = broadcast(NONE), nearest_index = broadcast(0);
+            int32_t last_face = face(0);  // highest so far
             for (int i = 0; i < n; ++i) {
                 const LaneMask ties = equal(left_keys_[i], nearest);
                 keep_greater(left_keys_[i], broadcast((float)i), nearest, nearest_index);
-                if (ties) keep_lower_face(i, ties, nearest_index);
+                // Entries mostly come in the order of their faces.
+                if (ties && face(i) < last_face) keep_lower_face(i, ties, nearest_index);
+                last_face = std::max(last_face, face(i));
             }
             LaneMask rest = active & greater(nearest, broadcast(NONE));
             if (!rest) return;
