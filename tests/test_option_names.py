@@ -76,7 +76,9 @@ def test_the_command_line_writes_flags_in_errors_and_in_warnings(tmp_path, capsy
     assert main(["render", str(cameras), "-o", str(tmp_path / "image.png")]) == 1
     assert "(--cameras takes cameras)" in capsys.readouterr().err
     ply = tmp_path / "activated.ply"
-    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    kinds = {"f_dc": 3, "scale": 3, "rot": 4}
+    of = {kind: [f"{kind}_{i}" for i in range(count)] for kind, count in kinds.items()}
+    names = [*"xyz", *of["f_dc"], "opacity", *of["scale"], *of["rot"]]
     header = "".join(f"property float {name}\n" for name in names)
     rows = "".join(f"{i} 0.2 0.3 1 0 0.5 0.5 0.01 0.02 0.03 1 0 0 0\n" for i in range(400))
     ply.write_text(f"ply\nformat ascii 1.0\nelement vertex 400\n{header}end_header\n{rows}", "ascii")
