@@ -220,3 +220,57 @@ def test_background_is_affine():
         share * render_splats(cloud, view, background=b).color for share, b in ((0.25, one), (0.75, two))
     ]
     np.testing.assert_allclose(mixed, sum(parts), atol=1e-6)
+
+
+# In stages: clouds of which hundreds of thousands are in front of the camera
+
+
+def crowd(seed: int, n: int, near: float, far: float, kernel: str) -> GaussianCloud:
+    """Small faint splats before ``camera(64, 48)``, between two depths."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(near, far, n)
+    x, y = (rng.random(n) - 0.47) * 64 / 31, (rng.random(n) - 0.55) * 48 / 27
+    cloud = splats(seed, n, kernel=kernel, degree=0, sizes=(1e-3, 3e-3), opacity=0.02)
+    return replace(cloud, means=np.column_stack([x * depth, y * depth, depth]))
+
+
+SIDE = 100
+"""Places of a wall's splats along each of its sides."""
+
+
+def wall(depth: float, bottom: float, kernel: str) -> GaussianCloud:
+    """Opaque splats, four at each place, down to a share of the image's height: no light passes."""
+    cloud = crowd(0, 4 * SIDE**2, depth, depth, kernel)
+    x, y = np.meshgrid(np.linspace(-0.2, 1.2, SIDE), np.linspace(-0.2, bottom, SIDE))
+    points = np.column_stack([(x.ravel() - 0.47) * 64 / 31, (y.ravel() - 0.55) * 48 / 27, np.ones(SIDE**2)])
+    means = np.tile(points * depth, (4, 1))
+    scales = np.full_like(cloud.scales, 0.01 * depth)
+    return replace(cloud, means=means, scales=scales, opacities=np.ones_like(cloud.opacities))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_what_lies_behind_a_wall_changes_no_bit(kernel):
+    view = camera(64, 48)
+    front = GaussianCloud.joined([crowd(1, 90_000, 2, 3, kernel), wall(4, 1.2, kernel)])
+    whole = GaussianCloud.joined([crowd(2, 400_000, 5, 9, kernel), front])
+    assert_same_bits(render_splats(whole, view), render_splats(front, view))
+
+
+# Not 'antialiased': the opacity of splats far outside depends on the sides of the image.
+@pytest.mark.parametrize("kernel", ["3dgs", "2dgs"])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_where_no_wall_is_the_rest_is_drawn(kernel, samples):
+    view = camera(64, 48)
+    cloud = GaussianCloud.joined(
+        [
+            *(crowd(seed, 60_000, 2, 9, kernel) for seed in range(7)),
+            wall(3, 0.4, kernel),
+        ]
+    )
+    whole = render_splats(cloud, view, samples=samples)
+    columns = []
+    for x in range(0, 64, 16):  # so few columns have too few splats for stages
+        part = render_splats(cloud, replace(view, width=16, cx=view.cx - x), samples=samples)
+        columns.append(part.color)
+    assert whole.fragments > 1e5 * samples**2
+    np.testing.assert_allclose(np.concatenate(columns, axis=1), whole.color, atol=2e-5)

@@ -312,12 +312,25 @@ MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, c
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::SplatScene scene(*splats, *camera, grid, options->threads);
-        image->fragments = render_tiles(
-            grid, scene.items, options->threads,
-            [&] { return std::make_unique<ms::SplatTile>(scene, grid, *options, *image, *camera, *splats); },
-            [&](ms::SplatTile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
-                render_tile(grid, worker, tile, list, length);
-            });
+        ms::OpenTiles open(grid);
+        std::vector<std::unique_ptr<ms::SplatSums>> left(grid.tiles());
+        image->fragments = 0;
+        for (int stage = 0; stage < scene.stages(); ++stage) {
+            scene.begin(stage, open);
+            image->fragments += render_tiles(
+                grid, scene.items, options->threads,
+                [&] {
+                    return std::make_unique<ms::SplatTile>(scene, grid, *options, *image, *camera, *splats);
+                },
+                [&](ms::SplatTile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
+                    if (!open.is_open(tile)) return;
+                    const bool last = stage == scene.stages() - 1;
+                    int x, y;
+                    grid.tile_position(tile, x, y);
+                    if (worker.render(x, y, list, length, last, left[tile])) open.close(tile);
+                });
+            open.count();
+        }
     });
 }
 

@@ -8,8 +8,7 @@
 
 #include <memory>
 
-#include "grid.h"
-#include "triangle.h"
+#include "splat_stages.h"
 
 namespace ms {
 
@@ -78,46 +77,54 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
 
 class SplatScene {
   public:
-    std::vector<ProjectedSplat> splats;  // visible splats
-    std::vector<ProjectedPlane> planes;  // of the same splats, for 2dgs only
-    std::vector<BinItem> items;          // entries of one splat each, nearest first
+    // Of the present stage:
+    PooledVector<ProjectedSplat> splats;  // those that are not visible have no values
+    PooledVector<ProjectedPlane> planes;  // of the same splats, for 2dgs only
+    std::vector<BinItem> items;           // entries of one visible splat each, nearest first
 
     SplatScene(const MsSplats &cloud, const MsCamera &camera, const Grid &grid, int threads)
-        : cloud_(cloud), camera_(camera), grid_(grid), projection_(camera, grid.samples) {
+        : cloud_(cloud),
+          camera_(camera),
+          grid_(grid),
+          projection_(camera, grid.samples),
+          stages_(cloud, projection_, grid),
+          found_(stages_.count()),
+          threads_(threads) {
         MS_ASSERT(cloud.count >= 0 && cloud.count <= INT32_MAX);
         MS_ASSERT(cloud.kernel >= KERNEL_3DGS && cloud.kernel <= KERNEL_2DGS);
         MS_ASSERT(cloud.sh_used <= cloud.sh_stored && cloud.dilation >= 0);
         for (int i = 0; i < 3; ++i)
             for (int k = 0; k < 3; ++k)
                 camera_center_[i] -= projection_.m[4 * k + i] * projection_.m[4 * k + 3];
-        constexpr int64_t block = 1 << 13;
-        struct Part {
-            std::vector<ProjectedSplat> splats;
-            std::vector<ProjectedPlane> planes;
-            std::vector<BinItem> items;
-        };
-        std::vector<Part> parts((cloud.count + block - 1) / block);
-        parallel_blocks(threads, cloud.count, block, [&](int64_t begin, int64_t end, int) {
-            Part &part = parts[begin / block];
-            ProjectedSplat splat;
+        if (stages() > 1) find_candidates();
+    }
+
+    int stages() const { return stages_.count(); }
+
+    // Goes on to a stage, whose splats lie behind those of earlier ones; without those that are on finished
+    // tiles alone.
+    void begin(int stage, const OpenTiles &open) {
+        const std::vector<int32_t> &found = found_[stage];
+        const int64_t count = stages() == 1 ? cloud_.count : (int64_t)found.size();
+        splats.clear(), planes.clear();  // so that resize() copies nothing
+        splats.resize(count);
+        if (cloud_.kernel == KERNEL_2DGS) planes.resize(count);
+        PooledVector<BinItem> candidates(count);
+        parallel_blocks(threads_, count, BLOCK, [&](int64_t begin, int64_t end, int) {
+            Candidate candidate;
             ProjectedPlane plane;
-            BinItem item;
-            for (int64_t i = begin; i < end; ++i)
-                if (project(i, splat, plane, item)) {
-                    part.splats.push_back(splat);
-                    if (cloud_.kernel == KERNEL_2DGS) part.planes.push_back(plane);
-                    part.items.push_back(item);
-                }
-        });
-        for (auto &part : parts) {
-            for (size_t i = 0; i < part.items.size(); ++i) {
-                part.items[i].entry.first = (int32_t)splats.size();
-                splats.push_back(part.splats[i]);
-                items.push_back(part.items[i]);
+            for (int64_t k = begin; k < end; ++k) {
+                const int64_t i = stages() == 1 ? k : found[k];
+                BinItem &item = candidates[k];
+                const bool visible =
+                    is_candidate(i, open, candidate) && project(i, candidate, open, splats[k], plane, item);
+                item.entry = {candidate.key, (int32_t)k, visible};
+                if (visible && cloud_.kernel == KERNEL_2DGS) planes[k] = plane;
             }
-            planes.insert(planes.end(), part.planes.begin(), part.planes.end());
-            part = Part();
-        }
+        });
+        items.clear();
+        std::copy_if(candidates.begin(), candidates.end(), std::back_inserter(items),
+                     [](const BinItem &item) { return item.entry.length; });
         sort_items(items);
     }
 
@@ -125,7 +132,10 @@ class SplatScene {
     const MsSplats &cloud_;
     const MsCamera &camera_;
     const Grid &grid_;
-    Projection projection_;
+    const Projection projection_;
+    const SplatStages stages_;
+    std::vector<std::vector<int32_t>> found_;  // by stage: the splats that may be visible; empty: all, of one
+    const int threads_;
     double camera_center_[3] = {0, 0, 0};  // world space
 
     // The box in the image where alpha may reach MIN_ALPHA, samples.
@@ -133,24 +143,56 @@ class SplatScene {
         double low[2], high[2];
     };
 
-    // Projects splat i; false if it is not visible. The item's entry does not get its index.
-    bool project(int64_t i, ProjectedSplat &out, ProjectedPlane &plane, BinItem &item) const {
-        const float *mean = cloud_.means + 3 * i;
-        Vec3 c = projection_.to_camera(mean);
+    struct Candidate {
+        Vec3 center;  // camera space
+        float key;
+        double x, y;  // projected centre, samples
+    };
+
+    static constexpr int64_t BLOCK = 1 << 13;  // splats
+
+    void find_candidates() {
+        const OpenTiles all(grid_);
+        std::vector<std::vector<std::vector<int32_t>>> parts((cloud_.count + BLOCK - 1) / BLOCK);
+        parallel_blocks(threads_, cloud_.count, BLOCK, [&](int64_t begin, int64_t end, int) {
+            auto &part = parts[begin / BLOCK];
+            part.resize(stages());
+            Candidate candidate;
+            for (int64_t i = begin; i < end; ++i)
+                if (is_candidate(i, all, candidate)) part[stages_.of(candidate.key)].push_back((int32_t)i);
+        });
+        for (const auto &part : parts)
+            for (int stage = 0; stage < stages(); ++stage)
+                found_[stage].insert(found_[stage].end(), part[stage].begin(), part[stage].end());
+    }
+
+    // Whether splat i may be visible on an open tile.
+    bool is_candidate(int64_t i, const OpenTiles &open, Candidate &out) const {
+        const Vec3 c = out.center = projection_.to_camera(cloud_.means + 3 * i);
         if (!(c.z >= projection_.near)) return false;
-        double opacity = cloud_.opacities[i];
+        out.key = (float)(1 / c.z);
+        const double opacity = cloud_.opacities[i];
         if (!(opacity >= MIN_ALPHA)) return false;
-        double axes[3][3];
-        principal_axes(i, axes);
         out.x = projection_.fx * c.x / c.z + projection_.cx;
         out.y = projection_.fy * c.y / c.z + projection_.cy;
+        if (cloud_.kernel == KERNEL_2DGS) return true;
+        BinItem item;
+        return find_tiles(bound(i, out, opacity), open, item);
+    }
+
+    // Projects splat i; false if it is not visible on an open tile. The item does not get its entry.
+    bool project(int64_t i, const Candidate &candidate, const OpenTiles &open, ProjectedSplat &out,
+                 ProjectedPlane &plane, BinItem &item) const {
+        const Vec3 &c = candidate.center;
+        const float *mean = cloud_.means + 3 * i;
+        double opacity = cloud_.opacities[i];
+        out.x = candidate.x, out.y = candidate.y;
         Box box;
+        double axes[3][3];
+        principal_axes(i, axes);
         bool visible = cloud_.kernel == KERNEL_2DGS ? project_plane(c, axes, opacity, out, plane, box)
                                                     : project_covariance(c, axes, opacity, out, box);
-        int x0, x1, y0, y1;
-        if (!visible || !sample_range(box.low[0], box.high[0], grid_.width, x0, x1) ||
-            !sample_range(box.low[1], box.high[1], grid_.height, y0, y1))
-            return false;
+        if (!visible || !find_tiles(box, open, item)) return false;
         out.opacity = (float)opacity;
         out.low = (float)box.low[1];
         out.high = (float)box.high[1];
@@ -162,12 +204,33 @@ class SplatScene {
         length = std::sqrt(length);
         for (double &d : direction) d /= length;
         sh_color(cloud_.sh + 3 * (int64_t)cloud_.sh_stored * i, cloud_.sh_used, direction, out.rgb);
-        item = {{(float)(1 / c.z), 0, 1},
-                (uint16_t)grid_.tile_of(x0),
-                (uint16_t)grid_.tile_of(x1),
-                (uint16_t)grid_.tile_of(y0),
-                (uint16_t)grid_.tile_of(y1)};
         return true;
+    }
+
+    // The tiles that a box touches; false if none of them is open.
+    bool find_tiles(const Box &box, const OpenTiles &open, BinItem &item) const {
+        int x0, x1, y0, y1;
+        if (!sample_range(box.low[0], box.high[0], grid_.width, x0, x1) ||
+            !sample_range(box.low[1], box.high[1], grid_.height, y0, y1))
+            return false;
+        item.x0 = (uint16_t)grid_.tile_of(x0), item.x1 = (uint16_t)grid_.tile_of(x1);
+        item.y0 = (uint16_t)grid_.tile_of(y0), item.y1 = (uint16_t)grid_.tile_of(y1);
+        return open.any(item.x0, item.x1, item.y0, item.y1);
+    }
+
+    // A box around that of project_covariance, at a fraction of its cost: as if the splat were a ball of its
+    // largest standard deviation.
+    Box bound(int64_t i, const Candidate &candidate, double opacity) const {
+        constexpr double slack = 1.01;  // rotations are orthonormal up to rounding
+        const float *scale = cloud_.scales + 3 * i;
+        const double radius = slack * std::max(std::max(scale[0], scale[1]), scale[2]) / candidate.center.z,
+                     s = grid_.samples, stretch = s * s * squared_radius(opacity);
+        double tx, ty;
+        ray_slopes(candidate.center, tx, ty);
+        const double x = camera_.fx * radius, y = camera_.fy * radius;
+        const double rx = std::sqrt(stretch * (x * x * (1 + tx * tx) + cloud_.dilation)),
+                     ry = std::sqrt(stretch * (y * y * (1 + ty * ty) + cloud_.dilation));
+        return {{candidate.x - rx, candidate.y - ry}, {candidate.x + rx, candidate.y + ry}};
     }
 
     // The principal axes of splat i in camera space, as columns scaled by the standard deviations.
@@ -185,17 +248,22 @@ class SplatScene {
             }
     }
 
+    // Slopes x / z and y / z of the ray to c where the Jacobian is evaluated: as in 3DGS, at most 0.3 of the
+    // half field of view outside the image.
+    void ray_slopes(const Vec3 &c, double &tx, double &ty) const {
+        const double fx = camera_.fx, fy = camera_.fy;
+        const double margin_x = 0.15 * camera_.width / fx, margin_y = 0.15 * camera_.height / fy;
+        auto clamped = [](double v, double low, double high) { return v < low ? low : v > high ? high : v; };
+        tx = clamped(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
+        ty = clamped(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
+    }
+
     // EWA: the affine approximation of the projection at the centre c. Lowers the opacity for 'antialiased'.
     bool project_covariance(const Vec3 &c, const double axes[3][3], double &opacity, ProjectedSplat &out,
                             Box &box) const {
-        // As in 3DGS, the Jacobian is evaluated at most 0.3 of the half field of view outside the image.
-        double s = grid_.samples, fx = camera_.fx, fy = camera_.fy;
-        double margin_x = 0.15 * camera_.width / fx, margin_y = 0.15 * camera_.height / fy;
-        auto clamped = [](double v, double low, double high) { return v < low ? low : v > high ? high : v; };
-        double tx =
-            clamped(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
-        double ty =
-            clamped(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
+        const double s = grid_.samples, fx = camera_.fx, fy = camera_.fy;
+        double tx, ty;
+        ray_slopes(c, tx, ty);
         double jx[3], jy[3], cov[3] = {0, 0, 0}, undilated_det = 0;
         for (int k = 0; k < 3; ++k) {
             jx[k] = fx / c.z * (axes[0][k] - tx * axes[2][k]);

@@ -2,6 +2,8 @@
 // alpha is limited to 0.99, and a sample stops before the splat that would leave a transmittance below 1e-4.
 #pragma once
 
+#include <memory>
+
 #include "splat_scene.h"
 
 namespace ms {
@@ -25,7 +27,13 @@ inline vf exp_negative(vf x) {
     return p * power_of_two;
 }
 
-// Renders the splats into one tile. Samples are stored in rows.
+// What is blended of a tile so far. Samples are stored in rows.
+struct SplatSums {
+    alignas(64) float red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], transmittance[TILE][TILE];
+    uint32_t active[TILE];  // by row, one bit per column
+};
+
+// Renders the splats into one tile.
 class SplatTile {
   public:
     SplatTile(const SplatScene &scene, const Grid &grid, const MsOptions &options, const MsImage &image,
@@ -43,27 +51,35 @@ class SplatTile {
 
     int64_t fragments() const { return fragments_; }
 
-    void render(int tile_x, int tile_y, const TileEntry *list, int64_t length) {
+    // Goes on with a tile; `left`: its sums after earlier stages, or null. Returns whether it is finished:
+    // all its samples have stopped, or this is the `last` stage. Otherwise its sums are left there.
+    bool render(int tile_x, int tile_y, const TileEntry *list, int64_t length, bool last,
+                std::unique_ptr<SplatSums> &left) {
         int x0 = tile_x * grid_.tile_side, y0 = tile_y * grid_.tile_side;
         int columns = std::min(grid_.tile_side, grid_.width - x0),
             rows = std::min(grid_.tile_side, grid_.height - y0);
         MS_ASSERT(columns > 0 && rows > 0);
-        for (int y = 0; y < TILE; ++y)
-            for (int x = 0; x < TILE; ++x) {
-                red_[y][x] = green_[y][x] = blue_[y][x] = 0;
-                transmittance_[y][x] = 1;
-            }
-        for (int y = 0; y < rows; ++y) active_[y] = (1u << columns) - 1;
+        if (left) {
+            sums_ = *left;
+        } else {
+            sums_ = SplatSums();
+            for (int y = 0; y < rows; ++y) sums_.active[y] = (1u << columns) - 1;
+            for (auto &row : sums_.transmittance)
+                for (float &transmittance : row) transmittance = 1;
+        }
         for (int64_t i = 0; i < length; ++i) {
             MS_ASSERT(i == 0 || list[i].key <= list[i - 1].key);
             blend(list[i].first, x0, y0, rows);
-            if (i % SPLATS_PER_CHECK == SPLATS_PER_CHECK - 1) {
-                uint32_t any = 0;
-                for (int y = 0; y < rows; ++y) any |= active_[y];
-                if (!any) break;
-            }
+            if (i % SPLATS_PER_CHECK == SPLATS_PER_CHECK - 1 && !active(rows)) break;
         }
+        if (!last && active(rows)) {
+            if (!left) left = std::make_unique<SplatSums>();
+            *left = sums_;
+            return false;
+        }
+        left.reset();
         resolve(x0, y0, columns, rows);
+        return true;
     }
 
   private:
@@ -77,8 +93,7 @@ class SplatTile {
     bool planar_;
     float near_, inverse_low_pass_;  // 1 / variance of the low-pass filter, 1 / square samples
     alignas(64) float center_[TILE];
-    alignas(64) float red_[TILE][TILE], green_[TILE][TILE], blue_[TILE][TILE], transmittance_[TILE][TILE];
-    uint32_t active_[TILE];  // by row, one bit per column
+    SplatSums sums_;
     int64_t fragments_ = 0;
 
     // A ProjectedSplat relative to the corner of a tile: u = a x + b y + c, v = d y + e, squared distance u^2
@@ -102,6 +117,13 @@ class SplatTile {
 #endif
     }
 
+    // Whether any sample goes on.
+    bool active(int rows) const {
+        uint32_t any = 0;
+        for (int y = 0; y < rows; ++y) any |= sums_.active[y];
+        return any;
+    }
+
     // Blends one splat behind all earlier ones.
     void blend(int32_t index, int x0, int y0, int rows) {
         MS_ASSERT(index >= 0 && index < (int32_t)scene_.splats.size());
@@ -119,11 +141,11 @@ class SplatTile {
         int first = (int)std::min(std::max(splat.low - y0 - 1, 0.0f), (float)rows);
         int last = (int)std::max(std::min(splat.high - y0, rows - 1.0f), -1.0f);
         for (int y = first; y <= last; ++y) {
-            if (!active_[y]) continue;
+            if (!sums_.active[y]) continue;
             const float v = flat.d * (y + 0.5f) + flat.e, row_u = flat.b * (y + 0.5f) + flat.c,
                         row_v2 = v * v;
             for (int x = 0; x < TILE; x += W) {
-                unsigned active = (active_[y] >> x) & ((1u << W) - 1);
+                unsigned active = (sums_.active[y] >> x) & ((1u << W) - 1);
                 if (!active) continue;
                 vf power;
                 if (planar_) {
@@ -138,16 +160,16 @@ class SplatTile {
                 vf alpha = vmin(opacity * exp_negative(power), set1(MAX_ALPHA));
                 active &= greater_equal_bits(alpha, set1(MIN_ALPHA));
                 if (!active) continue;
-                vf transmittance = load(transmittance_[y] + x);
+                vf transmittance = load(sums_.transmittance[y] + x);
                 vf next = transmittance * (set1(1.0f) - alpha);
                 unsigned blended = active & greater_equal_bits(next, set1(MIN_SPLAT_TRANSMITTANCE));
-                active_[y] &= ~((active & ~blended) << x);
+                sums_.active[y] &= ~((active & ~blended) << x);
                 if (!blended) continue;
                 vf weight = select_bits(blended, transmittance * alpha, set1(0.0f));
-                store(red_[y] + x, load(red_[y] + x) + weight * set1(splat.rgb[0]));
-                store(green_[y] + x, load(green_[y] + x) + weight * set1(splat.rgb[1]));
-                store(blue_[y] + x, load(blue_[y] + x) + weight * set1(splat.rgb[2]));
-                store(transmittance_[y] + x, select_bits(blended, next, transmittance));
+                store(sums_.red[y] + x, load(sums_.red[y] + x) + weight * set1(splat.rgb[0]));
+                store(sums_.green[y] + x, load(sums_.green[y] + x) + weight * set1(splat.rgb[1]));
+                store(sums_.blue[y] + x, load(sums_.blue[y] + x) + weight * set1(splat.rgb[2]));
+                store(sums_.transmittance[y] + x, select_bits(blended, next, transmittance));
                 fragments_ += __builtin_popcount(blended);
             }
         }
@@ -195,10 +217,10 @@ class SplatTile {
                 float sum[4] = {0, 0, 0, 0};
                 for (int j = y; j < y + s; ++j)
                     for (int i = x; i < x + s; ++i) {
-                        sum[0] += red_[j][i];
-                        sum[1] += green_[j][i];
-                        sum[2] += blue_[j][i];
-                        sum[3] += transmittance_[j][i];
+                        sum[0] += sums_.red[j][i];
+                        sum[1] += sums_.green[j][i];
+                        sum[2] += sums_.blue[j][i];
+                        sum[3] += sums_.transmittance[j][i];
                     }
                 const float *background =
                     options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
