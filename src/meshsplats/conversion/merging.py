@@ -10,6 +10,7 @@ splats lie behind each other, and as long as opacities are small it is opacity t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -130,14 +131,16 @@ def simplify_in_blocks(
     visible = np.array([(cloud.opacities[rows] >= MIN_OPACITY).sum() for rows in blocks])
     wanted = np.array([counted[rows].sum() for rows in blocks]) if cameras else visible
     shares = _shares(wanted, visible, max(count, FEWEST_OF_BLOCK * len(blocks)))
-    parts = []
-    for rows, share in zip(blocks, shares.tolist(), strict=True):
+
+    def left(rows: np.ndarray, share: int) -> GaussianCloud:
         part = cloud.take(rows)
         if share >= len(part):
-            parts.append(part)
-        elif share:
-            own = (low_pass[rows], masses[rows], counted[rows])
-            parts.append(_merge(part, share, *own, threads).cloud)
+            return part
+        return _merge(part, share, low_pass[rows], masses[rows], counted[rows], threads=1).cloud
+
+    kept = np.flatnonzero(shares)
+    with ThreadPoolExecutor(threads or processors()) as pool:
+        parts = list(pool.map(left, [blocks[i] for i in kept], shares[kept].tolist()))
     # What is left over is the least of each block: few of all.
     return simplify(GaussianCloud.joined(parts), count, threads=threads)
 
