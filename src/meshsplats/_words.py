@@ -1,8 +1,9 @@
-"""Directions and colours as users write them, and counts: options of commands, and what is printed."""
+"""Directions, colours, times and counts in words: as options of commands have them, and as is printed."""
 
 from __future__ import annotations
 
 import math
+import time
 from typing import TYPE_CHECKING
 
 from meshsplats.errors import OptionValueError
@@ -16,6 +17,9 @@ NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "grey": (0.5, 0.5, 0.5),
     "gray": (0.5, 0.5, 0.5),
 }
+
+SOON = 3.0
+"""Seconds of a phase before its end is estimated."""
 
 
 def parse_up(text: str) -> np.ndarray:
@@ -83,3 +87,30 @@ def _numbers(text: str) -> tuple[float, float, float] | None:
 def plural(count: int, noun: str) -> str:
     """``1 view``, ``1,200 views``."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def duration(seconds: float) -> str:
+    """A time in words, no more exact than an estimate."""
+    if seconds < 90:
+        return f"{max(5, 5 * round(seconds / 5))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"
+
+
+class Phase:
+    """The phase that is shown."""
+
+    def __init__(self) -> None:
+        self._name, self._began = "", 0.0
+
+    def begins(self, name: str) -> bool:
+        """Whether it is another one than before."""
+        if name == self._name:
+            return False
+        self._name, self._began = name, time.monotonic()
+        return True
+
+    def left(self, share: float) -> str:
+        """The time left after this ``share`` of it, in words; empty while it is unknown."""
+        passed = time.monotonic() - self._began
+        return f"{duration(passed * (1 - share) / share)} left" if share and passed > SOON else ""

@@ -448,6 +448,24 @@ def test_the_default_size_of_an_open_surface_is_said(tmp_path):
 
 
 @needs_extra
+def test_every_part_of_the_work_has_a_name(tmp_path):
+    save_mesh(wall(), tmp_path / "wall.npz")
+    cameras = [look_at((x, 0, -4), (0, 0, 0), up=(0, -1, 0), width=48, height=48) for x in (-1, 0, 1)]
+    save_cameras(cameras, tmp_path / "cameras.json")
+    options = SurfaceOptions(shape="open", resolution=16, size=48, rounds=1, faces=90, texture=64)
+    files = SurfaceFileOptions(options, cameras=tmp_path / "cameras.json", no_preview=True)
+    said: list[tuple[str, int, int]] = []
+    run = SurfaceRun(tmp_path / "wall.npz", tmp_path / "wall.glb", files, threads=1)
+    run.save(progress=lambda *at: said.append(at))
+    assert list(dict.fromkeys(name for name, _, _ in said)) == [
+        *("reading", "looking for views", "converting", "shape", "triangles"),
+        *("texture coordinates", "images", "colors", "fit", "texture", "saving"),
+    ]
+    for name in ("shape", "images", "colors", "fit", "texture"):
+        assert [(done, total) for other, done, total in said if other == name] == [(1, 3), (2, 3), (3, 3)]
+
+
+@needs_extra
 def test_an_atlas_that_fails_has_fewer_triangles_unless_their_number_is_named(monkeypatch):
     counts = []
 

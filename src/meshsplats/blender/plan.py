@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from meshsplats._words import duration
 from meshsplats.blender.options import SceneOptions
 
 if TYPE_CHECKING:
@@ -40,14 +41,6 @@ def _processors(options: SceneOptions) -> str:
 
     count = options.threads or processors()
     return f"{count} thread{'s'[: count > 1]}"
-
-
-def duration(seconds: float) -> str:
-    """In words, no more exact than an estimate."""
-    if seconds < 90:
-        return f"{max(5, 5 * round(seconds / 5))} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:

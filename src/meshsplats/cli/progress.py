@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from meshsplats._words import Phase
 from meshsplats.cli.messages import say
+from meshsplats.finetuning.setup import in_words
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
     from meshsplats.finetuning import Progress
     from meshsplats.finetuning.setup import Display
+
+
+EVERY = 20.0
+"""Seconds between lines about one phase."""
 
 
 @contextmanager
@@ -45,45 +52,36 @@ class InBar:
     def __init__(self, bar: Bar) -> None:
         self._bar, self._task = bar, bar.add_task("", total=None, text="")
         self._loss: float | None = None
-        self._phase = ""
+        self._phase = Phase()
 
     def phase(self, text: str, share: float | None = None, more: str = "") -> None:
-        if text != self._phase:  # rich takes a total of None for no change, and a new task for a pulse
-            self._phase = text
+        if self._phase.begins(text):  # rich takes a total of None for no change, and a new task for a pulse
             self._bar.remove_task(self._task)
             self._task = self._bar.add_task(text, total=None, text="")
-        if share is not None:
-            self._bar.update(self._task, total=1.0, completed=share, text=more)
+        if share:
+            self._bar.update(self._task, total=1.0, completed=share, text=more or self._phase.left(share))
 
     def __call__(self, progress: Progress) -> None:
         if progress.loss is not None:  # smoothed: it differs from view to view
             self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
-        self.phase("fine-tuning", progress.fraction, _text(progress, self._loss))
+        self.phase("fine-tuning", progress.fraction, in_words(progress, self._loss))
 
 
 class _Lines:
     def __init__(self) -> None:
         self._last: float | None = None
-        self._phase = ""
+        self._phase, self._next = Phase(), 0.0
 
     def phase(self, text: str, share: float | None = None) -> None:
-        if text != self._phase:
-            self._phase = text
+        if self._phase.begins(text):
             say(text)
+        elif share and time.monotonic() >= self._next and (left := self._phase.left(share)):
+            say(f"{text}: {share:.0%}, {left}")
+        else:
+            return
+        self._next = time.monotonic() + EVERY
 
     def __call__(self, progress: Progress) -> None:
         if progress.held_out != self._last:
             self._last = progress.held_out
-            say(_text(progress, progress.loss))
-
-
-def _text(progress: Progress, loss: float | None) -> str:
-    parts = [f"step {progress.step:,}" + (f"/{progress.steps:,}" if progress.steps else "")]
-    if loss is not None:
-        parts.append(f"loss {loss:.4f}")
-    if progress.held_out is not None:
-        parts.append(f"held out {progress.held_out:.2f} dB")
-    if progress.seconds_left is not None:
-        left = int(progress.seconds_left)
-        parts.append(f"{left // 60}:{left % 60:02d} left")
-    return ", ".join(parts)
+            say(in_words(progress, progress.loss))

@@ -1,4 +1,4 @@
-"""What happens before the first step of a run: shown in phases, and with an eye on the clock."""
+"""What happens before the first step of a run, in phases and with an eye on the clock; and steps in words."""
 
 from __future__ import annotations
 
@@ -46,3 +46,16 @@ class Setup:
             return self.seconds is None or self.spent < share * self.seconds
 
         return on_image
+
+
+def in_words(progress: Progress, loss: float | None) -> str:
+    """The steps of an optimisation, with this ``loss``, its scores and the time left."""
+    parts = [f"step {progress.step:,}" + (f"/{progress.steps:,}" if progress.steps else "")]
+    if loss is not None:
+        parts.append(f"loss {loss:.4f}")
+    if progress.held_out is not None:
+        parts.append(f"held out {progress.held_out:.2f} dB")
+    if progress.seconds_left is not None:
+        left = int(progress.seconds_left)
+        parts.append(f"{left // 60}:{left % 60:02d} left")
+    return ", ".join(parts)

@@ -124,23 +124,27 @@ class SurfaceRun:
             progress: as for ``surfaces_from``.
         """
         chosen, options = self.options, self.check(force)
+        said = progress or (lambda *_: None)
+        said("reading", 0, 1)
         scene = self.reading.load_scene(self.source)
         data = None
         if chosen.data is not None:
             how: dict[str, Any] = {"missing": chosen.missing, "masks": chosen.masks}
             data = load_dataset(chosen.data, **how, origin=scene.origin)
         given = None if chosen.cameras is None else load_cameras(chosen.cameras, origin=scene.origin)
+        said("looking for views", 0, 1)
         sources = sources_of(scene, data, given, options, self.threads)
         sized = options.sized(sources.closed)
         chosen_here = [f"at most {sized.faces:,} triangles"] if options.faces is None else []
         chosen_here += [f"a texture of {sized.texture} texels"] if options.texture is None else []
         if chosen_here and not sources.closed:
             self.say(f"an open surface: by default {', '.join(chosen_here)}")
-        bases = surfaces_from(scene, sources, options, chosen.levels, threads=self.threads, progress=progress)
+        bases = surfaces_from(scene, sources, options, chosen.levels, threads=self.threads, progress=said)
         files = base_meshes.level_files(self.output, chosen.levels)
         save = partial(
             base_meshes.save_base, unlit=chosen.unlit, image=chosen.image, collision=chosen.collision
         )
+        said("saving", 0, 1)
         with together():
             for base, path in zip(bases, files, strict=True):
                 save(self.place(scaled(base, chosen.scale)), path)

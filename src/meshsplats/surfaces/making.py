@@ -137,6 +137,7 @@ def surfaces_from(
         views = tuple(reduced(view, level.size) for view in sources.views)
         seen = replace(sources, views=views)
         least = 0 if chosen.faces is None else len(faces)
+        said("texture coordinates", 0, 1)
         blank = _blank(vertices, faces, grid, level.texture, least=least, fast=not sources.closed)
         base, fitted = _surface_of(scene, blank, seen, level, threads, said)
         vertices, faces, uv = blank.vertices, blank.faces, blank.uv
@@ -217,6 +218,7 @@ def _fused(
     """The surface in the depth images: vertices (v, 3) float64, triangles (f, 3) int32; with all of its
     triangles, where a normal map wants them; and the grid that it is from."""
     mesh = scene
+    progress("converting", 0, 1)
     if isinstance(mesh, GaussianCloud):
         # Voxels are far larger than the splats of so many.
         mesh = simplify_in_blocks(mesh, MOST_SPLATS, cameras=sources.depth, threads=threads)
@@ -237,6 +239,7 @@ def _fused(
         threads=threads,
         each=lambda *_: done(),
     )
+    progress("triangles", 0, 1)
     vertices, faces = isosurface(field)
     if not len(faces):
         raise ValueError(
@@ -309,7 +312,7 @@ def _fitted(
         reading()
     coarse = -(-side // _COARSE)
     surface = surface._replace(texels=np.zeros((coarse, coarse, 3), np.float32))
-    surface = mean_colors(surface, small, threads=threads)
+    surface = mean_colors(surface, small, threads=threads, progress=_Counter(progress, "colors", len(views)))
     fitting = partial(fit, stiffness=options.stiffness, threads=threads)
     done = _Counter(progress, "fit", options.rounds * len(views))
     surface = fitting(surface, small, rounds=options.rounds, move=options.move, progress=done)
