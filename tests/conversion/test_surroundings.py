@@ -17,6 +17,7 @@ from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.cleaning_rules import CleaningRules
 from meshsplats.conversion.surroundings import _as_mesh, _panorama, floaters, without_surroundings
 from meshsplats.datasets.folder import load_dataset
+from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.gaussians import GaussianCloud
@@ -85,6 +86,21 @@ def test_a_wall_stays_and_what_hangs_before_it_goes(kind: str):
     np.testing.assert_array_equal(left.surroundings, what == WALL)
     assert left.counts()["surroundings"]["splats"] == (what == WALL).sum()
     assert left.counts()["all"]["splats"] == (what == CLUMPS).sum()
+
+
+def test_a_scene_of_many_small_parts_is_no_floater():
+    rng = np.random.default_rng(0)
+    middle = np.repeat(rng.uniform(-9, 9, (300, 3)), 20, axis=0)
+    points = middle + rng.normal(0, 0.01, (6000, 3))
+    cloud = plates(points, np.tile([0, 0, 1.0], (6000, 1)), 0.01, 0.5)
+    with pytest.warns(DataWarning, match=r"in parts below 1\.0% of all opacity have 100% .* stay; min_part"):
+        found = floaters(cloud)
+    assert not found.gone["min_part"].any()
+    with pytest.raises(ValueError, match="none of the 6,000 splats would be left"):
+        find(cloud, CleaningRules(min_part=0.01))
+    # A rule that is named takes what it names, as long as something is left.
+    part = replace(cloud, opacities=np.where(np.arange(6000) < 20, 0.9, 0.01))
+    assert find(part, CleaningRules(min_part=0.01)).gone["min_part"].sum() == 5980
 
 
 def test_threads_do_not_change_it():

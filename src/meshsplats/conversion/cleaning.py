@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
+from meshsplats.errors import DataWarning
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -89,11 +91,13 @@ class Findings:
         ]
 
 
-def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> Findings:
+def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS, most: float = 1.0) -> Findings:
     """The splats of ``scene`` that each of the ``rules`` removes.
 
-    Each triangle of a mesh without ``face_splat`` counts as a splat. For parts and neighbours, centres are
-    sorted into cells with a side of 2.5 spacings of the splats: those in adjacent cells are connected.
+    A rule that names splats with more than the share ``most`` of all opacity removes none, with a
+    DataWarning: it has found the scene, not what hangs in it. Each triangle of a mesh without ``face_splat``
+    counts as a splat. For parts and neighbours, centres are sorted into cells with a side of 2.5 spacings of
+    the splats: those in adjacent cells are connected.
 
     Raises ValueError where there are no rules, and where no splat would be left.
     """
@@ -126,6 +130,16 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
             part = Cells(points.reshape(-1, 3), cell).parts(np.repeat(np.arange(len(centers)), per))[::per]
             held = np.bincount(part, opacities)
             gone["min_part"] = (held < rules.min_part * held.sum())[part]
+    whole = max(float(opacities.sum(dtype=np.float64)), 1e-300)
+    for name, mask in gone.items():
+        if (share := float(opacities[mask].sum(dtype=np.float64)) / whole) > most:
+            gone[name] = np.zeros_like(mask)
+            warnings.warn(
+                f"splats {_WORDS[name].format(vars(rules)[name])} have {share:.0%} of it all: they are the"
+                f" scene, and stay; ``{name}`` removes them all the same",
+                DataWarning,
+                stacklevel=3,
+            )
     found = Findings(gone, opacities, owner)
     if not found.kept.any():
         counts = ", ".join(f"{name} {int(mask.sum()):,}" for name, mask in gone.items())

@@ -39,6 +39,8 @@ LEAST_PIXELS = 1.0
 """That a splat must cover, in all panoramas together, to count as seen."""
 MOST = 500_000
 """Splats in the panoramas. Of larger scenes, every k-th one stands for k."""
+MOST_OPACITY = 0.5
+"""Share of all opacity that a rule for floaters may take."""
 _STATISTICAL = ("sparse", "min_part")
 """The rules that walls and skies break, too."""
 
@@ -52,7 +54,7 @@ def floaters(
     those that ``find_cameras`` finds; for a mesh, in the splats that its fans were. The ``camera`` of the
     result shows a place from within.
     """
-    found = find(scene, FLOATERS)
+    found = find(scene, FLOATERS, MOST_OPACITY)
     if found.kept.all():
         return found
     cloud = splats_of(scene)
