@@ -485,6 +485,13 @@ def test_blocks_leave_as_many_splats_and_as_good_an_image():
     assert not np.array_equal(np.sort(blocks.means[:, 0]), np.sort(at_once.means[:, 0]))
 
 
+def test_blocks_have_the_same_bits_with_any_number_of_threads():
+    cloud = make_scene(6000)
+    one, three = (merging.simplify_in_blocks(cloud, 1500, block=500, threads=n) for n in (1, 3))
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+
+
 def test_blocks_are_joined_to_merge_to_few_splats_around_the_same_centre():
     cloud = random_cloud(1000)
     blocks = merging.simplify_in_blocks(cloud, 10, block=100)  # fewer than each block keeps at first

@@ -91,7 +91,9 @@ class Findings:
         ]
 
 
-def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS, most: float = 1.0) -> Findings:
+def find(
+    scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS, most: float | None = None
+) -> Findings:
     """The splats of ``scene`` that each of the ``rules`` removes.
 
     A rule that names splats with more than the share ``most`` of all opacity removes none, with a
@@ -130,17 +132,16 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS, most
             part = Cells(points.reshape(-1, 3), cell).parts(np.repeat(np.arange(len(centers)), per))[::per]
             held = np.bincount(part, opacities)
             gone["min_part"] = (held < rules.min_part * held.sum())[part]
-    whole = max(float(opacities.sum(dtype=np.float64)), 1e-300)
-    for name, mask in gone.items():
-        if (share := float(opacities[mask].sum(dtype=np.float64)) / whole) > most:
-            gone[name] = np.zeros_like(mask)
+    found = Findings(gone, opacities, owner)
+    for name, count in found.counts().items():
+        if most is not None and name in gone and count["opacity"] > most:
+            gone[name] = np.zeros_like(gone[name])
             warnings.warn(
-                f"splats {_WORDS[name].format(vars(rules)[name])} have {share:.0%} of it all: they are the"
-                f" scene, and stay; ``{name}`` removes them all the same",
+                f"splats {_WORDS[name].format(vars(rules)[name])} have {count['opacity']:.0%} of it all: they"
+                f" are the scene, and stay; ``{name}`` removes them all the same",
                 DataWarning,
                 stacklevel=3,
             )
-    found = Findings(gone, opacities, owner)
     if not found.kept.any():
         counts = ", ".join(f"{name} {int(mask.sum()):,}" for name, mask in gone.items())
         raise ValueError(f"none of the {len(centers):,} splats would be left ({counts})")

@@ -60,12 +60,13 @@ int64_t render_tiles(const ms::Grid &grid, const std::vector<ms::BinItem> &items
     return fragments;
 }
 
-template <class Worker>
-void render_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::TileEntry *list,
-                 int64_t length) {
+// `more`: what else the worker's render() takes; its result is returned.
+template <class Worker, class... More>
+auto render_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::TileEntry *list,
+                 int64_t length, More &&...more) {
     int x, y;
     grid.tile_position(tile, x, y);
-    worker.render(x, y, list, length);
+    return worker.render(x, y, list, length, more...);
 }
 
 ms::Grid mesh_grid(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options) {
@@ -325,9 +326,7 @@ MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, c
                 [&](ms::SplatTile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
                     if (!open.is_open(tile)) return;
                     const bool last = stage == scene.stages() - 1;
-                    int x, y;
-                    grid.tile_position(tile, x, y);
-                    if (worker.render(x, y, list, length, last, left[tile])) open.close(tile);
+                    if (render_tile(grid, worker, tile, list, length, last, left[tile])) open.close(tile);
                 });
             open.count();
         }

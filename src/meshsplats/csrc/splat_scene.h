@@ -116,10 +116,11 @@ class SplatScene {
             for (int64_t k = begin; k < end; ++k) {
                 const int64_t i = stages() == 1 ? k : found[k];
                 BinItem &item = candidates[k];
-                const bool visible =
-                    is_candidate(i, open, candidate) && project(i, candidate, open, splats[k], plane, item);
-                item.entry = {candidate.key, (int32_t)k, visible};
-                if (visible && cloud_.kernel == KERNEL_2DGS) planes[k] = plane;
+                item.entry.length = 0;
+                if (!is_candidate(i, open, candidate) || !project(i, candidate, open, splats[k], plane, item))
+                    continue;
+                item.entry = {candidate.key, (int32_t)k, 1};
+                if (cloud_.kernel == KERNEL_2DGS) planes[k] = plane;
             }
         });
         items.clear();

@@ -5,6 +5,10 @@
 // stopped, and others go on in the next stage.
 #pragma once
 
+#include <algorithm>
+#include <functional>
+#include <vector>
+
 #include "grid.h"
 #include "triangle.h"
 
@@ -53,9 +57,8 @@ class SplatStages {
         for (int64_t i = 0; i < cloud.count; i += every) {
             const Vec3 c = projection.to_camera(cloud.means + 3 * i);
             if (!(c.z >= projection.near)) continue;
-            const double x = projection.fx * c.x / c.z + projection.cx,
-                         y = projection.fy * c.y / c.z + projection.cy;
-            if (x >= 0 && x < grid.width && y >= 0 && y < grid.height) keys.push_back((float)(1 / c.z));
+            const Projected p = projection.project(c);
+            if (p.x >= 0 && p.x < grid.width && p.y >= 0 && p.y < grid.height) keys.push_back((float)p.w);
         }
         std::sort(keys.begin(), keys.end(), std::greater<float>());
         const int64_t count = (int64_t)keys.size() * every;

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from meshsplats.surfaces.options import SurfaceChanges
 
 ProgressOf = Callable[[str, int, int], object]
-"""Called with the name of a phase, how much of it is done, and how much there is."""
+"""Called with the name of a phase, how much of it is done, and how much there is; once, with 0 and 1, where a
+phase is not counted."""
 
 MOST_SPLATS = 1_000_000
 """Splats of which depth images are drawn; more are merged. Their mesh takes about a gigabyte."""
