@@ -244,7 +244,7 @@ def test_floaters_are_taken_out_of_a_file(files):
 
 def test_splats_of_a_file_are_merged(files):
     noted = []
-    callbacks = EditCallbacks(record=noted.append, draw=lambda cloud, path: noted.append(len(cloud)))
+    callbacks = EditCallbacks(record=noted.append, draw=lambda cloud, path, camera: noted.append(len(cloud)))
     made = simplify_file(files / "s.ply", files / "out.ply", SimplifyOptions(share=0.5), callbacks)
     assert (made.read, len(made.kept), len(ms.load_gaussians(files / "out.ply"))) == (40, 20, 20)
     assert noted == [files / "out.ply.config.toml", 20]

@@ -41,6 +41,7 @@ from meshsplats.formats.splat_formats import written_ending
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.plain_colors import plain_colors_of
+from meshsplats.viewpoints.showing import default_views
 
 Place = Callable[[Any], Any]
 """Makes of a scene the one that is written."""
@@ -135,8 +136,8 @@ class EditCallbacks:
     place: Place = lambda scene: scene
     record: Callable[[Path], object] = lambda path: None
     """Writes what is noted at this path."""
-    draw: Callable[[GaussianCloud, Path], object] = lambda cloud, path: None
-    """Writes a preview."""
+    draw: Callable[[GaussianCloud, Path, Camera | None], object] = lambda cloud, path, camera: None
+    """Writes a preview, from the camera where there is one."""
 
 
 def simplify_file(
@@ -176,11 +177,12 @@ def simplify_file(
     kept = simplify_for_views(cloud, options.wanted(len(cloud)), cameras, threads=threads)
     seconds = time.perf_counter() - start
     placed = own.place(kept)
+    shown = None if options.no_preview else default_views(kept, source, 1, given=cameras, threads=threads)
     with together():
         save_gaussians(placed, output)
         own.record(config)
         if not options.no_preview:
-            own.draw(kept, preview)
+            own.draw(kept, preview, shown[0][0] if shown and shown[0] else None)
     return Simplified(len(cloud), kept, preview, seconds)
 
 

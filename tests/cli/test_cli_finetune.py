@@ -16,6 +16,7 @@ import pytest
 from _glb import read_glb
 from _photographs import write_photographs
 from conftest import words_of
+from PIL import Image
 
 from meshsplats import _toml as toml
 from meshsplats._files.locks import locked
@@ -32,7 +33,9 @@ from meshsplats.finetuning.pace import Pace
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.formats.meshes import load_mesh
-from meshsplats.rendering import render_splats
+from meshsplats.rendering import render, render_splats
+from meshsplats.rendering.previews import SIDE
+from meshsplats.rendering.samples import needed_samples
 
 SMALL = ("--views", "4", "--held-out", "2", "--width", "32")
 
@@ -85,6 +88,26 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     assert run(splats, "-o", out, *SMALL, "--steps", "12", "--force") == 0
     assert np.array_equal(load_mesh(out).vertices, mesh.vertices)
     assert "next: meshsplats evaluate" in capsys.readouterr().out
+
+
+def test_the_preview_of_a_place_is_one_of_its_views(splats, tmp_path):
+    """What is seen from given cameras is not shown from elsewhere; an object is, from before it."""
+    cloud = load_gaussians(splats)
+    cameras = orbit(cloud, 9, elevation=70, azimuth=200, width=60, height=30)
+    save_cameras(cameras, tmp_path / "cameras.json")
+    shown = {}
+    for name, how in (("place", ["--cameras", tmp_path / "cameras.json"]), ("object", SMALL)):
+        out = tmp_path / f"{name}.npz"
+        assert run(splats, "-o", out, *how, "--steps", "1") == 0
+        with Image.open(tmp_path / f"{name}.npz.preview.png") as image:
+            shown[name] = np.asarray(image.convert("RGB")) / 255
+    (seen,) = load_cameras(tmp_path / "place.npz.run/held_out.cameras.json")[:1]
+    large = seen.scaled(SIDE / seen.width)
+    mesh = load_mesh(tmp_path / "place.npz")
+    truth = render(mesh, large, background=(1, 1, 1), samples=needed_samples(mesh, [large])).color
+    assert shown["place"].shape == (400, 800, 3)
+    assert np.mean((shown["place"] - truth) ** 2) < 1e-4
+    assert shown["object"].shape == (800, 800, 3)
 
 
 def printed_score(out: str, capsys) -> tuple[float, float]:

@@ -42,6 +42,7 @@ from meshsplats.images.reading import load_image
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.rendering.previews import SIDE
 from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training.as_splats import HALVED, splats_of_fans
 from meshsplats.training.exposures import exposures_differ
@@ -847,7 +848,9 @@ def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     for name in ("config.toml", "preview.png"):
         assert (tmp_path / f"mesh.npz.{name}").is_file()
     with Image.open(tmp_path / "mesh.npz.preview.png") as preview:  # from the first held-out photograph
-        assert preview.size == (views[0].camera.width, views[0].camera.height)
+        seen = views[0].camera
+        large = seen.scaled(SIDE / max(seen.width, seen.height))
+        assert preview.size == (large.width, large.height)
     np.testing.assert_allclose(mesh.up, [0, 0, 1], atol=0.1)  # as the cameras are held
     assert main(words) == 3  # what is there is not overwritten
     assert main(["train", str(folder), "-o", str(tmp_path / "b.npz"), "--as-splats", "b.obj"]) == 2

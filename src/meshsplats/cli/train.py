@@ -23,7 +23,6 @@ from meshsplats.training.photographs import PhotographOptions
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from meshsplats.camera import Camera
     from meshsplats.finetuning.checkpoint import Checkpoint
     from meshsplats.finetuning.interruption import Interrupted
     from meshsplats.finetuning.plans import Plan, Trained
@@ -101,10 +100,6 @@ class Train(TrainingCommand):
         splats = placed(splats, self.origin)
         say_origin(splats.origin, "keep", splats=True)
         save_gaussians(splats, self.as_splats)
-
-    def preview_camera(self, plan: Plan) -> Camera:
-        # From elsewhere, it would show what no photograph shows.
-        return (plan.dataset.test or plan.dataset.train)[0].camera
 
     def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
         from meshsplats.training.run import SO_FAR

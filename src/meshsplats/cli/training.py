@@ -29,7 +29,6 @@ from meshsplats.formats.outputs import recorded_options
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from meshsplats.camera import Camera
     from meshsplats.finetuning.checkpoint import Checkpoint
     from meshsplats.finetuning.plans import Plan, Trained
     from meshsplats.finetuning.run import RunOptions
@@ -191,7 +190,7 @@ class TrainingCommand(Command):
         with together():  # a run that is killed before has no result, and its checkpoint
             save_mesh(mesh, files.mesh, **given)
             write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
-            draw_preview(trained.shown, files.preview, self.preview_camera(plan), listing=given.get("order"))
+            draw_preview(trained.shown, files.preview, plan.dataset.opening, listing=given.get("order"))
         try:
             self.save_more(files, plan, trained)  # which may fail: the mesh is there by now
         except Interrupted as stop:
@@ -203,10 +202,6 @@ class TrainingCommand(Command):
         following = () if self.json else self.next_steps(files, config, plan)
         self.finish(result.to_dict(), *words, *following)
         return 0
-
-    def preview_camera(self, plan: Plan) -> Camera | None:
-        """The camera of the preview; None: one in front of the mesh."""
-        return None
 
     def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
         """Says how to resume; returns the exit code."""

@@ -109,7 +109,7 @@ def splat_dataset(
     if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
     first = max(test, HELD_OUT)  # of the training views
-    free = fov is None and tuple(distance) == DISTANCES
+    free, around = fov is None and tuple(distance) == DISTANCES, False
     if cameras is not None:
         cameras = [camera.with_near_plane(cloud.means) for camera in cameras]
         placed, first = _given(cameras, train, test, width)
@@ -122,7 +122,7 @@ def splat_dataset(
     else:
         if placement == "auto":
             placement = "surrounded" if has_surroundings(cloud) else "object"
-        of_object = ALL_ELEVATIONS if below else OBJECT_ELEVATIONS
+        around, of_object = True, ALL_ELEVATIONS if below else OBJECT_ELEVATIONS
         placed = outside_cameras(
             cloud,
             first + train,
@@ -158,7 +158,7 @@ def splat_dataset(
             (learned_from, quick, cache_bytes - cache_bytes // 8),
         )
     )
-    return Dataset(learned, held_out, "splats", look, cloud.origin)
+    return Dataset(learned, held_out, "splats", look, cloud.origin, around)
 
 
 def _found(

@@ -135,6 +135,8 @@ class Dataset:
     origin: np.ndarray = field(default_factory=zero_origin)
     """(3,) float64 point of the world that cameras, and with them all that is made of the data set, are
     relative to: world = origin + local."""
+    around: bool = False
+    """Whether cameras were placed around an object, which may be looked at from elsewhere, too."""
 
     def __post_init__(self) -> None:
         need_all(View, train=self.train, test=self.test)
@@ -153,6 +155,12 @@ class Dataset:
     @property
     def views(self) -> tuple[View, ...]:
         return self.train + self.test
+
+    @property
+    def opening(self) -> Camera | None:
+        """The first held-out view, or the first of all, from which the scene is shown; None: from anywhere.
+        Of a place, and of what was photographed, other views show what no image shows."""
+        return None if self.around or not self.views else (self.test or self.train)[0].camera
 
     @property
     def memory(self) -> int:

@@ -23,9 +23,13 @@ FRAGMENTS = 1e9
 previews have 1e7 to 4e8."""
 
 
+SIDE = 800
+"""Longer side of previews in pixels, at least."""
+
+
 def preview_camera(scene: SplatMesh | GaussianCloud) -> Camera:
     """In front of ``scene`` and a little to the side, which shows more of its shape."""
-    return orbit(scene, 1, azimuth=30, width=800, height=800)[0]
+    return orbit(scene, 1, azimuth=30, width=SIDE, height=SIDE)[0]
 
 
 def save_preview(
@@ -38,6 +42,7 @@ def save_preview(
     file with the order ``listing``, where there is one. Returns False, and saves nothing, if it would have
     more than ``FRAGMENTS`` at an eighth of the size, too."""
     camera = preview_camera(scene) if camera is None else camera
+    camera = camera.scaled(max(1.0, SIDE / max(camera.width, camera.height)))
     samples = 1
     if isinstance(scene, SplatMesh):
         if len(scene.faces) <= TRIANGLES:
