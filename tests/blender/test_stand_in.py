@@ -85,6 +85,8 @@ def test_a_place_is_searched_once_for_its_images_and_the_light_on_it(tmp_path, m
         (PictureOptions(fast=True, views=SceneViews(up="z")), [24, 1]),
         (PictureOptions(fast=True, views=SceneViews(azimuth=10)), [24]),
         (PictureOptions(), [1]),
+        (PictureOptions(max_splats=100, lit=True, views=SceneViews(up="z")), [32, 24, 1, 32]),
+        (PictureOptions(max_splats=100), [32, 1, 32]),
     ):
         asked.clear()
         PictureRun(tmp_path / "place.ply", tmp_path / "image.png", options).save(force=True)

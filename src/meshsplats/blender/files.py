@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from meshsplats._options import changed, check_options
 from meshsplats._words import parse_color, parse_up
 from meshsplats.blender import draw
@@ -26,7 +28,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.cleaning import cropped
-from meshsplats.conversion.merging_views import convert_within_limits
+from meshsplats.conversion.merging_views import convert_within_limits, views_of_place
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.errors import OptionsError
@@ -144,16 +146,26 @@ class PictureOptions:
             return replace(self.views, distance=1.7)
         return self.views
 
-    def converted(self, scene: GaussianCloud | SplatMesh) -> SplatMesh:
-        """The mesh of ``scene``. OptionsError for ``max_splats`` of a mesh."""
+    @property
+    def up(self) -> np.ndarray | None:
+        """(3,) direction, where the user names it."""
+        return None if self.views.up is None else parse_up(self.views.up)
+
+    @property
+    def most_splats(self) -> int | None:
+        """To which splats are merged; None: not at all."""
+        return self.max_splats or (FAST_SPLATS if self.fast else None)
+
+    def converted(self, scene: GaussianCloud | SplatMesh, source: Path) -> SplatMesh:
+        """The mesh of ``scene``, from ``source``. OptionsError for ``max_splats`` of a mesh."""
         if isinstance(scene, SplatMesh):
             if self.max_splats is not None:
                 raise OptionsError("``max_splats`` is for splats: this is a mesh already")
             return scene
         # Crossed ellipses stand upright on the surface, where they catch too little light.
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
-        most = self.max_splats or (FAST_SPLATS if self.fast else None)
-        return convert_within_limits(scene, ConversionOptions(max_splats=most, mode=mode))
+        options = ConversionOptions(max_splats=self.most_splats, mode=mode)
+        return convert_within_limits(scene, options, up=self.up, source=source, threads=self.threads)
 
 
 @dataclass(frozen=True)
@@ -200,10 +212,11 @@ class PictureRun:
         scene, *coarser = [outline(tileset)] if tileset else self._scenes(chain)
         count = 1 if suffix else 60
         views = chosen.chosen_views()
+        # The search for most views comes first: what asks for fewer, or for cameras, gets some of these.
+        if isinstance(scene, GaussianCloud) and len(scene) > (chosen.most_splats or len(scene)):
+            views_of_place(scene, self.source, up=chosen.up, threads=chosen.threads)
         if options.light is not None and not tileset:
-            # Before the cameras, so that these are some of them: one search is enough for both.
-            up = None if views.up is None else parse_up(views.up)
-            within = views_within(scene, self.source, up=up, threads=chosen.threads)
+            within = views_within(scene, self.source, up=chosen.up, threads=chosen.threads)
             options = replace(options, within=tuple(within))
         cameras = views.make(scene, self.source, count=count, side=800, film=not suffix, say=self.say)
         if suffix in (".png", ".exr") and len(cameras) > 1:
@@ -216,10 +229,10 @@ class PictureRun:
         ]
         every = [*images, *([blend] if blend else []), *records]
         check_outputs(every, force, None if suffix else self.output)
-        mesh = self._tiles(tileset, cameras) if tileset else chosen.converted(scene)
+        mesh = self._tiles(tileset, cameras) if tileset else chosen.converted(scene, self.source)
         subject: SplatMesh | LevelMeshes = mesh
         if chain:
-            levels = [mesh, *(chosen.converted(level) for level in coarser)]
+            levels = [mesh, *(chosen.converted(level, self.source) for level in coarser)]
             subject = LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
         if not suffix:
             self.output.mkdir(exist_ok=True)
