@@ -130,7 +130,7 @@ class Work:
 
             scene = load_gaussians(path, axes=self.choices["axes"])
             self._at(begin + 0.3 * share, "converting")
-            mesh = self._converted(scene)
+            mesh = self._converted(scene, source=Path(path))
         if views is None and self.choices.get("frame_view"):
             self._at(begin + 0.4 * share, "looking for a view")
             views = self._views(scene, path)
@@ -154,8 +154,10 @@ class Work:
         found = default_views(cloud, Path(path), VIEWS if opening is None else 1, side=(400, 400))
         return tuple(found[0]) if found else ()
 
-    def _converted(self, cloud, up=None, **options):
-        from meshsplats.conversion import convert
+    def _converted(self, cloud, up=None, source=None, **options):
+        """The mesh of ``cloud``; a place that a limit wants merged is merged as it is seen from within."""
+        from meshsplats.conversion import ConversionOptions
+        from meshsplats.conversion.merging_views import convert_within_limits
 
         options["max_triangles"] = self.choices["max_triangles"] or None
         if self.choices["min_opacity"] > 0:
@@ -163,7 +165,8 @@ class Work:
         if self.choices["shading"] == "lit":
             # Crossed ellipses stand upright on the surface and catch too little light.
             options["mode"] = "flat"
-        return convert(cloud, preset=self.choices["preset"], up=up, **options)
+        preset, chosen = self.choices["preset"], ConversionOptions(**options)
+        return convert_within_limits(cloud, chosen, preset=preset, up=up, source=source)
 
     def _ready(self, mesh, begin, share, views=None):
         from meshsplats.blender.inside import objects

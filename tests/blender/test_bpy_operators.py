@@ -31,6 +31,7 @@ from meshsplats.blender.inside import (
     stand_ins,
     views,
 )
+from meshsplats.conversion import merging_views
 from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
@@ -79,6 +80,25 @@ def test_a_place_is_imported_with_a_view_from_within(extension, tmp_path, monkey
         foot = objects.prepare(convert(load_gaussians(tmp_path / "place.ply")), False)["origin"]
         local = np.array(obj.matrix_world.inverted()) @ after[:, 3]
         np.testing.assert_allclose(local[:3] + foot, [0.1, 0.2, 0.3], atol=1e-4)
+
+
+def test_a_place_with_a_limit_is_merged_as_it_is_seen_from_within(extension, tmp_path, monkeypatch):
+    path, asked = tmp_path / "place.ply", []
+    save_gaussians(ball_splats(200)[0], path)
+    given = [look_at((0.1, y, 0.3), (1, 0.4, 0.3), fov=60, width=800, height=800) for y in (0.1, 0.2)]
+
+    def default_views(scene, source, count, **_):
+        asked.append((len(scene), source, count))
+        return given, "a place"
+
+    monkeypatch.setattr(merging_views, "default_views", default_views)
+    monkeypatch.setattr("meshsplats.viewpoints.showing.default_views", default_views)
+    bpy.ops.wm.read_factory_settings()
+    bpy.ops.import_scene.meshsplats(filepath=str(path), max_triangles=300, at_origin=True)
+    assert asked == [(200, path, 32), (200, path, 24)], (
+        "the larger search is first, so that it is the only one"
+    )
+    assert len(bpy.context.object.data.polygons) <= 300 < len(convert(load_gaussians(path)).faces)
 
 
 def test_a_place_is_searched_for_views_once(extension, tmp_path, monkeypatch):
