@@ -71,7 +71,7 @@ REFERENCE = {
         "Interrupted",
     ],
     "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "save_base"],
-    "Mesh priors": ["BaseMesh", "load_base", "bind", "MeshPrior", "load_prior", "train_prior"],
+    "Mesh priors": ["BaseMesh", "load_base", "load_painted", "bind", "MeshPrior", "load_prior", "train_prior"],
     "Work with files": [
         *("edits.clean_file", "edits.simplify_file", "edits.bake_file"),
         *("file_options.SimplifyOptions", "file_options.BakingOptions"),

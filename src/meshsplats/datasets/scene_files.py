@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from meshsplats._options import Advanced, Help, changed
 from meshsplats._words import direction_in_words
@@ -15,10 +15,12 @@ from meshsplats.formats.splat_formats import listed, y_up_suffixes
 if TYPE_CHECKING:
     import numpy as np
 
+    from meshsplats.base_mesh import BaseMesh
     from meshsplats.formats.streaming import SplatStream
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.mesh import SplatMesh
 
+Mesh = TypeVar("Mesh", bound="SplatMesh | BaseMesh")
 _AXES = Help(
     "Direction of the y axis in the file; auto: as its format prescribes, up in"
     f" {listed(y_up_suffixes(), 'and')}, else down. After reading, y points down. Some programs write SPZ"
@@ -105,8 +107,28 @@ class SceneReading:
     def load_scene(
         self, path: Path, *, up: str | None = None, find_up: bool = True
     ) -> GaussianCloud | SplatMesh:
-        """The splats or the mesh at ``path``; ``up`` and ``find_up`` as for ``load``. FileFormatError for
-        cameras, and OptionsError as by ``refuse_for``."""
+        """The splats or the mesh at ``path``, textures as colours of vertices; ``up`` and ``find_up`` as for
+        ``load``. FileFormatError for cameras, and OptionsError as by ``refuse_for``."""
+        from meshsplats.formats.base_meshes import load_painted
+
+        return self._load(path, load_painted, up, find_up)
+
+    def load_shown(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh | BaseMesh:
+        """``load_scene``, but a surface with one texture on all faces as it is."""
+        from meshsplats.formats.base_meshes import load_painted, load_textured
+        from meshsplats.formats.surfaces.corners import has_whole_texture
+        from meshsplats.mesh import SplatMesh
+
+        def load(path: Path) -> SplatMesh | BaseMesh:
+            found = load_textured(path)
+            return found if isinstance(found, SplatMesh) or has_whole_texture(found) else load_painted(path)
+
+        return self._load(path, load, up, True)
+
+    def _load(
+        self, path: Path, load_mesh: Callable[[Path], Mesh], up: str | None, find_up: bool
+    ) -> GaussianCloud | Mesh:
+        from meshsplats.base_mesh import BaseMesh
         from meshsplats.cameras.framing import warn_of_strays_in
         from meshsplats.formats.sniff import identify
 
@@ -118,10 +140,9 @@ class SceneReading:
         if kind == "splats":
             return self.load(path, up=up, find_up=find_up)
         self.refuse_for(path)
-        from meshsplats.formats.meshes import load_mesh
-
         mesh = load_mesh(path)
-        warn_of_strays_in(mesh)
+        if not isinstance(mesh, BaseMesh):
+            warn_of_strays_in(mesh)
         return mesh
 
     def refuse_for(self, path: Path) -> None:

@@ -22,6 +22,7 @@ from meshsplats.formats.npz import write_npz
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
 from meshsplats.formats.surfaces.corners import check_texture, plain_mesh
 from meshsplats.formats.surfaces.glb import write_surface_glb
+from meshsplats.formats.surfaces.painting import painted
 from meshsplats.formats.surfaces.solids import write_3mf, write_stl
 from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_ply
 from meshsplats.formats.surfaces.usd import write_surface_usd
@@ -94,6 +95,37 @@ def load_base(
             f"{source}: {len(uv):,} faces with texture coordinates, {len(base.faces):,} in all"
         )
     return replace(base, uv=uv, face_texture=index, textures=images)
+
+
+def load_textured(path: str | os.PathLike[str]) -> SplatMesh | BaseMesh:
+    """What ``load_mesh`` reads from ``path``; of a mesh with textures, what ``load_base`` does. Raises what
+    these raise."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mesh = load_mesh(path)
+    # They are of meshes that may have textures.
+    if any(issubclass(each.category, (NoTextureWarning, NoColorsWarning)) for each in caught):
+        base = load_base(path)
+        if base.textured:
+            return base
+    for each in caught:
+        warnings.warn(each.message, stacklevel=2)
+    return mesh
+
+
+def load_painted(path: str | os.PathLike[str]) -> SplatMesh:
+    """The mesh at ``path``, its textures, if it has any, as colours of vertices (``painted``), which a
+    NoTextureWarning says. Raises what ``load_base`` raises."""
+    found = load_textured(path)
+    if isinstance(found, SplatMesh):
+        return found
+    mesh = painted(found)
+    warnings.warn(
+        f"{path}: its texture counts as the colours of {len(mesh.vertices):,} vertices",
+        NoTextureWarning,
+        stacklevel=2,
+    )
+    return mesh
 
 
 def save_base(

@@ -3,11 +3,9 @@ surface beside them or alone."""
 
 from __future__ import annotations
 
-import os
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -18,17 +16,12 @@ from meshsplats.conversion import convert
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.merging_views import merging_views, views_of_place
-from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.formats.base_meshes import load_base
-from meshsplats.formats.surfaces.corners import has_whole_texture
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.layers import SMALLEST, affordable
 from meshsplats.viewer.page import Page, PageOptions, estimated_size, make_page
-
-Scene = TypeVar("Scene")
 
 SIDE = 400
 """Largest side of the image by which the errors of merging and quantisation are measured."""
@@ -133,21 +126,6 @@ def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Con
     if splats is None:
         return Content(mesh, None)
     return Content(mesh, splats.of_degree(0), _coarse(mesh, splats))
-
-
-def surface_or(load: Callable[[Any], Scene], path: str | os.PathLike[str]) -> Scene | BaseMesh:
-    """What ``load`` reads from ``path``, or the surface there: a mesh with one texture on all faces."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        scene = load(path)
-        # They are of meshes that may have a texture, which is read by load_base alone.
-        hints = (NoTextureWarning, NoColorsWarning)
-        base = load_base(path) if any(issubclass(each.category, hints) for each in caught) else None
-    if base is not None and has_whole_texture(base):
-        return base
-    for each in caught:
-        warnings.warn(each.message, stacklevel=2)
-    return scene
 
 
 def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[str, Any]:

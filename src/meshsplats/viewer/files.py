@@ -30,7 +30,6 @@ from meshsplats.viewer.content import (
     content_of_mesh,
     content_of_splats,
     measured,
-    surface_or,
 )
 from meshsplats.viewer.page import Page, PageOptions
 from meshsplats.viewpoints.showing import default_views, opening_beside
@@ -135,7 +134,7 @@ def shown_file(
     """
     options.check()
     reading = options.reading
-    scene: Shown = surface_or(lambda path: reading.load_scene(path, up=options.up), source)
+    scene: Shown = reading.load_shown(source, up=options.up)
     if not isinstance(scene, BaseMesh):
         scene = cropped(scene, options.part.crop)
     _check_effects(scene, source, options)
