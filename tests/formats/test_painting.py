@@ -100,7 +100,7 @@ def test_faces_without_a_texture_keep_their_colours():
     assert len(bare.faces) == 2
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
 def test_commands_show_what_the_texture_shows(tmp_path, capsys, suffix):
     """Where other programs would see white: in images, and in files without textures."""
     path = tmp_path / f"square{suffix}"

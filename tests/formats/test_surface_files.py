@@ -49,7 +49,7 @@ def tetrahedron(*, textured: bool = True, origin=(0, 0, 0), noise: bool = False)
     )
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
 @pytest.mark.parametrize("origin", [(0, 0, 0), (5e5, 4.5e6, 100)])
 def test_a_texture_comes_back(tmp_path, suffix, origin):
     base = tetrahedron(origin=origin)

@@ -20,6 +20,7 @@ from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.npz import write_npz
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
+from meshsplats.formats.ply.textures import ply_textures
 from meshsplats.formats.surfaces.corners import check_texture, plain_mesh
 from meshsplats.formats.surfaces.glb import write_surface_glb
 from meshsplats.formats.surfaces.painting import painted
@@ -51,13 +52,15 @@ def load_base(
 ) -> BaseMesh:
     """The mesh in a file that ``load_mesh`` reads, with its vertex colours, if it has any, and textures.
 
-    Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour) and from the
-    material library beside an `.obj` (``map_Kd``); image files must lie in the folder of the mesh or below.
+    Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour), from the
+    material library beside an `.obj` (``map_Kd``), and as a `.ply` names them (comment TextureFile); image
+    files must lie in the folder of the mesh or below.
     Faces whose texture is missing or of an unknown kind count as untextured, with a DataWarning.
 
     Args:
         path: the mesh.
-        texture: an image to use for the whole mesh instead, by its texture coordinates (`.obj`, glTF).
+        texture: an image to use for the whole mesh instead, by its texture coordinates (`.obj`, `.ply`,
+            glTF).
         textures: False leaves textures unread.
         origin: as for ``load_mesh``.
 
@@ -259,7 +262,9 @@ def _textured(
     content = Content(path)
     if content.container in ("glb", "json"):
         return gltf_textures(path, read_texture, override)
-    if content.container in ("ply", "usd") or not content.is_obj:
+    if content.container == "ply":
+        return ply_textures(path, read_texture, override)
+    if content.container == "usd" or not content.is_obj:
         return None
     found = obj_coordinates(path)
     if found is None:

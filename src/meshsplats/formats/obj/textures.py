@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from array import array
 from collections.abc import Callable
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
 from meshsplats.base_mesh import Texture, Wrap
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._beside import file_beside, shown_name
 from meshsplats.formats.obj.mesh import statements
 from meshsplats.formats.ply.faces import cut_polygons
 
@@ -88,11 +88,11 @@ def obj_textures(
     maps: dict[bytes, tuple[bytes, Wrap]] = {}
     missing: list[str] = []
     for name in libraries:
-        library = _beside(path, name)
+        library = file_beside(path, name)
         if library.is_file():
             maps |= _diffuse_maps(library)
         else:
-            missing.append(_shown(name))
+            missing.append(shown_name(name))
     textures: list[Texture] = []
     indices: dict[tuple[bytes, Wrap], int] = {}
     of_material: dict[bytes, int] = {}
@@ -102,9 +102,9 @@ def obj_textures(
         if entry is None:
             continue
         if entry not in indices:
-            image = _beside(path, entry[0])
+            image = file_beside(path, entry[0])
             if not image.is_file():
-                missing.append(_shown(entry[0]))
+                missing.append(shown_name(entry[0]))
                 indices[entry] = -1
             else:
                 indices[entry] = len(textures)
@@ -151,23 +151,3 @@ def _number(word: bytes) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _beside(path: Path, name: bytes) -> Path:
-    """The file ``name`` in the folder of ``path`` or below. FileFormatError if it lies elsewhere."""
-    folder = Path(os.path.realpath(path)).parent
-    clean = os.fsdecode(name).replace("\\", "/")
-    parts = PurePosixPath(clean).parts
-    bad = "\0" in clean or not 0 < len(clean) <= 1000 or clean.startswith("/") or ".." in parts
-    target = (
-        folder if bad or PureWindowsPath(clean).drive else Path(os.path.realpath(folder.joinpath(*parts)))
-    )
-    if folder not in target.parents:
-        raise FileFormatError(
-            f"{path}: refers to {_shown(name)!r} outside its folder; refused. Put it beside the mesh"
-        )
-    return target
-
-
-def _shown(name: bytes) -> str:
-    return name[:80].decode("utf-8", "replace")

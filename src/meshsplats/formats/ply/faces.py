@@ -47,6 +47,28 @@ def read_faces(
     return cut_polygons(lengths, corners, {p.name: v for p, v in zip(keep, values, strict=True)})
 
 
+def read_corner_values(
+    file: BinaryIO, header: PlyHeader, face: Element, name: str, others: tuple[str, ...], path: Path
+) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+    """(f, k) values of the list ``name`` of each triangle, in the order of ``read_faces``, and the properties
+    among ``others``, each (f,). None unless all faces are triangles with lists of one length, in binary.
+    Raises FileFormatError."""
+    if header.encoding == "ascii" or face.count == 0:
+        return None
+    file.seek(header.data_offset)
+    data = file.read()
+    at = _begin(data, header, face, path)
+    row = _uniform(data, face, at)
+    if row is None:
+        return None
+    table = np.frombuffer(data, row, face.count, at)
+    column = {p.name: table[f"f{i}"] for i, p in enumerate(face.properties)}
+    index = next((n for n in _INDEX_NAMES if n in column), None)
+    if index is None or column[index]["items"].shape[1] != 3:
+        return None
+    return column[name]["items"], {n: column[n] for n in others if n in column}
+
+
 def cut_polygons(
     lengths: np.ndarray, corners: np.ndarray, values: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -72,15 +94,7 @@ def _binary(
     data: bytes, header: PlyHeader, face: Element, index: Property, keep: list[Property], path: Path
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Length of each polygon, all corners concatenated, and the values of ``keep``."""
-    at = 0
-    order = "<" if header.encoding == "binary_little_endian" else ">"
-    for element in header.elements:
-        if element is face:
-            break
-        if element.has_lists:
-            *_, at = _rows(data, element, at, order, path)
-        else:
-            at += element.count * element.minimum_row_bytes
+    at = _begin(data, header, face, path)
     uniform = _uniform(data, face, at)
     if uniform is not None:
         table = np.frombuffer(data, uniform, face.count, at)
@@ -88,7 +102,7 @@ def _binary(
         corners = column[index.name]["items"]
         lengths = np.full(face.count, corners.shape[1], np.int64)
         return lengths, corners.reshape(-1), [column[p.name].astype(np.int64) for p in keep]
-    starts = np.fromiter(_rows(data, face, at, order, path), np.int64, face.count + 1)
+    starts = np.fromiter(_rows(data, face, at, _order(header), path), np.int64, face.count + 1)
     raw = np.frombuffer(data, np.uint8)
     place = starts[:-1].copy()
     lengths, items, values = np.zeros(face.count, np.int64), np.empty(0, index.dtype), []
@@ -107,6 +121,24 @@ def _binary(
             items = _gather(raw, np.repeat(place, counts) + inside * p.dtype.itemsize, p.dtype)[:, 0]
         place += counts * p.dtype.itemsize
     return lengths, items, values
+
+
+def _order(header: PlyHeader) -> str:
+    """Of bytes, as struct names it."""
+    return "<" if header.encoding == "binary_little_endian" else ">"
+
+
+def _begin(data: bytes, header: PlyHeader, face: Element, path: Path) -> int:
+    """Offset of the rows of ``face`` in the data of a binary file."""
+    at = 0
+    for element in header.elements:
+        if element is face:
+            break
+        if element.has_lists:
+            *_, at = _rows(data, element, at, _order(header), path)
+        else:
+            at += element.count * element.minimum_row_bytes
+    return at
 
 
 def _gather(raw: np.ndarray, places: np.ndarray, dtype: np.dtype) -> np.ndarray:
