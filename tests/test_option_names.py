@@ -50,6 +50,7 @@ def flags() -> dict[str, set[str]]:
     return {name: names - NOT_OURS.get(name, set()) for name, names in found.items()}
 
 
+@pytest.mark.slow
 def test_messages_of_the_library_name_no_flags():
     assert {name: names for name, names in flags().items() if names} == STILL
 

@@ -127,6 +127,7 @@ def test_tiles_of_the_rest_are_as_fine(strays, camera, tmp_path):
         assert sum(tile.triangles for tile in choose_tiles(tiles, [away])[0]) < 40_000
 
 
+@pytest.mark.slow
 def test_one_line_names_clean(tmp_path, capsys):
     ms.save_gaussians(beside(ball(), *FAR["one at 1e8"]), tmp_path / "far.ply")
     ms.save_gaussians(beside(ball(), *LARGE["e20"]), tmp_path / "large.ply")

@@ -57,6 +57,7 @@ def run_all(path: Path, capsys) -> None:
         assert main(small(command)) == 0, f"{shlex.join(command)}\n{capsys.readouterr().err}"
 
 
+@pytest.mark.slow
 def test_from_a_splat_file(tmp_path, monkeypatch, capsys):
     cloud = make_scene(300)
     save_gaussians(cloud, tmp_path / "scene.ply")

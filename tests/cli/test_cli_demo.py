@@ -15,6 +15,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(demo, "STEPS", (demo.STEPS[0] + " --alpha blend --no-preview", demo.STEPS[3]))
 
 
+@pytest.mark.slow
 def test_it_makes_a_scene_and_types_the_first_commands(tmp_path, quick, capfd, monkeypatch):
     opened = []
     monkeypatch.setattr(server, "open_page", lambda url: not opened.append(url))

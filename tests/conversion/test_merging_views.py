@@ -39,6 +39,7 @@ def test_an_object_is_seen_from_all_around():
     assert min(heights) < 0 < max(heights)
 
 
+@pytest.mark.slow
 def test_a_room_is_seen_from_within(room):
     views = merging_views(room)
     inside = [(np.abs(view.center - MIDDLE) < HALF).all() for view in views]
@@ -66,6 +67,7 @@ def test_without_merging_no_views_are_looked_for(room, monkeypatch):
     same(convert_within_limits(room, limit, cameras=cameras), convert(room, limit, cameras=cameras))
 
 
+@pytest.mark.slow
 def test_many_splats_are_merged_in_blocks(room, monkeypatch):
     monkeypatch.setattr(merging, "LARGE", 1000)
     monkeypatch.setitem(merging.simplify_in_blocks.__kwdefaults__, "block", 500)

@@ -184,6 +184,7 @@ def test_frozen_vertices_stay(held, tmp_path):
 # ---- Whole runs
 
 
+@pytest.mark.slow
 def test_each_splat_comes_from_the_cell_that_owns_it(held, whole_run):
     owner = divide(held.cloud.means, MOST).owner
     assert len(whole_run.files) == 3

@@ -494,7 +494,7 @@ def test_linear_usd_has_linear_colours(tmp_path):
 # ---- Real splats
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["playbot_lod3_31k_sh2.ply", "guitar_sh0.ply"])
 def test_real_splats_lose_little(tmp_path, name):
     cloud = ms.load_gaussians(shared_data(f"splats/{name}"))

@@ -46,7 +46,7 @@ def errors(mesh, suffix):
     return 1e-4, largest / 127 * 0.501
 
 
-@pytest.mark.slow(keep=10)
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize("suffix", [".npz", ".ply", ".glb", *USD])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("plain", [False, True])

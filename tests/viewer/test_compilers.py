@@ -32,7 +32,7 @@ COMPILE = """(async (source, entries) => {
 })"""
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "entries"),
     [

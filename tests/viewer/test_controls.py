@@ -106,6 +106,7 @@ def test_dragging_orbits_around_the_pivot(page):
     assert above[1][1] == pytest.approx(0.9998, abs=1e-3)  # and does not go over the pole
 
 
+@pytest.mark.slow
 def test_arrow_keys_orbit_and_with_shift_pan(page):
     before = pose(page)
     page.key("ArrowLeft")

@@ -200,6 +200,7 @@ def test_a_file_that_is_read_stands(tmp_path):
     assert reading.load(folder).up is None
 
 
+@pytest.mark.slow
 def test_a_mesh_stands_in_its_file(tmp_path, capsys):
     path = tmp_path / "chair.splat"
     save_gaussians(chair(), path)

@@ -372,7 +372,7 @@ def test_a_broken_limit_of_windows_is_refused(scene, value):
         )
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", [0, 15])
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path, terms):
     need_gpu()

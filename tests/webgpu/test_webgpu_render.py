@@ -88,7 +88,7 @@ def bits(images: renderer.Images) -> bytes:
 # The image of the core
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_triangles_that_pierce_each_other_with_all_outputs(seed):
     view = turned(camera(), seed)
