@@ -422,6 +422,7 @@ def test_inside_cameras_stand_in_free_space_and_look_all_round():
     forward = np.array([c.world_to_camera[2, :3] for c in cameras])
     assert np.linalg.norm(forward.mean(axis=0)) < 0.2
     dataset = splat_dataset(room, placement="inside", train=12, test=3, width=24)
+    assert dataset.opening is dataset.test[0].camera
     assert np.mean([view.alpha.mean() for view in dataset.views]) > 0.95
 
 

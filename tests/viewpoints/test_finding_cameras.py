@@ -362,10 +362,14 @@ def test_targets_of_a_room_are_its_inside():
     auto = splat_dataset(room(4000, 1500), train=4, test=2, width=32, threads=2)
     for view in (*auto.train, *auto.test):
         assert (np.abs(view.camera.center) < HALF).all()
+    assert auto.placed.endswith(" units deep: seen from views that were found")
+    assert auto.opening is auto.test[0].camera
     dome = splat_dataset(room(), train=4, test=2, width=32, placement="object")
     assert not any((np.abs(view.camera.center) < HALF).all() for view in dome.train)
     with pytest.raises(ValueError, match="placement must be one of auto, object"):
         splat_dataset(room(2000, 10), placement="outside")
+    assert dome.placed == ""
+    assert dome.opening is None
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from meshsplats.choices import MAX_SIDE, Look
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.looks import check_look, draw_splats
-from meshsplats.viewpoints.finding import find_cameras
+from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
 Placement = Literal["auto", "object", "surrounded", "inside", "found"]
 
@@ -109,7 +109,7 @@ def splat_dataset(
     if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
     first = max(test, HELD_OUT)  # of the training views
-    free, around = fov is None and tuple(distance) == DISTANCES, False
+    free, around, placed_as = fov is None and tuple(distance) == DISTANCES, False, ""
     if cameras is not None:
         cameras = [camera.with_near_plane(cloud.means) for camera in cameras]
         placed, first = _given(cameras, train, test, width)
@@ -118,7 +118,7 @@ def splat_dataset(
             cloud, first + train, up=up, width=width, height=height or width, fov=75.0 if fov is None else fov
         )
     elif found := _found(cloud, placement, first + train, up, width, height, free, threads):
-        placed = found
+        placed, placed_as = list(found.cameras), f"{found.in_words()}: seen from views that were found"
     else:
         if placement == "auto":
             placement = "surrounded" if has_surroundings(cloud) else "object"
@@ -158,7 +158,7 @@ def splat_dataset(
             (learned_from, quick, cache_bytes - cache_bytes // 8),
         )
     )
-    return Dataset(learned, held_out, "splats", look, cloud.origin, around)
+    return Dataset(learned, held_out, "splats", look, cloud.origin, around, placed_as)
 
 
 def _found(
@@ -170,14 +170,14 @@ def _found(
     height: int | None,
     free: bool,
     threads: int | None,
-) -> list[Camera] | None:
-    """The views of placement 'found', None if the scene is to be seen from a dome; ``free``: no option of
+) -> FoundCameras | None:
+    """The views of placement 'found'; None if the scene is to be seen from a dome; ``free``: no option of
     domes was given."""
     if placement != "found" and not (placement == "auto" and free):
         return None
     options: dict[str, Any] = {"up": up, "width": width, "height": height, "threads": threads}
     found = find_cameras(cloud, count, anywhere=placement == "found", **options)
-    return None if found.kind == "object" and placement == "auto" else list(found.cameras)
+    return None if found.kind == "object" and placement == "auto" else found
 
 
 def window_centers(cloud: GaussianCloud) -> np.ndarray:

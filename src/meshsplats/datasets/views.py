@@ -137,6 +137,8 @@ class Dataset:
     relative to: world = origin + local."""
     around: bool = False
     """Whether cameras were placed around an object, which may be looked at from elsewhere, too."""
+    placed: str = ""
+    """What was found out about a scene in which cameras were looked for, in words."""
 
     def __post_init__(self) -> None:
         need_all(View, train=self.train, test=self.test)

@@ -65,8 +65,12 @@ class FileTuning:
         Raises OptionsError for options without effect on this file, and the errors of what it calls.
         """
         scene = self.scene()
-        dataset = self.targets(scene, config, earlier)
         background, photographs = None, self.target.data is not None
+        if isinstance(scene, GaussianCloud) and not photographs:
+            setup.phase("looking for views")
+        dataset = self.targets(scene, config, earlier)
+        if dataset.placed:
+            self.say(dataset.placed)
         if photographs:
             whole = self.begin.conversion.crop is None
             if not whole:
