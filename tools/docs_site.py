@@ -70,8 +70,8 @@ REFERENCE = {
         *("finetune", "FinetuneConfig", "make_config", "starting_mesh", "RunOptions", "Progress"),
         "Interrupted",
     ],
-    "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "save_base"],
-    "Mesh priors": ["BaseMesh", "load_base", "load_painted", "bind", "MeshPrior", "load_prior", "train_prior"],
+    "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "load_painted", "save_base"],
+    "Mesh priors": ["BaseMesh", "load_base", "bind", "MeshPrior", "load_prior", "train_prior"],
     "Work with files": [
         *("edits.clean_file", "edits.simplify_file", "edits.bake_file"),
         *("file_options.SimplifyOptions", "file_options.BakingOptions"),
