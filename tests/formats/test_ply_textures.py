@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 
 from meshsplats import load_base
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats import base_meshes
 
 UV = [(0.25, 0.75), (0.5, 0.5), (0.75, 0.25)]
 """Of three corners, v up."""
@@ -21,10 +23,10 @@ def images(folder, *names):
         Image.new("RGB", (4, 4), (10 * i, 100, 0)).save(folder / name)
 
 
-def head(encoding, vertex, face, *comments, vertices=3, faces=1):
+def head(encoding, vertex, face, *comments, faces=1):
     lines = ["ply", f"format {encoding} 1.0", *(f"comment {text}" for text in comments)]
     lines += [
-        f"element vertex {vertices}",
+        "element vertex 3",
         *(f"property {line}" for line in ("float x", "float y", "float z")),
     ]
     lines += [f"property float {name}" for name in vertex]
@@ -102,3 +104,42 @@ def test_what_is_not_read_is_said_and_nothing_outside_is_opened(tmp_path):
     path = of_vertices(tmp_path / "m.ply")
     path.write_bytes(path.read_bytes().replace(struct.pack("<f", 0.75), struct.pack("<f", np.nan)))
     assert not load_base(path).textured
+
+
+def test_properties_of_other_kinds_than_usual_are_no_numbers_of_textures(tmp_path):
+    images(tmp_path, "a.png", "b.png")
+    path = tmp_path / "m.ply"
+    whole = b"property int texnumber"
+    for other in (b"property list uchar uchar texnumber", b"property float texnumber"):
+        rest = struct.pack("<B3B", 3, 1, 1, 1) if b"list" in other else b""
+        content = of_corners(path, (1,)).read_bytes().replace(whole, other)
+        path.write_bytes(content[:-4] + rest if rest else content)
+        assert load_base(path).face_texture.tolist() == [0]
+    # A value named as the list of vertices may be, too, which has the other name.
+    face = ["list uchar int vertex_index", "list uchar float texcoord"]
+    data = b"".join(struct.pack("<3f", i == 1, i == 2, 0) for i in range(3)) + struct.pack("<i", 5)
+    data += struct.pack("<B3i", 3, 0, 1, 2) + struct.pack("<B6f", 6, *np.ravel(UV))
+    named = head("binary_little_endian", (), face, "TextureFile a.png")
+    path.write_bytes(named.replace(b"list uchar int vertex_indices", b"int vertex_indices") + data)
+    np.testing.assert_allclose(load_base(path).uv, [DOWN])
+
+
+def test_one_image_is_read_once_and_those_of_no_face_never(tmp_path, monkeypatch):
+    images(tmp_path, "a.png", "b.png")
+    read = []
+    monkeypatch.setattr(
+        base_meshes, "read_texture", lambda path: read.append(path.name) or np.zeros((1, 1, 4), np.uint8)
+    )
+    comments = ["TextureFile a.png"] * 5000 + ["TextureFile b.png"]
+    base = load_base(of_corners(tmp_path / "m.ply", (7, 9), comments=comments))
+    assert read == ["a.png"]
+    assert base.face_texture.tolist() == [0, 0]
+
+
+def test_coordinates_beyond_float32_are_none(tmp_path):
+    images(tmp_path, "a.png")
+    path = of_vertices(tmp_path / "m.ply", encoding="ascii")
+    path.write_bytes(path.read_bytes().replace(b"0.75", b"1e300"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        assert not load_base(path).textured

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 
 
 def file_beside(path: Path, name: bytes) -> Path:
@@ -25,4 +27,15 @@ def file_beside(path: Path, name: bytes) -> Path:
 
 
 def shown_name(name: bytes) -> str:
+    """``name`` for messages."""
     return name[:80].decode("utf-8", "replace")
+
+
+def warn_of_missing(path: Path, names: Sequence[str], stacklevel: int) -> None:
+    """A DataWarning that ``path`` refers to files of these ``names``, if any, that are not there."""
+    if names:
+        warnings.warn(
+            f"{path}: missing: {', '.join(names[:5])}; faces that need it have no texture",
+            DataWarning,
+            stacklevel=stacklevel + 1,
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from array import array
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats.base_mesh import Texture, Wrap
-from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._beside import file_beside, shown_name
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
 from meshsplats.formats.obj.mesh import statements
 from meshsplats.formats.ply.faces import cut_polygons
 
@@ -110,12 +109,7 @@ def obj_textures(
                 indices[entry] = len(textures)
                 textures.append(Texture(read(image), (entry[1], entry[1])))
         of_material[material] = indices[entry]
-    if missing:
-        warnings.warn(
-            f"{path}: missing: {', '.join(missing[:5])}; faces that need it have no texture",
-            DataWarning,
-            stacklevel=4,
-        )
+    warn_of_missing(path, missing, 4)
     return np.array([of_material[m] for m in materials], np.int32), tuple(textures)
 
 

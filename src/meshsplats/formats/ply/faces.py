@@ -29,12 +29,12 @@ def read_faces(
     Polygons become fans of triangles around their first corner; points and lines are dropped. Raises
     FileFormatError.
     """
-    index = next((p for p in face.properties if p.name in _INDEX_NAMES and p.is_list), None)
+    index = _index(face)
     if face.count == 0:
         return np.empty((0, 3), np.int64), {}
     if index is None or index.dtype.kind not in "iu":
         raise FileFormatError(f"{path}: element 'face' has no list of integers 'vertex_indices'")
-    keep = [p for p in face.properties if p.name in names and not p.is_list and p.dtype.kind in "iu"]
+    keep = _integers(face, names)
     size = file.seek(0, io.SEEK_END) - header.data_offset
     if face.count > max(size, 0):
         raise FileFormatError(f"{path}: {face.count:,} faces do not fit {max(size, 0):,} bytes (truncated)")
@@ -50,10 +50,11 @@ def read_faces(
 def read_corner_values(
     file: BinaryIO, header: PlyHeader, face: Element, name: str, others: tuple[str, ...], path: Path
 ) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
-    """(f, k) values of the list ``name`` of each triangle, in the order of ``read_faces``, and the properties
-    among ``others``, each (f,). None unless all faces are triangles with lists of one length, in binary.
-    Raises FileFormatError."""
-    if header.encoding == "ascii" or face.count == 0:
+    """(f, k) values of the list ``name`` of each triangle, in the order of ``read_faces``, and its integer
+    properties among ``others``, each (f,) int64. None unless all faces are triangles with lists of one
+    length, in binary. Raises FileFormatError."""
+    index = _index(face)
+    if header.encoding == "ascii" or face.count == 0 or index is None:
         return None
     file.seek(header.data_offset)
     data = file.read()
@@ -63,10 +64,20 @@ def read_corner_values(
         return None
     table = np.frombuffer(data, row, face.count, at)
     column = {p.name: table[f"f{i}"] for i, p in enumerate(face.properties)}
-    index = next((n for n in _INDEX_NAMES if n in column), None)
-    if index is None or column[index]["items"].shape[1] != 3:
+    if column[index.name]["items"].shape[1] != 3:
         return None
-    return column[name]["items"], {n: column[n] for n in others if n in column}
+    numbers = {p.name: column[p.name].astype(np.int64) for p in _integers(face, others)}
+    return column[name]["items"], numbers
+
+
+def _index(face: Element) -> Property | None:
+    """The list of the vertices of each face."""
+    return next((p for p in face.properties if p.name in _INDEX_NAMES and p.is_list), None)
+
+
+def _integers(face: Element, names: tuple[str, ...]) -> list[Property]:
+    """The integer properties among ``names``."""
+    return [p for p in face.properties if p.name in names and not p.is_list and p.dtype.kind in "iu"]
 
 
 def cut_polygons(

@@ -5,15 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from meshsplats.base_mesh import Texture
 from meshsplats.errors import DataWarning
-from meshsplats.formats._beside import file_beside, shown_name
+from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.faces import read_corner_values, read_faces
-from meshsplats.formats.ply.header import read_header
+from meshsplats.formats.ply.header import PlyHeader, read_header
 from meshsplats.formats.ply.table import FloatTable
 
 _OF_CORNERS, _NUMBER = "texcoord", "texnumber"
@@ -33,63 +34,65 @@ def ply_textures(
     with open(path, "rb") as file:
         header = read_header(file, path)
         names = [text[len("TextureFile ") :] for text in header.comments if text.startswith("TextureFile ")]
-        face, vertex = header.element("face"), header.element("vertex")
-        if face is None or vertex is None or not (names or override):
+        if not (names or override):
             return None
-        columns = next((pair for pair in _OF_VERTICES if all(n in vertex.names for n in pair)), None)
-        number = np.zeros(0, np.int64)
-        if any(p.name == _OF_CORNERS and p.is_list for p in face.properties):
-            found = read_corner_values(file, header, face, _OF_CORNERS, (_NUMBER,), path)
-            if found is None or found[0].shape[1] != 6:
-                warnings.warn(
-                    f"{path}: texture coordinates are read of triangles in binary files alone; left out",
-                    DataWarning,
-                    stacklevel=4,
-                )
-                return None
-            uv = found[0].astype(np.float32).reshape(-1, 3, 2)
-            number = found[1].get(_NUMBER, number).astype(np.int64)
-        elif columns is not None:
-            budget = Budget(path)
-            faces, _ = read_faces(file, header, face, (), budget, path)
-            budget.spend(8 * vertex.count, "texture coordinates")
-            table = FloatTable(file, header, vertex, columns, path)
-            at = [table.names.index(name) for name in columns]
-            uv = np.concatenate([chunk[:, at] for chunk in table.chunks()])[faces]
-        else:
-            return None
+        found = _coordinates(file, header, path)
+    if found is None:
+        return None
+    uv, number = found
     uv[..., 1] = 1 - uv[..., 1]
-    complete = np.asarray(np.isfinite(uv).all(axis=(1, 2)))
-    if override is not None:
-        return np.nan_to_num(uv, posinf=0, neginf=0), np.where(complete, 0, -1).astype(np.int32), (override,)
-    return _with_images(uv, complete, number, names, path, read)
+    if override is None:
+        index, textures = _images(names, number, path, read)
+    else:
+        index, textures = np.zeros(len(uv), np.int32), (override,)
+    complete = np.isfinite(uv).all(axis=(1, 2))
+    return np.nan_to_num(uv, posinf=0, neginf=0), np.where(complete, index, -1).astype(np.int32), textures
 
 
-def _with_images(
-    uv: np.ndarray,
-    complete: np.ndarray,
-    number: np.ndarray,
-    names: list[str],
-    path: Path,
-    read: Callable[[Path], np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]]:
-    """``ply_textures``, of faces with the texture ``number`` (m,) among ``names``; empty: the first."""
-    index, textures, missing = np.full(len(uv), -1, np.int32), list[Texture](), list[str]()
-    for i, name in enumerate(names):
-        image = file_beside(path, name.encode())
-        if image.is_file():
-            index[(number == i) if len(number) else i == 0] = len(textures)
-            textures.append(Texture(read(image)))
-        else:
-            missing.append(shown_name(name.encode()))
-    if missing:
-        warnings.warn(
-            f"{path}: missing: {', '.join(missing[:5])}; faces that need it have no texture",
-            DataWarning,
-            stacklevel=5,
-        )
-    return (
-        np.nan_to_num(uv, posinf=0, neginf=0),
-        np.where(complete, index, -1).astype(np.int32),
-        tuple(textures),
-    )
+def _coordinates(file: BinaryIO, header: PlyHeader, path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Texture coordinates (m, 3, 2) float32, v up, and number of the texture (m,) of each triangle. None
+    without any, and with a DataWarning where they are not read."""
+    face, vertex = header.element("face"), header.element("vertex")
+    if face is None or vertex is None:
+        return None
+    if any(p.name == _OF_CORNERS and p.is_list for p in face.properties):
+        found = read_corner_values(file, header, face, _OF_CORNERS, (_NUMBER,), path)
+        if found is None or found[0].shape[1] != 6:
+            warnings.warn(
+                f"{path}: texture coordinates are read of triangles in binary files alone; left out",
+                DataWarning,
+                stacklevel=5,
+            )
+            return None
+        with np.errstate(over="ignore"):
+            uv = found[0].astype(np.float32).reshape(-1, 3, 2)
+        return uv, found[1].get(_NUMBER, np.zeros(len(uv), np.int64))
+    columns = next((pair for pair in _OF_VERTICES if all(n in vertex.names for n in pair)), None)
+    if columns is None:
+        return None
+    budget = Budget(path)
+    faces, _ = read_faces(file, header, face, (), budget, path)
+    budget.spend(8 * vertex.count, "texture coordinates")
+    table = FloatTable(file, header, vertex, columns, path)
+    at = [table.names.index(name) for name in columns]
+    values = np.concatenate([chunk[:, at] for chunk in table.chunks()])
+    return values[faces], np.zeros(len(faces), np.int64)
+
+
+def _images(
+    names: list[str], number: np.ndarray, path: Path, read: Callable[[Path], np.ndarray]
+) -> tuple[np.ndarray, tuple[Texture, ...]]:
+    """(m,) int32 texture of each face, -1 for none, by its ``number`` among ``names``; and those textures."""
+    index, missing = np.full(len(number), -1, np.int32), list[str]()
+    textures, known = list[Texture](), dict[str, int]()
+    for i in np.unique(number[(number >= 0) & (number < len(names))]).tolist():
+        if names[i] not in known:
+            image = file_beside(path, names[i].encode())
+            known[names[i]] = len(textures) if image.is_file() else -1
+            if image.is_file():
+                textures.append(Texture(read(image)))
+            else:
+                missing.append(shown_name(names[i].encode()))
+        index[number == i] = known[names[i]]
+    warn_of_missing(path, missing, 5)
+    return index, tuple(textures)
