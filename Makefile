@@ -143,7 +143,8 @@ $(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
 
 # Left out is what does not depend on the versions: what Chromium and Dawn draw and compile, the rules of this
 # repository, what the core computes, to which all commands give arrays, whole sessions whose commands have tests of
-# their own, and real scenes, which go through the same lines as small ones.
+# their own, merging for views and in blocks, which takes long, and real scenes, which go through the same lines as
+# small ones.
 LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py controls.py docs_page.py exact.py screens.py \
 	shader_of_docs.py) $(addprefix conversion/test_,conversion_blocks.py merging_views.py) webgpu/test_dawn.py \
 	cli/test_cli_demo.py $(addprefix test_,benchmarks.py compare_commits.py house.py option_names.py rooms.py \

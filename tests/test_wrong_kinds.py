@@ -129,7 +129,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
         ),
         *(
             (name, {}, {"path": "path"})
-            for name in ("load_base", "load_cameras", "load_dataset", "load_mesh", "load_painted")
+            for name in ("load_base", "load_cameras", "load_dataset", "load_mesh", "load_vertex_colored")
         ),
         *((name, {}, {"path": "path"}) for name in ("load_gaussians", "load_points", "load_prior")),
         ("stream_gaussians", {}, {"path": "path"}),

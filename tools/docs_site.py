@@ -70,7 +70,7 @@ REFERENCE = {
         *("finetune", "FinetuneConfig", "make_config", "starting_mesh", "RunOptions", "Progress"),
         "Interrupted",
     ],
-    "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "load_painted", "save_base"],
+    "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "load_vertex_colored", "save_base"],
     "Mesh priors": ["BaseMesh", "load_base", "bind", "MeshPrior", "load_prior", "train_prior"],
     "Work with files": [
         *("edits.clean_file", "edits.simplify_file", "edits.bake_file"),

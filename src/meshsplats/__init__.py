@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         make_config,
         starting_mesh,
     )
-    from meshsplats.formats.base_meshes import load_base, load_painted, save_base
+    from meshsplats.formats.base_meshes import load_base, load_vertex_colored, save_base
     from meshsplats.formats.cutting import cut_mesh
     from meshsplats.formats.gaussians import load_gaussians, save_gaussian_blocks, save_gaussians
     from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
@@ -89,7 +89,7 @@ _HOME = {
         *("FinetuneConfig", "Interrupted", "Progress", "RunOptions"),
         *("finetune", "finetune_ordered", "make_config", "starting_mesh"),
     ),
-    "meshsplats.formats.base_meshes": ("load_base", "load_painted", "save_base"),
+    "meshsplats.formats.base_meshes": ("load_base", "load_vertex_colored", "save_base"),
     "meshsplats.formats.cutting": ("cut_mesh",),
     "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussian_blocks", "save_gaussians"),
     "meshsplats.formats.scenes": ("save_scene",),
@@ -171,9 +171,9 @@ __all__ = [
     "load_dataset",
     "load_gaussians",
     "load_mesh",
-    "load_painted",
     "load_points",
     "load_prior",
+    "load_vertex_colored",
     "look_around",
     "look_at",
     "make_config",

@@ -155,6 +155,15 @@ class BaseMesh:
         mixed = np.einsum("kc,kcj->kj", weights.astype(np.float64), self.colors[self.faces[face]])
         return np.clip(mixed, 0, 1).astype(np.float32)
 
+    def colors_at(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """(k, 4) float32 display RGBA at points on ``face`` (k,) with barycentric ``weights`` (k, 3): of the
+        textures, on faces without one of the vertex colours, else opaque mid grey."""
+        rgba = self.texture_at(face, weights)
+        untextured = ~self.textured_faces()[face]
+        if self.colors is not None and untextured.any():
+            rgba[untextured] = self.vertex_colors_at(face[untextured], weights[untextured])
+        return rgba
+
     def texture_at(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """(k, 4) float32 display RGBA of the textures at points on ``face`` (k,) with barycentric ``weights``
         (k, 3); opaque mid grey on faces without a texture."""

@@ -177,7 +177,7 @@ def simplify_file(
     kept = simplify_for_views(cloud, options.wanted(len(cloud)), cameras, threads=threads)
     seconds = time.perf_counter() - start
     placed = own.place(kept)
-    shown = None if options.no_preview else default_views(kept, source, 1, given=cameras, threads=threads)
+    shown = None if options.no_preview else default_views(cloud, source, 1, given=cameras, threads=threads)
     with together():
         save_gaussians(placed, output)
         own.record(config)

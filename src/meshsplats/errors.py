@@ -62,7 +62,7 @@ class NoColorsWarning(DataWarning):
 
 
 class NoTextureWarning(DataWarning):
-    """The textures of a mesh file were left out."""
+    """The textures of a mesh file were left out, or became colours of vertices."""
 
 
 class DivergenceError(ValueError):

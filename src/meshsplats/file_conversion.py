@@ -21,7 +21,7 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.comparison import fidelity
-from meshsplats.formats.base_meshes import load_painted
+from meshsplats.formats.base_meshes import load_vertex_colored
 from meshsplats.formats.gaussians import save_gaussian_blocks, save_gaussians
 from meshsplats.formats.meshes import save_mesh_blocks
 from meshsplats.formats.outputs import (
@@ -188,7 +188,7 @@ class Converter:
     def _mesh_again(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         """A mesh in another format."""
         start = time.perf_counter()
-        mesh = self.product.files.prepared(self._upright(load_painted(job.source)))
+        mesh = self.product.files.prepared(self._upright(load_vertex_colored(job.source)))
         times = {"read": time.perf_counter() - start}
         seen = [camera.relative_to(mesh.origin) for camera in cameras or ()]
         return {**self._finish(mesh, job, seen, times), "fidelity": None}
@@ -226,7 +226,9 @@ class Converter:
         """A mesh to write beside the splats, as they are."""
         if path is None:
             return None
-        part: SplatMesh = self.callbacks.place(scaled(self._upright(load_painted(path)), self.product.scale))
+        part: SplatMesh = self.callbacks.place(
+            scaled(self._upright(load_vertex_colored(path)), self.product.scale)
+        )
         return part
 
     def _upright(self, scene: Any) -> Any:

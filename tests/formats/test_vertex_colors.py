@@ -16,8 +16,8 @@ from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import main
 from meshsplats.errors import NoTextureWarning
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.formats.base_meshes import load_base, load_painted, save_base
-from meshsplats.formats.surfaces.painting import painted
+from meshsplats.formats.base_meshes import load_base, load_vertex_colored, save_base
+from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors as colored
 from meshsplats.images.reading import load_image
 from meshsplats.surfaces.images import draw_surface
 
@@ -51,7 +51,7 @@ def area(mesh) -> float:
 
 
 def test_a_texture_that_is_linear_becomes_exact_colours():
-    mesh = painted(square())
+    mesh = colored(square())
     x, y = mesh.vertices[:, :2].astype(np.float64).T
     inner = np.maximum(abs(x), abs(y)) < 0.96  # beyond the middles of the last texels, there is the border
     expected = [(x + 1) * 64 - 0.5, (1 - y) * 32 - 0.5]  # in texels
@@ -65,7 +65,7 @@ def test_a_texture_that_is_linear_becomes_exact_colours():
 @settings(max_examples=30, deadline=None)
 @given(st.integers(2, 40_000), st.sampled_from([8, 64, 256]))
 def test_it_keeps_its_shape_and_to_the_limit(limit, side):
-    mesh = painted(square(noise(side)), limit)
+    mesh = colored(square(noise(side)), limit)
     assert 2 <= len(mesh.faces) <= min(limit, 2 * side * side)
     assert area(mesh) == pytest.approx(4, rel=1e-6)
     normal = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
@@ -77,25 +77,25 @@ def test_it_keeps_its_shape_and_to_the_limit(limit, side):
 
 def test_more_triangles_show_more_until_it_is_the_texture():
     base = square(noise(128), up=[0, 1, 0])
-    camera = orbit(painted(base, 2), 1, elevation=80, width=200, height=200)[0]
+    camera = orbit(colored(base, 2), 1, elevation=80, width=200, height=200)[0]
     truth = draw_surface(base, camera)
-    scores = [psnr(render(painted(base, n), camera, samples=2).color, truth) for n in (2, 500, 5000, 50_000)]
+    scores = [psnr(render(colored(base, n), camera, samples=2).color, truth) for n in (2, 500, 5000, 50_000)]
     assert sorted(scores) == scores
     assert scores[0] < 23
     assert scores[-1] > 30
-    alpha = render(painted(base, 5000), camera, samples=2).alpha
-    np.testing.assert_allclose(alpha, render(painted(base, 2), camera, samples=2).alpha, atol=1e-6)
+    alpha = render(colored(base, 5000), camera, samples=2).alpha
+    np.testing.assert_allclose(alpha, render(colored(base, 2), camera, samples=2).alpha, atol=1e-6)
 
 
 def test_faces_without_a_texture_keep_their_colours():
     colors = np.random.default_rng(2).random((4, 4), np.float32)
     half = square(face_texture=[0, -1], colors=colors)
     for base, own in ((half, colors[[0, 2, 3]]), (replace(half, colors=None), [[0.5, 0.5, 0.5, 1]] * 3)):
-        mesh = painted(base, 1000)
+        mesh = colored(base, 1000)
         (whole,) = mesh.faces[[np.ptp(mesh.vertices[face], axis=0)[0] == 2 for face in mesh.faces]]
         np.testing.assert_allclose(mesh.colors[whole], own, atol=1e-6)
         assert 400 < len(mesh.faces) <= 1000
-    bare = painted(square(face_texture=[-1, -1], colors=colors), 1000)
+    bare = colored(square(face_texture=[-1, -1], colors=colors), 1000)
     np.testing.assert_array_equal(bare.colors, colors)
     assert len(bare.faces) == 2
 
@@ -106,7 +106,7 @@ def test_commands_show_what_the_texture_shows(tmp_path, capsys, suffix):
     path = tmp_path / f"square{suffix}"
     save_base(square(noise(64)), path)
     with pytest.warns(NoTextureWarning, match=r"its texture counts as the colours of [\d,]+ vertices"):
-        mesh = load_painted(path)
+        mesh = load_vertex_colored(path)
     assert len(mesh.faces) == 2 * 64**2
     assert main(["render", str(path), "-o", str(tmp_path / "a.png"), "--elevation", "40"]) == 0
     assert "its texture counts as the colours of" in capsys.readouterr().err
@@ -121,7 +121,7 @@ def test_a_real_texture():
     """Of another program's file, whose library of materials names none: it is given."""
     folder = shared_data("meshes/spot_textured/spot")
     base = load_base(folder / "spot_triangulated.obj", texture=folder / "spot_texture.png")
-    mesh = painted(base)
+    mesh = colored(base)
     for camera in orbit(mesh, 3, width=300, height=300):
         drawn = render(mesh, camera, samples=2).color
         assert psnr(drawn, draw_surface(base, camera)) > 40

@@ -109,19 +109,20 @@ class SceneReading:
     ) -> GaussianCloud | SplatMesh:
         """The splats or the mesh at ``path``, textures as colours of vertices; ``up`` and ``find_up`` as for
         ``load``. FileFormatError for cameras, and OptionsError as by ``refuse_for``."""
-        from meshsplats.formats.base_meshes import load_painted
+        from meshsplats.formats.base_meshes import load_vertex_colored
 
-        return self._load(path, load_painted, up, find_up)
+        return self._load(path, load_vertex_colored, up, find_up)
 
     def load_shown(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh | BaseMesh:
         """``load_scene``, but a surface with one texture on all faces as it is."""
-        from meshsplats.formats.base_meshes import load_painted, load_textured
+        from meshsplats.base_mesh import BaseMesh
+        from meshsplats.formats.base_meshes import load_textured, vertex_colored
         from meshsplats.formats.surfaces.corners import has_whole_texture
-        from meshsplats.mesh import SplatMesh
 
         def load(path: Path) -> SplatMesh | BaseMesh:
             found = load_textured(path)
-            return found if isinstance(found, SplatMesh) or has_whole_texture(found) else load_painted(path)
+            whole = isinstance(found, BaseMesh) and has_whole_texture(found)
+            return found if whole else vertex_colored(found, path)
 
         return self._load(path, load, up, True)
 

@@ -109,7 +109,7 @@ def splat_dataset(
     if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
     first = max(test, HELD_OUT)  # of the training views
-    free, around, placed_as = fov is None and tuple(distance) == DISTANCES, False, ""
+    free, found = fov is None and tuple(distance) == DISTANCES, None
     if cameras is not None:
         cameras = [camera.with_near_plane(cloud.means) for camera in cameras]
         placed, first = _given(cameras, train, test, width)
@@ -118,11 +118,11 @@ def splat_dataset(
             cloud, first + train, up=up, width=width, height=height or width, fov=75.0 if fov is None else fov
         )
     elif found := _found(cloud, placement, first + train, up, width, height, free, threads):
-        placed, placed_as = list(found.cameras), f"{found.in_words()}: seen from views that were found"
+        placed = list(found.cameras)
     else:
         if placement == "auto":
             placement = "surrounded" if has_surroundings(cloud) else "object"
-        around, of_object = True, ALL_ELEVATIONS if below else OBJECT_ELEVATIONS
+        of_object = ALL_ELEVATIONS if below else OBJECT_ELEVATIONS
         placed = outside_cameras(
             cloud,
             first + train,
@@ -158,7 +158,9 @@ def splat_dataset(
             (learned_from, quick, cache_bytes - cache_bytes // 8),
         )
     )
-    return Dataset(learned, held_out, "splats", look, cloud.origin, around, placed_as)
+    around = cameras is None and placement in ("object", "surrounded")
+    words = "" if found is None else found.seen_in_words()
+    return Dataset(learned, held_out, "splats", look, cloud.origin, around, words)
 
 
 def _found(

@@ -66,7 +66,7 @@ class FileTuning:
         """
         scene = self.scene()
         background, photographs = None, self.target.data is not None
-        if isinstance(scene, GaussianCloud) and not photographs:
+        if isinstance(scene, GaussianCloud) and not photographs and self.target.cameras is None:
             setup.phase("looking for views")
         dataset = self.targets(scene, config, earlier)
         if dataset.placed:

@@ -23,10 +23,10 @@ from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
 from meshsplats.formats.ply.textures import ply_textures
 from meshsplats.formats.surfaces.corners import check_texture, plain_mesh
 from meshsplats.formats.surfaces.glb import write_surface_glb
-from meshsplats.formats.surfaces.painting import painted
 from meshsplats.formats.surfaces.solids import write_3mf, write_stl
 from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_ply
 from meshsplats.formats.surfaces.usd import write_surface_usd
+from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
 from meshsplats.mesh import SplatMesh
 
 TextureImage = Literal["png", "jpg", "webp"]
@@ -70,65 +70,52 @@ def load_base(
     """
     need_path(path=path)
     source = Path(path)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        mesh = load_mesh(source, origin=origin)
+    mesh, hints = _read(source, origin)
     if mesh.binding is not None:
         raise FileFormatError(
             f"{source}: splats that are bound to a mesh, not the mesh that carries them: give that one"
         )
-    uncolored = False
-    for warning in caught:
-        uncolored |= issubclass(warning.category, NoColorsWarning)
-        if not issubclass(warning.category, (NoColorsWarning, NoTextureWarning)):
-            warnings.warn(warning.message, stacklevel=2)
-    colors = None if uncolored else _display(mesh)
-    base = BaseMesh(mesh.vertices, mesh.faces, colors, up=mesh.up, origin=mesh.origin)
     if not textures:
-        return base
+        return _base(source, mesh, hints, None)
     override = None if texture is None else Texture(read_texture(Path(texture)))
-    found = _textured(source, override)
-    if found is None or not (found[1] >= 0).any():
-        if override is not None:
-            raise ValueError(f"{source}: has no texture coordinates, so {texture} cannot be put on it")
-        return base
-    uv, index, images = found
-    if len(uv) != len(base.faces):
-        raise FileFormatError(
-            f"{source}: {len(uv):,} faces with texture coordinates, {len(base.faces):,} in all"
-        )
-    return replace(base, uv=uv, face_texture=index, textures=images)
+    base = _base(source, mesh, hints, _textured(source, override))
+    if override is not None and not base.textured:
+        raise ValueError(f"{source}: has no texture coordinates, so {texture} cannot be put on it")
+    return base
 
 
 def load_textured(path: str | os.PathLike[str]) -> SplatMesh | BaseMesh:
     """What ``load_mesh`` reads from ``path``; of a mesh with textures, what ``load_base`` does. Raises what
     these raise."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        mesh = load_mesh(path)
-    # They are of meshes that may have textures.
-    if any(issubclass(each.category, (NoTextureWarning, NoColorsWarning)) for each in caught):
-        base = load_base(path)
+    need_path(path=path)
+    source = Path(path)
+    mesh, hints = _read(source, None)
+    if hints and mesh.binding is None:
+        base = _base(source, mesh, hints, _textured(source, None))
         if base.textured:
             return base
-    for each in caught:
+    for each in hints:
         warnings.warn(each.message, stacklevel=2)
     return mesh
 
 
-def load_painted(path: str | os.PathLike[str]) -> SplatMesh:
-    """The mesh at ``path``, its textures, if it has any, as colours of vertices (``painted``), which a
-    NoTextureWarning says. Raises what ``load_base`` raises."""
-    found = load_textured(path)
-    if isinstance(found, SplatMesh):
-        return found
-    mesh = painted(found)
+def load_vertex_colored(path: str | os.PathLike[str]) -> SplatMesh:
+    """The mesh at ``path``, its textures, if it has any, as vertex colours (``texture_to_vertex_colors``),
+    which a NoTextureWarning says. Raises what ``load_base`` raises, but for a mesh prior."""
+    return vertex_colored(load_textured(path), path)
+
+
+def vertex_colored(mesh: SplatMesh | BaseMesh, path: str | os.PathLike[str]) -> SplatMesh:
+    """``load_vertex_colored``, of the ``mesh`` that was read from ``path``."""
+    if isinstance(mesh, SplatMesh):
+        return mesh
+    colored = texture_to_vertex_colors(mesh)
     warnings.warn(
-        f"{path}: its texture counts as the colours of {len(mesh.vertices):,} vertices",
+        f"{path}: its texture counts as the colours of {len(colored.vertices):,} vertices",
         NoTextureWarning,
-        stacklevel=2,
+        stacklevel=3,
     )
-    return mesh
+    return colored
 
 
 def save_base(
@@ -244,6 +231,40 @@ def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:
     pixels = load_image(path, data)
     opaque = np.full((*pixels.shape[:2], 4 - pixels.shape[2]), 255, np.uint8)
     return np.concatenate([pixels, opaque], axis=2)
+
+
+def _read(
+    source: Path, origin: Sequence[float] | np.ndarray | None
+) -> tuple[SplatMesh, list[warnings.WarningMessage]]:
+    """``load_mesh``, and those of its warnings that hint at textures, which it does not read."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mesh = load_mesh(source, origin=origin)
+    hints = [each for each in caught if issubclass(each.category, (NoColorsWarning, NoTextureWarning))]
+    for each in caught:
+        if each not in hints:
+            warnings.warn(each.message, stacklevel=3)
+    return mesh, hints
+
+
+def _base(
+    source: Path,
+    mesh: SplatMesh,
+    hints: Sequence[warnings.WarningMessage],
+    found: tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None,
+) -> BaseMesh:
+    """The base of ``mesh`` and ``hints`` (of ``_read``), with the textures ``found`` (of ``_textured``)."""
+    uncolored = any(issubclass(each.category, NoColorsWarning) for each in hints)
+    colors = None if uncolored else _display(mesh)
+    base = BaseMesh(mesh.vertices, mesh.faces, colors, up=mesh.up, origin=mesh.origin)
+    if found is None or not (found[1] >= 0).any():
+        return base
+    uv, index, images = found
+    if len(uv) != len(base.faces):
+        raise FileFormatError(
+            f"{source}: {len(uv):,} faces with texture coordinates, {len(base.faces):,} in all"
+        )
+    return replace(base, uv=uv, face_texture=index, textures=images)
 
 
 def _display(mesh: SplatMesh) -> np.ndarray:

@@ -226,11 +226,7 @@ def _colors(
     if source == "vertices":
         return base.vertex_colors_at(face, weights)
     if source == "texture":
-        rgba = base.texture_at(face, weights)
-        untextured = ~base.textured_faces()[face]
-        if base.colors is not None and untextured.any():
-            rgba[untextured] = base.vertex_colors_at(face[untextured], weights[untextured])
-        return rgba
+        return base.colors_at(face, weights)
     rgba = np.full((len(face), 4), 0.5, np.float32)
     rgba[:, 3] = 1
     if source == "views":

@@ -21,8 +21,6 @@ triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."
 FRAGMENTS = 1e9
 """Fragments above which a preview is made smaller, or not at all: some 10 s of one processor. Of real scenes,
 previews have 1e7 to 4e8."""
-
-
 SIDE = 800
 """Longer side of previews in pixels, at least."""
 

@@ -156,6 +156,6 @@ class SurfaceRun:
     def _draw_preview(self, scene: GaussianCloud | SplatMesh, base: BaseMesh, sources: Sources) -> None:
         camera = preview_camera(scene)
         if place := place_of(scene, sources):
-            self.say(f"{place.in_words()}: seen from views that were found")
+            self.say(place.seen_in_words())
             camera = place.cameras[0].within(camera.width)
         save_image(self.preview, draw_surface(base, camera, threads=self.threads))

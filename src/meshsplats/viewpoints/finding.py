@@ -85,6 +85,10 @@ class FoundCameras:
         x, y, z = (f"{v:.2f}" for v in self.up + 0.0)
         return f"{what} ({sure}); up {x} {y} {z} ({told}); views {self.extent:.3g} units deep"
 
+    def seen_in_words(self) -> str:
+        """``in_words``, and that its views were found."""
+        return f"{self.in_words()}: seen from views that were found"
+
 
 _Key = tuple[bytes, bytes | None]
 """Of splats as they were, and of a given up."""

@@ -113,7 +113,7 @@ def default_views(
         words = f"seen on a round through {len(found.cameras)} views that were found"
         return walk(found.cameras, count, found.up), f"{found.in_words()}: {words}"
     views = opened_with(found.cameras, source, scene.origin, side)
-    return views, f"{found.in_words()}: seen from views that were found"
+    return views, found.seen_in_words()
 
 
 def _spread(cameras: Sequence[Camera], count: int) -> list[Camera]:

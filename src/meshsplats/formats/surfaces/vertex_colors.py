@@ -18,7 +18,7 @@ PARTS = np.unique(np.round(2 ** (np.arange(19) / 2)).astype(int))  # 1 to 512
 _AT_ONCE = 1_000_000
 
 
-def painted(base: BaseMesh, triangles: int = TRIANGLES) -> SplatMesh:
+def texture_to_vertex_colors(base: BaseMesh, triangles: int = TRIANGLES) -> SplatMesh:
     """``base`` with its textures as colours of vertices: triangles with a texture are divided where it has
     more texels than they have corners, up to two for a texel, and into at most ``triangles`` in all. A mesh
     without textures keeps its triangles, and its colours, else it is grey."""
@@ -89,19 +89,11 @@ def _divided(
         for values in (base.vertices, normals)
     )
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
+    colors = base.colors_at(np.repeat(faces, len(weights)), np.tile(weights, (len(faces), 1)))
     triangles = corners + len(weights) * np.arange(len(faces))[:, None, None]
     return (
         positions.astype(np.float32),
         directions.astype(np.float32),
-        _colors(base, faces, weights),
+        colors,
         triangles.reshape(-1, 3).astype(np.int32),
     )
-
-
-def _colors(base: BaseMesh, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(k * w, 4) display RGBA of k ``faces`` at the barycentric ``weights`` (w, 3)."""
-    every, at = np.repeat(faces, len(weights)), np.tile(weights, (len(faces), 1))
-    colors = base.texture_at(every, at)
-    if base.colors is not None and not (textured := base.textured_faces()[every]).all():
-        colors[~textured] = base.vertex_colors_at(every[~textured], at[~textured])
-    return colors
