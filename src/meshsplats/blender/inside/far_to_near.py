@@ -197,14 +197,14 @@ def _group() -> Any:
     depth = node("GeometryNodeCaptureAttribute", 7, 0, domain="FACE")
     depth.capture_items.new("INT", "Depth")
     link(given.outputs["Geometry"], depth.inputs[0])
-    link(step.outputs[0], depth.inputs[1])
+    link(step.outputs[0], depth.inputs["Depth"])  # by name: Blender 5.2 has a selection before it
     # What is not carried along needs no time.
     less = node("GeometryNodeRemoveAttribute", 8, 0)
     less.inputs["Name"].default_value = CENTER
     link(depth.outputs[0], less.inputs["Geometry"])
     sort = node("GeometryNodeSortElements", 9, 0, domain="FACE")
     link(less.outputs[0], sort.inputs["Geometry"])
-    link(depth.outputs[1], sort.inputs["Group ID"])
+    link(depth.outputs["Depth"], sort.inputs["Group ID"])
     copy = node("GeometryNodeObjectInfo", 7, 2, transform_space="ORIGINAL")
     link(given.outputs[SORTED], copy.inputs["Object"])
     count = node("GeometryNodeAttributeDomainSize", 8, 2, component="MESH")
