@@ -16,7 +16,7 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats.blender.inside import meshes, sorted_copies, versions
 from meshsplats.blender.inside.host import bpy
-from meshsplats.blender.inside.sorted_copies import CENTER, SORTED
+from meshsplats.blender.inside.sorted_copies import CENTER, SORTED, VIEW
 
 MODIFIER = "Far to near"
 """Name of the modifier, and of its node group."""
@@ -26,9 +26,6 @@ _SOME = 10_000
 """Splats whose median that distance is."""
 _FARTHEST = 2.0**29
 """Steps beyond which strays are not told apart: sums of three must fit into 32 bits."""
-VIEW = "View"
-"""Input of the node group: the direction to the viewer of a viewport, in Blender's world. Zero: the active
-camera's."""
 
 
 def add(obj: Any, *, viewport: bool = True) -> Any:
@@ -90,9 +87,9 @@ def look(modifier: Any, direction: Sequence[float] | None) -> None:
     if modifier.show_viewport != shown:
         modifier.show_viewport = shown
     given = tuple(float(x) for x in direction or (0, 0, 0))
-    versions.set_input(modifier, VIEW, given)
     if not (_knows_copies(modifier) and any(given) and sorted_copies.show(modifier, given)):
         sorted_copies.drop(modifier)
+        versions.set_input(modifier, VIEW, given)
         if shown:
             modifier.id_data.update_tag()
 

@@ -21,10 +21,16 @@ CENTER = "splat_center"
 the middle of the mesh, and in such units that whole numbers tell two depths apart (``far_to_near``)."""
 SORTED = "Sorted"
 """Input of the modifier's node group: the object whose mesh viewports show."""
+VIEW = "View"
+"""Input of the modifier's node group: the direction to the viewer of a viewport, in Blender's world. Zero:
+the active camera's. A copy needs it only when it is dropped: Blender 5.3 counts each new value of an input as
+an edit of the mesh."""
 OWNER = "meshsplats_copy_of"
 """Property of a copy, the object and its mesh: the session's number of the object that it was made for."""
 _AXES = "meshsplats_axes"
 """Property of a copy: the axes of its owner in Blender's world when it was sorted."""
+_VIEW = "meshsplats_view"
+"""Property of a copy: the direction to the viewer for which it was sorted."""
 _NEW = "meshsplats_new"
 """Property of a copy until Blender has evaluated it."""
 _CORNERS = (".corner_vert", ".corner_edge")
@@ -52,7 +58,7 @@ def show(modifier: Any, direction: Sequence[float]) -> bool:
     centers = np.empty(3 * count, np.float32)
     data.attributes[CENTER].data.foreach_get("vector", centers)
     axes = np.array(obj.matrix_world)[:3, :3]
-    copy[_AXES] = axes.ravel().tolist()
+    copy[_AXES], copy[_VIEW] = axes.ravel().tolist(), [float(x) for x in direction]
     local = np.asarray(direction, np.float64) @ axes
     local /= max(float(np.linalg.norm(local)), 1e-300)
     order = far_to_near(centers.reshape(-1, 3)[::each] @ local.astype(np.float32))
@@ -87,6 +93,7 @@ def drop(modifier: Any) -> None:
     if copy is None:
         return
     versions.set_input(modifier, SORTED, None)
+    versions.set_input(modifier, VIEW, tuple(copy.get(_VIEW, (0, 0, 0))))
     if copy.get(OWNER) == modifier.id_data.session_uid or not copy.users:
         _delete(copy)
     modifier.id_data.update_tag(refresh={"DATA"})
