@@ -100,7 +100,7 @@ def lit(
         turned = tree.node(
             "ShaderNodeVectorTransform", 1, 3, vector_type="NORMAL", convert_from="OBJECT", convert_to="WORLD"
         )
-        tree.link(normal.outputs["Vector"], turned.inputs[0])
+        tree.link(normal.outputs["Vector"], turned.inputs["Vector"])
         tree.link(turned.outputs[0], surface.inputs["Normal"])
         # Bump map correction darkens wherever the shading normal differs from the triangle's own.
         versions.set_if_there(material.cycles, use_bump_map_correction=False)
@@ -142,7 +142,7 @@ def _seen(tree: _Tree, color: Any, terms: int) -> Any:
     turned = tree.node(
         "ShaderNodeVectorTransform", -8, 8, vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT"
     )
-    tree.link(coming.outputs["Incoming"], turned.inputs[0])
+    tree.link(coming.outputs["Incoming"], turned.inputs["Vector"])  # Blender 5.3 hides one before it
     # The object's axes are those of the splats but for its rotation and one scale.
     length = tree.node("ShaderNodeVectorMath", -7, 8, operation="NORMALIZE")
     tree.link(turned.outputs[0], length.inputs[0])
