@@ -8,6 +8,7 @@ from . import (
     export_operator,
     following,
     import_operator,
+    light_operators,
     object_operators,
     panel,
     settings,
@@ -31,6 +32,7 @@ def register():
     import_operator.register()
     export_operator.register()
     object_operators.register()
+    light_operators.register()
     cut_operator.register()
     panel.register()
     following.register()
@@ -42,6 +44,7 @@ def unregister():
     following.unregister()
     panel.unregister()
     cut_operator.unregister()
+    light_operators.unregister()
     object_operators.unregister()
     export_operator.unregister()
     import_operator.unregister()

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators on objects and scenes: conversion, shading, render settings, stage, mesh priors, levels of
-detail."""
+"""Operators on objects: conversion, mesh priors, levels of detail."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
@@ -9,16 +8,11 @@ from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices
 from .work import (
     AgainWork,
     CloudWork,
-    LightWork,
     Modal,
     follow_shading,
     own_warnings,
     settle,
-    take_over,
-    waiting,
 )
-
-SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
 
 class ConvertAgain(Modal, bpy.types.Operator):
@@ -129,11 +123,12 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
             return {"CANCELLED"}
         for warning in caught:
             self.report({"WARNING"}, str(warning.message))
-        choices = {name: getattr(self, name) for name in CHOICES} | {"fast": context.scene.meshsplats_fast}
+        choices = {name: getattr(self, name) for name in (*CHOICES, "frame_view")}
+        choices["fast"] = context.scene.meshsplats_fast
         return self.begin(context, CloudWork(cloud, f"{source.name} mesh", frame.up_of(source), choices))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, splat_points
+        from meshsplats.blender.inside import objects, splat_points, views
 
         (result,) = work.results
         obj = objects.add(result.prepared[0], result.name, context.collection)
@@ -143,187 +138,14 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
             self.report({"WARNING"}, "MeshSplats: the splats are gone, the mesh stands upright")
         else:
             splat_points.take_place(obj, source, result.prepared[0]["origin"])
+            context.view_layer.update()
+            if result.views:
+                origin = result.prepared[0]["origin"]
+                views.remember(obj, [view.relative_to(origin) for view in result.views])
             if self.hide_splats:
                 source.hide_viewport = source.hide_render = True
         settle(self, context, [obj])
         self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
-
-
-class SetShading(Modal, bpy.types.Operator):
-    """Change between unlit and lit; edits since the import are kept"""
-
-    bl_idname = "object.meshsplats_shading"
-    bl_label = "Change Shading"
-    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
-
-    shading: EnumProperty(items=SHADINGS)
-
-    @classmethod
-    def poll(cls, context):
-        return context.object is not None and context.object.type == "MESH"
-
-    def execute(self, context):
-        from meshsplats.blender.inside import foreign, levels, objects
-
-        try:
-            chosen = levels.with_levels(context.object)
-            lit = self.shading == "lit"
-            self._changed = any(objects.is_lit(obj) != lit for obj in chosen)  # also imports of Blender's own
-            meshes = {
-                obj.name: objects.as_splat_mesh(obj) if objects.LIT in obj.data else foreign.splat_mesh(obj)
-                for obj in chosen
-            }
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        fast = self.shading == "lit" and context.scene.meshsplats_fast
-        return self.begin(context, LightWork(meshes, self.shading, fast))
-
-    def done(self, context, work):
-        take_over(work)
-        if self._changed:
-            follow_shading(self, context.scene, self.shading == "lit")
-
-
-class SetUpRender(bpy.types.Operator):
-    """Set bounce limits and colour management for the splat meshes of the scene"""
-
-    bl_idname = "scene.meshsplats_set_up"
-    bl_label = "Set up Render"
-    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
-
-    shading: EnumProperty(items=SHADINGS)
-
-    def execute(self, context):
-        from meshsplats.blender.inside import objects
-
-        every = objects.splat_objects(context.scene)
-        lit = self.shading == "lit"
-        limit = objects.render_settings(context.scene, every, lit)
-        clash = objects.clash(every, lit)
-        if clash:
-            self.report({"WARNING"}, f"MeshSplats: {clash}")
-        layers = objects.count_layers(every)
-        if layers > limit:
-            self.report(
-                {"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black"
-            )
-        return {"FINISHED"}
-
-
-LIGHTS = [
-    ("sun", "Sun", "An afternoon's sun and an even sky"),
-    ("noon", "Noon", "The sun high in a clear sky"),
-    ("overcast", "Overcast", "Clouds: no shadows with edges"),
-    ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
-]
-
-
-class SetUpStage(Modal, bpy.types.Operator):
-    """Set up light, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
-
-    bl_idname = "scene.meshsplats_stage"
-    bl_label = "Set up Light and Camera"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
-
-    lights: EnumProperty(name="Light", items=LIGHTS, default="sun")
-    camera: BoolProperty(name="Camera", description="Add a camera that sees all of them", default=True)
-    make_lit: BoolProperty(
-        name="Make Lit",
-        description="Give unlit splat meshes the lit material, which light acts on",
-        default=True,
-    )
-
-    fast: BoolProperty(
-        name="Fast",
-        description="A preview: rougher light and colours, in less time",
-        default=False,
-    )
-
-    @classmethod
-    def description(cls, context, properties):
-        (light,) = (text for name, _, text in LIGHTS if name == properties.lights)
-        return f"{light}. {cls.__doc__}"
-
-    def execute(self, context):
-        from meshsplats.blender.inside import objects
-
-        wanted = {}
-        try:
-            for obj in objects.splat_objects(context.scene):
-                unlit = not obj.data[objects.LIT]
-                if (unlit and self.make_lit) or objects.needs_light(obj, fast=self.fast):
-                    wanted[obj.name] = objects.as_splat_mesh(obj)
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return self.begin(context, LightWork(wanted, "lit", self.fast))
-
-    def done(self, context, work):
-        from meshsplats.blender.inside import objects, setting
-
-        take_over(work)
-        setting.hide_start_scene(context.scene)
-        with waiting(context):
-            every = objects.splat_objects(context.scene)
-            setting.set_up(context.scene, every, self.lights, camera=self.camera, fast=self.fast)
-        if "EEVEE" in context.scene.render.engine:  # Material Preview shows no lamps of the scene
-            setting.show_colors(context.window_manager.windows, "RENDERED")
-
-
-class BakeLight(Modal, bpy.types.Operator):
-    """Gather the light of the scene on its lit splat meshes, which then show it without noise. Do so again
-    after lamps, sky or other objects have changed"""
-
-    bl_idname = "scene.meshsplats_bake_light"
-    bl_label = "Bake Light"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
-
-    live: BoolProperty(
-        name="Live",
-        description="Lamps light the splats in every image, slower and with noise; baked light is dropped",
-        default=False,
-    )
-    fast: BoolProperty(name="Fast", description="A preview: rougher light, in less time", default=False)
-    only_active: BoolProperty(
-        name="Only Active", description="Of the active object, not of all", default=False
-    )
-
-    def execute(self, context):
-        from meshsplats.blender.inside import baking, objects, stand_ins
-
-        stand_ins.remove_strays(context.scene)
-        lit = [obj for obj in objects.splat_objects(context.scene) if obj.data[objects.LIT]]
-        if self.only_active:
-            lit = [obj for obj in lit if obj == context.object]
-        if not lit:
-            what = "the active object is no lit splat mesh" if self.only_active else "no splat mesh is lit"
-            self.report({"ERROR"}, f"{what}: choose Lit for it first")
-            return {"CANCELLED"}
-        if self.live:
-            baking.forget(lit)
-            return {"FINISHED"}
-        self._names = [obj.name for obj in lit]
-        stale = [obj for obj in lit if objects.needs_light(obj, fast=self.fast)]
-        try:
-            meshes = {obj.name: objects.as_splat_mesh(obj) for obj in stale}
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return self.begin(context, LightWork(meshes, "lit", self.fast))
-
-    def done(self, context, work):
-        from meshsplats.blender.inside import baking
-        from meshsplats.blender.options import CAREFUL, FAST
-
-        renewed = take_over(work)
-        lit = [obj for name in self._names if (obj := bpy.data.objects.get(name)) is not None]
-        with waiting(context):
-            count = baking.bake(context.scene, lit, samples=(FAST if self.fast else CAREFUL).samples)
-        if renewed:
-            self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")
-        if not count:
-            self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
 
 
 class FollowBase(bpy.types.Operator):
@@ -419,10 +241,6 @@ class FitLevel(ChainOperator, bpy.types.Operator):
 CLASSES = (
     ConvertAgain,
     ConvertSplats,
-    SetShading,
-    SetUpRender,
-    SetUpStage,
-    BakeLight,
     FollowBase,
     ShowLevel,
     FitLevel,

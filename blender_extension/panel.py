@@ -7,18 +7,9 @@ import bpy
 
 from .cut_operator import AdjustSplats, CleanSplats, CutSplats
 from .import_operator import ImportMeshSplats
-from .object_operators import (
-    BakeLight,
-    ConvertAgain,
-    ConvertSplats,
-    FitLevel,
-    FollowBase,
-    SetShading,
-    SetUpRender,
-    SetUpStage,
-    ShowLevel,
-)
-from .settings import LIT, draw_choices
+from .light_operators import BakeLight, SetShading, SetUpRender, SetUpStage
+from .object_operators import ConvertAgain, ConvertSplats, FitLevel, FollowBase, ShowLevel
+from .settings import LIT, draw_choices, is_blenders
 
 CHAIN, LEVEL = "meshsplats_levels", "meshsplats_level"
 """Properties of the collections of levels of detail; ``meshsplats.blender.inside.levels`` sets them."""
@@ -71,6 +62,8 @@ class MeshSplatsPanel(bpy.types.Panel):
             self._object(layout, obj)
         if ConvertSplats.poll(context):
             layout.operator(ConvertSplats.bl_idname, icon="MESH_DATA")
+        if is_blenders(obj):
+            self._blenders(layout, obj)
         for collection in context.scene.collection.children_recursive:
             if CHAIN in collection:
                 self._chain(layout, collection)
@@ -106,6 +99,16 @@ class MeshSplatsPanel(bpy.types.Panel):
                 button = row.operator(ShowLevel.bl_idname, text=str(child[LEVEL]), depress=shown)
                 button.chain, button.level, button.where = chain.name, child[LEVEL], where
         box.operator(FitLevel.bl_idname, icon="CAMERA_DATA").chain = chain.name
+
+    def _blenders(self, layout, obj):
+        warning = light_warning(bpy.context.scene, obj)
+        if warning:
+            draw_warning(layout, warning)
+        layout.label(text="Light of these splats")
+        row, now = layout.row(align=True), bool(obj.data.get(LIT))
+        for shading, lit in (("unlit", False), ("lit", True)):
+            button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=lit == now)
+            button.shading = shading
 
     def _object(self, layout, obj):
         if obj.meshsplats.path:

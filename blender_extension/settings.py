@@ -13,6 +13,17 @@ def is_splat_mesh(obj):
     return obj is not None and obj.type == "MESH" and LIT in obj.data
 
 
+def is_blenders(obj):
+    """Whether the object is splats that Blender draws itself, since 5.3; it may be None. Loads no library of
+    ours: the panel asks whenever it is drawn."""
+    return (
+        obj is not None
+        and obj.type == "POINTCLOUD"
+        and getattr(obj.data, "type", "") == "GAUSSIAN_SPLAT"
+        and "radiance:base" in obj.data.attributes
+    )
+
+
 class Choices:
     """Properties shared by the import operator and by the objects it made."""
 

@@ -173,15 +173,20 @@ class Work:
 
         lit = self.choices["shading"] == "lit"
         self._at(begin + 0.6 * share, "counting layers")
-        phases = iter((0.6, 0.7, 0.8, 0.9))
-
-        def announce(phase):  # Escape takes effect between phases
-            self._at(begin + next(phases, 0.9) * share, f"{phase} for light")
-
+        announce = self._announce(begin, share, (0.6, 0.7, 0.8, 0.9))
         fast = self.choices.get("fast", False)
         prepared = objects.prepare(mesh, lit, fast=fast, views=views, announce=announce)
         self._at(begin + share, "building")
         return prepared
+
+    def _announce(self, begin, share, reached):
+        """Is told the phases of what is lit; ``reached`` are their shares."""
+        phases = iter(reached)
+
+        def announce(phase):  # Escape takes effect between phases
+            self._at(begin + next(phases, reached[-1]) * share, f"{phase} for light")
+
+        return announce
 
 
 class CloudWork(Work):
@@ -192,9 +197,14 @@ class CloudWork(Work):
         self._cloud, self._up = cloud, up
 
     def _one(self, path, index):
+        from meshsplats.blender.subject import views_within
+
         self._at(index, "converting")
-        mesh = self._converted(self._cloud, self._up)
-        return Result("", path, (self._ready(mesh, index, 1.0),))
+        mesh, views = self._converted(self._cloud, self._up), None
+        if self.choices.get("frame_view"):
+            self._at(index + 0.4, "looking for a view")
+            views = tuple(views_within(self._cloud, up=self._up))
+        return Result("", path, (self._ready(mesh, index, 1.0, views),), views=views)
 
 
 class AgainWork(Work):
@@ -221,21 +231,30 @@ class AgainWork(Work):
 
 
 class LightWork(Work):
-    """Prepares ``meshes``, by the names of their objects, unlit or lit."""
+    """Prepares ``sources``, meshes or splats that Blender draws (``objects.light_source``), by the names of
+    their objects: unlit or lit; the latter are lit."""
 
-    def __init__(self, meshes, shading, fast=False):
+    def __init__(self, sources, shading, fast=False):
         import bpy
 
         from meshsplats.blender.inside import objects, stand_ins
 
-        super().__init__(meshes, {"shading": shading, "fast": fast})
-        self._meshes = meshes
-        named = {name: bpy.data.objects[name] for name in meshes}
+        super().__init__(sources, {"shading": shading, "fast": fast})
+        self._sources = sources
+        named = {name: bpy.data.objects[name] for name in sources}
         self.shapes = {name: stand_ins.shape(obj.data) for name, obj in named.items()}
         self._views_of = {name: objects.views_within(obj) for name, obj in named.items()}
 
     def _one(self, path, index):
-        return Result("", path, (self._ready(self._meshes[path], index, 1.0, self._views_of[path]),))
+        from meshsplats.blender.inside import lit_points
+
+        source, views = self._sources[path], self._views_of[path]
+        if not isinstance(source, lit_points.Source):
+            return Result("", path, (self._ready(source, index, 1.0, views),))
+        self._at(index, "converting")
+        announce = self._announce(index, 1.0, (0.2, 0.3, 0.5, 0.7))
+        prepared = lit_points.prepare(source, fast=self.choices["fast"], within=views, announce=announce)
+        return Result("", path, (prepared,))
 
 
 class Modal:
@@ -346,7 +365,7 @@ def follow_shading(operator, scene, lit):
     are of the other kind: ``operator`` then says so."""
     from meshsplats.blender.inside import objects
 
-    every = objects.splat_objects(scene)
+    every = objects.splat_objects(scene)  # Blender's own splats are right in light's settings, lit or not
     if all(objects.is_lit(obj) == lit for obj in every):
         objects.render_settings(scene, every, lit)
     else:
@@ -368,7 +387,7 @@ def take_over(work):
     for result in work.results:
         obj = bpy.data.objects.get(result.name)
         if obj is not None and stand_ins.shape(obj.data) == work.shapes[result.name]:
-            objects.replace_mesh(obj, result.prepared[0])
+            objects.take_light(obj, result.prepared[0])
             obj.meshsplats.shading = work.choices["shading"]
             done.append(result.name)
     return done

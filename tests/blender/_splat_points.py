@@ -7,8 +7,8 @@ import numpy as np
 
 
 def splat_points(cloud, name: str, collection):
-    """A point cloud object with the attributes of Blender's importers, active and selected; None where
-    Blender makes no point clouds (4.2)."""
+    """A point cloud object with the attributes of Blender's importers, active and selected, which 5.3 draws
+    as splats; None where Blender makes no point clouds (4.2)."""
     if bpy.app.version < (4, 5, 0):
         return None
     data = bpy.data.meshes.new(name)
@@ -16,11 +16,13 @@ def splat_points(cloud, name: str, collection):
     data.vertices.foreach_set("co", np.asarray(cloud.means, np.float32).ravel())
     base = np.concatenate([cloud.sh[:, 0], cloud.opacities[:, None]], axis=1)
     # Four numbers that are no colour are a type of attribute since 5.2.
-    kinds = {"base": ("FLOAT4", "vector") if bpy.app.version >= (5, 2, 0) else ("FLOAT_COLOR", "color")}
-    for attribute, values, kind, key in [
-        ("scale", cloud.scales, "FLOAT_VECTOR", "vector"),
-        ("rotation", cloud.quaternions, "QUATERNION", "value"),
-        ("radiance:base", base, *kinds["base"]),
+    four = ("FLOAT4", "vector") if bpy.app.version >= (5, 2, 0) else ("FLOAT_COLOR", "color")
+    three = ("FLOAT_VECTOR", "vector")
+    for attribute, values, (kind, key) in [
+        ("scale", cloud.scales, three),
+        ("rotation", cloud.quaternions, ("QUATERNION", "value")),
+        ("radiance:base", base, four),
+        *((f"radiance:sh_{k}", sh, three) for k, sh in enumerate(np.moveaxis(cloud.sh[:, 1:], 1, 0))),
     ]:
         made = data.attributes.new(attribute, kind, "POINT")
         made.data.foreach_set(key, np.ascontiguousarray(values, np.float32).ravel())
@@ -31,4 +33,7 @@ def splat_points(cloud, name: str, collection):
     bpy.context.view_layer.objects.active = obj
     obj.select_set(True)
     bpy.ops.object.convert(target="POINTCLOUD")
-    return bpy.context.object
+    obj = bpy.context.object
+    if hasattr(obj.data, "type"):
+        obj.data.type = "GAUSSIAN_SPLAT"
+    return obj

@@ -325,7 +325,7 @@ def test_fast_light_is_made_carefully_when_asked(ball, extension):
     assert materials.shows_baked(material)
     assert len(baking.places_of(ball)[0]) == rough
     bpy.context.view_layer.objects.active = bpy.context.scene.camera
-    with pytest.raises(RuntimeError, match="the active object is no lit splat mesh"):
+    with pytest.raises(RuntimeError, match="the active object is not lit"):
         bpy.ops.scene.meshsplats_bake_light(only_active=True)
     # A part that is cut off a baked object shows baked light, too.
     bpy.context.view_layer.objects.active = ball
@@ -398,7 +398,7 @@ def test_tooltips_say_why_a_button_is_grey(ball, extension):
 
 
 def test_each_light_has_a_tooltip_of_its_own(extension):
-    stage = sys.modules["blender_extension.object_operators"].SetUpStage
+    stage = sys.modules["blender_extension.light_operators"].SetUpStage
     texts = [
         stage.description(None, SimpleNamespace(lights=n)) for n in ("sun", "noon", "overcast", "studio")
     ]

@@ -51,6 +51,19 @@ def test_splats_are_those_of_the_file(collection):
     assert np.abs(found.quaternions - cloud.quaternions).max() < 1e-6
 
 
+@pytest.mark.parametrize("terms", [3, 8, 15])
+def test_harmonics_are_those_of_the_file(collection, terms):
+    sh = np.random.default_rng(0).normal(0, 0.2, (20, 1 + terms, 3)).astype(np.float32)
+    cloud = replace(ball_splats(20)[0], sh=sh)
+    obj = made(cloud, collection)
+    found = read(obj)
+    assert np.array_equal(found.sh, sh)
+    np.testing.assert_array_equal(convert(found).harmonics, convert(cloud).harmonics)
+    obj.data.attributes.remove(obj.data.attributes[f"radiance:sh_{terms - 1}"])
+    kept = {3: 1, 8: 4, 15: 9}[terms]
+    assert np.array_equal(read(obj).sh, sh[:, :kept]), "whole degrees"
+
+
 def test_the_mesh_stands_where_the_splats_do(collection):
     """Under a parent, moved, turned and stretched."""
     cloud = ball_splats(100)[0]

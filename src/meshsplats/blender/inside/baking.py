@@ -134,8 +134,8 @@ def state(scene: Any, obj: Any) -> str:
         if other.type == "LIGHT":
             lamp = other.data
             parts += [_numbers(other.matrix_world), lamp.type, _numbers([[lamp.energy, *lamp.color]])]
-        elif other.type == "MESH" and other != obj and other.parent != obj:
-            parts += [other.name, _numbers(other.matrix_world), len(other.data.vertices)]
+        elif other.type in ("MESH", "POINTCLOUD") and other != obj and other.parent != obj:
+            parts += [other.name, _numbers(other.matrix_world), meshes.size(other.data)]
     tree = scene.world.node_tree if scene.world is not None else None
     for node in tree.nodes if tree is not None else ():
         if node.type == "BACKGROUND":
@@ -161,15 +161,16 @@ def forget(objs: list[Any]) -> None:
 
 def show(data: Any, light: np.ndarray) -> None:
     """Gives the splats ``data`` the ``light`` (n, 3) of their points, and switches their material to it."""
-    index = np.empty(len(data.vertices), np.int32)
-    data.attributes[POINT].data.foreach_get("value", index)
+    points = data.attributes[POINT].data
+    index = np.empty(len(points), np.int32)
+    points.foreach_get("value", index)
     values = np.ones((len(index), 4), np.float32)
     values[:, :3] = light[index]
     attribute = data.attributes.get(LIGHT) or data.attributes.new(LIGHT, "FLOAT_COLOR", "POINT")
     attribute.data.foreach_set("color", values.ravel())
     for material in data.materials:
         materials.set_baked(material, True)
-    data.update()
+    data.update_tag()
 
 
 def smoothed(data: Any) -> np.ndarray:

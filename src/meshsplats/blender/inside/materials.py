@@ -14,6 +14,8 @@ SELF_SHADOW = "Self-shadow distance"
 BAKED = "Baked light"
 """Name and label of the node that is 1 where the splats glow with the light of ``LIGHT``, 0 where the lamps
 of the scene light them."""
+LIT = "meshsplats_lit"
+"""Property of the data of splats: whether their colours are linear light and their material lit."""
 LIGHT = "Light"
 """Attribute with the linear RGB of the light on a white matt surface there."""
 
@@ -133,6 +135,26 @@ def lit(
     tree.link(shader, both.inputs[1])
     tree.link(glow.outputs[0], both.inputs[2])
     _translucent(tree, material, alpha, both.outputs[0])
+    return material
+
+
+def glowing(name: str = "Splats, lit") -> Any:
+    """For splats that Blender draws itself, which have their opacity from it: they glow with their linear
+    colours of ``COLOR`` times the light of ``LIGHT``."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
+    product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
+    tree.link(color.outputs["Color"], product.inputs[0])
+    tree.link(light.outputs["Color"], product.inputs[1])
+    glow = tree.node("ShaderNodeEmission", 2, 0)
+    tree.link(product.outputs[0], glow.inputs["Color"])
+    out = tree.node("ShaderNodeOutputMaterial", 3, 0)
+    tree.link(glow.outputs[0], out.inputs["Surface"])
+    baked = tree.node("ShaderNodeValue", 0, 2, name=BAKED, label=BAKED)
+    baked.outputs[0].default_value = 1
+    material.cycles.emission_sampling = "NONE"
     return material
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.inside.splat_points import is_splats, values
 from meshsplats.cameras.framing import SAMPLE
 from meshsplats.spherical_harmonics import TERMS, in_fours
 
@@ -162,15 +163,24 @@ def face_middles(mesh: Any) -> np.ndarray:
     return np.add.reduceat(places.reshape(-1, 3)[corners], starts) / counts[:, None]
 
 
+def size(data: Any) -> int:
+    """Count of the vertices of a mesh, or of the points of a point cloud."""
+    return len(data.vertices if hasattr(data, "vertices") else data.points)
+
+
 def world_points(obj: Any) -> np.ndarray:
-    """(k, 3) float64 sample of the visible vertices of ``obj``, in Blender's world."""
+    """(k, 3) float64 sample of the visible vertices, or splats, of ``obj``, in Blender's world."""
     world = np.array(obj.matrix_world)
     return local_points(obj) @ world[:3, :3].T + world[:3, 3]
 
 
 def local_points(obj: Any) -> np.ndarray:
-    """(k, 3) float64 sample of the visible vertices of ``obj``, in its own frame."""
+    """(k, 3) float64 sample of the visible vertices, or splats, of ``obj``, in its own frame."""
     data = obj.data
+    if is_splats(obj):
+        points = values(data, "position").astype(np.float64)
+        points = points[values(data, "radiance:base")[:, 3] > _VISIBLE]
+        return points[:: -(-max(len(points), 1) // SAMPLE)]
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
     points = vertices.reshape(-1, 3).astype(np.float64)

@@ -12,6 +12,7 @@ from meshsplats.blender.inside import (
     foreign,
     frame,
     levels,
+    lit_points,
     materials,
     meshes,
     priors,
@@ -22,6 +23,8 @@ from meshsplats.blender.inside import (
     views,
 )
 from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.inside.materials import LIT as LIT
+from meshsplats.blender.inside.stand_ins import ROUGH as ROUGH
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import CAREFUL, FAST, LightOptions
 from meshsplats.blender.subject import Announce, lit_subject, lowest, vertex_harmonics
@@ -33,8 +36,6 @@ from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import MAX_COLOR, Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
 
-LIT = "meshsplats_lit"
-"""Property of the mesh data: whether its colours are linear light and its material lit."""
 LINEAR = "meshsplats_linear"
 """Property of the mesh data: whether the mesh was made for blending in linear light."""
 UP = "meshsplats_up"
@@ -46,8 +47,6 @@ WORLD = "meshsplats_world"
 frame is relative to. Blender's places are float32, so objects stand near (0, 0, 0)."""
 LAYERS = "meshsplats_layers"
 """Property of the mesh data: most layers behind each other."""
-ROUGH = "meshsplats_rough"
-"""Property of the object of lit splats: whether surface and colours for light are those of a preview."""
 
 
 def prepare(
@@ -130,15 +129,25 @@ def splat_objects(scene: Any) -> list[Any]:
     return [obj for obj in scene.objects if obj.type == "MESH" and LAYERS in obj.data]
 
 
+def subjects(scene: Any) -> list[Any]:
+    """What light can act on: the splat meshes of ``scene``, and the splats that Blender draws itself."""
+    return [*splat_objects(scene), *(obj for obj in scene.objects if lit_points.can_be_lit(obj))]
+
+
 def is_lit(obj: Any) -> bool | None:
-    """Whether the splat mesh ``obj`` is lit; None for other objects."""
+    """Whether the splats ``obj`` are lit; None for other objects."""
+    if lit_points.can_be_lit(obj):
+        return bool(obj.data.get(LIT))
     return bool(obj.data[LIT]) if obj.type == "MESH" and LIT in obj.data else None
 
 
 def count_layers(objs: Iterable[Any]) -> int:
-    """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
+    """Most layers of triangles behind each other of ``objs``; of the levels of a chain, one is shown at a
+    time."""
     most: dict[tuple[bool, str], int] = {}
     for obj in objs:
+        if obj.type != "MESH":
+            continue
         chain = levels.chain_of(obj)
         key = (True, chain.name) if chain is not None else (False, obj.name)
         most[key] = max(most.get(key, 0), int(obj.data.get(LAYERS, 256)))
@@ -166,10 +175,34 @@ def renew_light(scene: Any, objs: Iterable[Any], *, fast: bool = False) -> list[
     stand_ins.remove_strays(scene)
     found = []
     for obj in objs:
-        if needs_light(obj, fast=fast):
-            replace_mesh(obj, prepare(as_splat_mesh(obj), True, fast=fast, views=views_within(obj)))
-            found.append(obj.name)
+        if not needs_light(obj, fast=fast):
+            continue
+        source, within = light_source(obj), views_within(obj)
+        if isinstance(source, SplatMesh):
+            take_light(obj, prepare(source, True, fast=fast, views=within))
+        else:
+            take_light(obj, lit_points.prepare(source, fast=fast, within=within))
+        found.append(obj.name)
     return found
+
+
+def light_source(obj: Any) -> SplatMesh | lit_points.Source:
+    """What light is prepared for: the unlit mesh of ``obj``, or the splats that Blender draws.
+
+    Raises:
+        ValueError: the object is neither.
+    """
+    if lit_points.can_be_lit(obj):
+        return lit_points.Source(obj, bpy.context.evaluated_depsgraph_get())
+    return as_splat_mesh(obj)
+
+
+def take_light(obj: Any, prepared: dict[str, Any]) -> None:
+    """Gives ``obj`` what was prepared for its ``light_source``."""
+    if lit_points.can_be_lit(obj):
+        lit_points.light(obj, prepared)
+    else:
+        replace_mesh(obj, prepared)
 
 
 def views_within(obj: Any) -> list[Camera] | None:
@@ -183,7 +216,7 @@ def views_within(obj: Any) -> list[Camera] | None:
 def needs_light(obj: Any, *, fast: bool = False) -> bool:
     """Whether the splats ``obj`` are lit, and their stand-in is not of their shape as it is now, or for
     previews unless ``fast``."""
-    if not obj.data[LIT] or priors.base_of(obj) is not None:
+    if not is_lit(obj) or priors.base_of(obj) is not None:
         return False
     return not stand_ins.is_current(obj) or bool(obj.get(ROUGH) and not fast)
 
@@ -195,8 +228,9 @@ def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
     if "surface_vertices" not in prepared:
         return
     origin = prepared["origin"].astype(np.float32)
-    arrays = {name: prepared[name] for name in stand_ins.ARRAYS}
-    for name in ("surface_vertices", "light_points"):
+    whole = prepared | {"vertices": prepared["mesh"].vertices}
+    arrays = {name: whole[name] for name in (*stand_ins.SPLATS, *stand_ins.ARRAYS)}
+    for name in ("vertices", "surface_vertices", "light_points"):
         arrays[name] = arrays[name] - origin
     stand_ins.add(
         obj,
@@ -344,7 +378,7 @@ def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions 
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
     layers = count_layers(objs)
-    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
+    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs if obj.type == "MESH")
     limit = bounce_limit(layers)
     if lit:
         rendering.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)

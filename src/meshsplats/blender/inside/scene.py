@@ -205,7 +205,7 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
     if subject.surface_vertices is not None:
         stand_ins.add(
             obj,
-            {name: getattr(subject, name) for name in stand_ins.ARRAYS},
+            {name: getattr(subject, name) for name in (*stand_ins.SPLATS, *stand_ins.ARRAYS)},
             subject.light_spacing,
             self_shadow=subject.self_shadow,
             home=home,

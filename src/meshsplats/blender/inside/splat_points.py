@@ -9,10 +9,15 @@ import numpy as np
 
 from meshsplats.formats.splats._cloud_builder import CloudBuilder
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.spherical_harmonics import TERMS
 
 WIDTHS = {"position": 3, "scale": 3, "rotation": 4, "radiance:base": 4}
 """Attributes of a splat: centre, standard deviations, quaternion w, x, y, z; the harmonic of degree 0 in red,
 green, blue, and opacity. Blender's importers decode logits and logarithms."""
+HARMONIC = "radiance:sh_{}"
+"""Name of the attribute with harmonic k from 0, of degree 1 and more, in red, green, blue."""
+OPACITY = "meshsplats_opacity"
+"""Attribute of lit splats (``lit_points``): the opacity that they were imported with."""
 KEYS = {"FLOAT_VECTOR": "vector", "FLOAT4": "vector", "FLOAT_COLOR": "color", "QUATERNION": "value"}
 """Blender's name of the value, by the type of the attribute."""
 
@@ -26,36 +31,55 @@ def is_splats(obj: Any) -> bool:
 
 
 def cloud_of(obj: Any, depsgraph: Any) -> GaussianCloud:
-    """The splats of ``obj`` with its modifiers, in its own frame, of degree 0. A mesh has one colour per
-    vertex, so higher degrees are not read.
+    """The splats of ``obj`` with its modifiers, in its own frame, as they were imported.
 
     Raises:
         FileFormatError: no splat with finite values is there.
         ValueError: the modifiers leave no point cloud of splats.
     """
+    return usable(obj, depsgraph)[0]
+
+
+def usable(obj: Any, depsgraph: Any) -> tuple[GaussianCloud, np.ndarray]:
+    """``cloud_of``, and (n,) the indices of its splats among the points of ``obj`` with its modifiers."""
     evaluated = obj.evaluated_get(depsgraph)
     if not is_splats(evaluated):
         raise ValueError(f"{obj.name}: its modifiers leave no splats")
     data = evaluated.data
-    count = len(data.points)
-    builder = CloudBuilder(count, 1, obj.name)
+    count, terms = len(data.points), _terms(data)
+    builder = CloudBuilder(count, 1 + terms, obj.name)
     rows = builder.next(count)
-    rows.means[:] = _values(data, "position")
-    np.abs(_values(data, "scale"), out=rows.scales)
-    rows.quaternions[:] = _values(data, "rotation")
-    base = _values(data, "radiance:base")
+    rows.means[:] = values(data, "position")
+    np.abs(values(data, "scale"), out=rows.scales)
+    rows.quaternions[:] = values(data, "rotation")
+    base = values(data, "radiance:base")
     rows.sh[:, 0] = base[:, :3]
-    np.clip(base[:, 3], 0, 1, out=rows.opacities)
-    builder.keep(rows)
-    return builder.finish("3dgs", strict=False)
+    for k in range(terms):
+        rows.sh[:, 1 + k] = values(data, HARMONIC.format(k))
+    opacities = base[:, 3]
+    if OPACITY in data.attributes:
+        data.attributes[OPACITY].data.foreach_get("value", opacities := np.empty(count, np.float32))
+    np.clip(opacities, 0, 1, out=rows.opacities)
+    kept = np.flatnonzero(builder.keep(rows))
+    return builder.finish("3dgs", strict=False), kept
 
 
-def _values(data: Any, name: str) -> np.ndarray:
-    """(n, width) float32 values of an attribute."""
+def _terms(data: Any) -> int:
+    """Harmonics of degree 1 and more that ``data`` has: those of whole degrees, as vectors of its points."""
+    found = 0
+    while (a := data.attributes.get(HARMONIC.format(found))) is not None:
+        if (a.domain, a.data_type) != ("POINT", "FLOAT_VECTOR"):
+            break
+        found += 1
+    return max((terms for terms in TERMS if terms <= found), default=0)
+
+
+def values(data: Any, name: str) -> np.ndarray:
+    """(n, width) float32 values of an attribute of ``data``."""
     attribute = data.attributes[name]
-    flat = np.empty(WIDTHS[name] * len(attribute.data), np.float32)
+    flat = np.empty(WIDTHS.get(name, 3) * len(attribute.data), np.float32)
     attribute.data.foreach_get(KEYS[attribute.data_type], flat)
-    return flat.reshape(-1, WIDTHS[name])
+    return flat.reshape(len(attribute.data), -1)
 
 
 def take_place(obj: Any, splats: Any, origin: np.ndarray) -> None:

@@ -11,7 +11,10 @@ import numpy as np
 
 from meshsplats.blender.inside import baking, materials, meshes
 from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.inside.splat_points import values
 
+SPLATS = ("vertices", "faces", "colors")
+"""The mesh of the splats, with linear colours."""
 ARRAYS = (
     *("surface_vertices", "surface_faces", "surface_colors", "fine_faces"),
     *("light_points", "light_normals", "light_point_of"),
@@ -21,6 +24,8 @@ STAND_IN = "meshsplats_stand_in"
 """Property of the objects made here: True."""
 OWNER = "meshsplats_splats"
 """Property of the objects made here: the object of the splats that they were made for."""
+ROUGH = "meshsplats_rough"
+"""Property of the object of lit splats: whether surface and colours for light are those of a preview."""
 SHAPE = "meshsplats_shape"
 """Property of lit splats: the ``shape`` that their mesh had when their stand-in was made."""
 
@@ -31,7 +36,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     Cameras, mirrors and glass see the splats. Shadows, bounced light and occlusion come from the stand-in.
 
     Args:
-        arrays: those of ``ARRAYS``, in the frame of the object.
+        arrays: those of ``SPLATS`` and ``ARRAYS``, in the frame of the object.
         size: distance of neighbouring points, scene units.
         self_shadow: rays that start within this distance of the fine faces ignore them.
     """
@@ -42,17 +47,12 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     surface.materials.append(materials.stand_in())
     _child(obj, surface, home)
     if fine.any():
-        data = obj.data
-        corners = np.empty(len(data.loops), np.int32)
-        data.loops.foreach_get("vertex_index", corners)
-        used, index = np.unique(corners.reshape(-1, 3)[fine], return_inverse=True)
-        co = np.empty(3 * len(data.vertices), np.float32)
-        data.vertices.foreach_get("co", co)
+        used, index = np.unique(arrays["faces"][fine], return_inverse=True)
         thin = meshes.make_mesh(
             f"{obj.name} stand-in, fine",
-            co.reshape(-1, 3)[used],
+            arrays["vertices"][used],
             index.reshape(-1, 3).astype(np.int32),
-            meshes.read_colors(data, meshes.COLOR)[used],
+            arrays["colors"][used],
         )
         thin.materials.append(materials.stand_in("Stand-in, fine", fine=True, self_shadow=self_shadow))
         _child(obj, thin, home)
@@ -65,7 +65,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     target.hide_select = False
     target.hide_render = target.hide_viewport = True
     obj[baking.POINTS] = target
-    index_of = obj.data.attributes.new(baking.POINT, "INT", "POINT")
+    index_of = obj.data.attributes.get(baking.POINT) or obj.data.attributes.new(baking.POINT, "INT", "POINT")
     index_of.data.foreach_set("value", np.ascontiguousarray(arrays["light_point_of"], np.int32))
     obj.visible_shadow = obj.visible_diffuse = False
 
@@ -84,13 +84,23 @@ def _child(obj: Any, mesh: Any, home: Any) -> Any:
 
 
 def shape(data: Any) -> str:
-    """Counts and a checksum of the mesh ``data``, which edits change."""
+    """Counts and a checksum of the mesh ``data``, or of a point cloud, which edits change."""
+    if not hasattr(data, "vertices"):
+        places = np.concatenate([values(data, name) for name in ("position", "scale", "rotation")], axis=1)
+        return f"{_counts(data)}{zlib.crc32(places.tobytes()):08x}"
     co = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", co)
     corners = np.empty(len(data.loops), np.int32)
     data.loops.foreach_get("vertex_index", corners)
     checksum = zlib.crc32(corners.tobytes(), zlib.crc32(co.tobytes()))
-    return f"{len(data.vertices)} {len(data.polygons)} {checksum:08x}"
+    return f"{_counts(data)}{checksum:08x}"
+
+
+def _counts(data: Any) -> str:
+    """How a ``shape`` begins."""
+    if not hasattr(data, "vertices"):
+        return f"{len(data.points)} "
+    return f"{len(data.vertices)} {len(data.polygons)} "
 
 
 def is_current(obj: Any, *, counts_only: bool = False) -> bool:
@@ -102,7 +112,7 @@ def is_current(obj: Any, *, counts_only: bool = False) -> bool:
             return False
     before, data = obj.get(SHAPE, ""), obj.data
     if counts_only:
-        return before.startswith(f"{len(data.vertices)} {len(data.polygons)} ")
+        return before.startswith(_counts(data))
     return bool(before == shape(data))
 
 

@@ -167,8 +167,9 @@ class CloudBuilder:
         """The next ``m`` rows, to be written."""
         return SplatRows(*(a[self._kept : self._kept + m] for a in self._arrays))
 
-    def keep(self, rows: SplatRows) -> None:
-        """Keeps the rows from ``next``: normalises their quaternions and drops unusable ones."""
+    def keep(self, rows: SplatRows) -> np.ndarray:
+        """Keeps the rows from ``next``: normalises their quaternions and drops unusable ones. Returns (m,)
+        bool which are kept."""
         m = len(rows.means)
         if self._flat:
             rows.scales[:, 2] = 0
@@ -194,6 +195,7 @@ class CloudBuilder:
             for array in rows:
                 array[:m] = array[good]
         self._kept += m
+        return good
 
     def finish(self, kernel: Kernel, *, strict: bool) -> GaussianCloud:
         """The cloud. Dropped splats give a DataWarning; an error if ``strict`` or if none is left."""

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators for light: shading of objects, render settings, a stage with lamps and camera, baked light."""
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty
+
+from .settings import is_blenders
+from .work import LightWork, Modal, follow_shading, take_over, waiting
+
+SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
+
+
+class SetShading(Modal, bpy.types.Operator):
+    """Change between unlit and lit; edits since the import are kept"""
+
+    bl_idname = "object.meshsplats_shading"
+    bl_label = "Change Shading"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    shading: EnumProperty(items=SHADINGS)
+
+    @classmethod
+    def poll(cls, context):
+        return context.object is not None and (context.object.type == "MESH" or is_blenders(context.object))
+
+    def execute(self, context):
+        from meshsplats.blender.inside import foreign, levels, lit_points, objects
+
+        lit, self._own = self.shading == "lit", is_blenders(context.object)
+        if self._own and not lit:
+            lit_points.unlight(context.object)
+            return {"FINISHED"}
+        try:
+            chosen = levels.with_levels(context.object)
+            self._changed = any(objects.is_lit(obj) != lit for obj in chosen)  # also imports of Blender's own
+            meshes = {
+                obj.name: objects.light_source(obj)
+                if self._own or objects.LIT in obj.data
+                else foreign.splat_mesh(obj)
+                for obj in chosen
+            }
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        fast = self.shading == "lit" and context.scene.meshsplats_fast
+        return self.begin(context, LightWork(meshes, self.shading, fast))
+
+    def done(self, context, work):
+        done = take_over(work)
+        if self._changed:
+            follow_shading(self, context.scene, self.shading == "lit")
+        if self._own:  # lamps alone do not light them
+            bake(context, done, work.choices["fast"])
+
+
+class SetUpRender(bpy.types.Operator):
+    """Set bounce limits and colour management for the splat meshes of the scene"""
+
+    bl_idname = "scene.meshsplats_set_up"
+    bl_label = "Set up Render"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    shading: EnumProperty(items=SHADINGS)
+
+    def execute(self, context):
+        from meshsplats.blender.inside import objects
+
+        every = objects.splat_objects(context.scene)
+        lit = self.shading == "lit"
+        limit = objects.render_settings(context.scene, every, lit)
+        clash = objects.clash(every, lit)
+        if clash:
+            self.report({"WARNING"}, f"MeshSplats: {clash}")
+        layers = objects.count_layers(every)
+        if layers > limit:
+            self.report(
+                {"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black"
+            )
+        return {"FINISHED"}
+
+
+LIGHTS = [
+    ("sun", "Sun", "An afternoon's sun and an even sky"),
+    ("noon", "Noon", "The sun high in a clear sky"),
+    ("overcast", "Overcast", "Clouds: no shadows with edges"),
+    ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
+]
+
+
+class SetUpStage(Modal, bpy.types.Operator):
+    """Set up light, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
+
+    bl_idname = "scene.meshsplats_stage"
+    bl_label = "Set up Light and Camera"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    lights: EnumProperty(name="Light", items=LIGHTS, default="sun")
+    camera: BoolProperty(name="Camera", description="Add a camera that sees all of them", default=True)
+    make_lit: BoolProperty(
+        name="Make Lit",
+        description="Give unlit splat meshes the lit material, which light acts on",
+        default=True,
+    )
+
+    fast: BoolProperty(
+        name="Fast",
+        description="A preview: rougher light and colours, in less time",
+        default=False,
+    )
+
+    @classmethod
+    def description(cls, context, properties):
+        (light,) = (text for name, _, text in LIGHTS if name == properties.lights)
+        return f"{light}. {cls.__doc__}"
+
+    def execute(self, context):
+        from meshsplats.blender.inside import objects
+
+        wanted = {}
+        try:
+            for obj in objects.subjects(context.scene):
+                unlit = not objects.is_lit(obj) and not obj.hide_render
+                if (unlit and self.make_lit) or objects.needs_light(obj, fast=self.fast):
+                    wanted[obj.name] = objects.light_source(obj)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return self.begin(context, LightWork(wanted, "lit", self.fast))
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import objects, setting
+
+        take_over(work)
+        setting.hide_start_scene(context.scene)
+        with waiting(context):
+            every = objects.subjects(context.scene)
+            setting.set_up(context.scene, every, self.lights, camera=self.camera, fast=self.fast)
+        if "EEVEE" in context.scene.render.engine:  # Material Preview shows no lamps of the scene
+            setting.show_colors(context.window_manager.windows, "RENDERED")
+
+
+def bake(context, names, fast):
+    """Gathers the light of the scene on the lit splats with these ``names``. Returns how many took it."""
+    from meshsplats.blender.inside import baking
+    from meshsplats.blender.options import CAREFUL, FAST
+
+    objs = [obj for name in names if (obj := bpy.data.objects.get(name)) is not None]
+    with waiting(context):
+        return baking.bake(context.scene, objs, samples=(FAST if fast else CAREFUL).samples)
+
+
+class BakeLight(Modal, bpy.types.Operator):
+    """Gather the light of the scene on its lit splat meshes, which then show it without noise. Do so again
+    after lamps, sky or other objects have changed"""
+
+    bl_idname = "scene.meshsplats_bake_light"
+    bl_label = "Bake Light"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    live: BoolProperty(
+        name="Live",
+        description="Lamps light the splats in every image, slower and with noise; baked light is dropped",
+        default=False,
+    )
+    fast: BoolProperty(name="Fast", description="A preview: rougher light, in less time", default=False)
+    only_active: BoolProperty(
+        name="Only Active", description="Of the active object, not of all", default=False
+    )
+
+    def execute(self, context):
+        from meshsplats.blender.inside import baking, objects, stand_ins
+
+        stand_ins.remove_strays(context.scene)
+        lit = [obj for obj in objects.subjects(context.scene) if objects.is_lit(obj)]
+        if self.only_active:
+            lit = [obj for obj in lit if obj == context.object]
+        if not lit:
+            what = "the active object is not lit" if self.only_active else "no splats are lit"
+            self.report({"ERROR"}, f"{what}: choose Lit for it first")
+            return {"CANCELLED"}
+        if self.live:
+            meshes = [obj for obj in lit if obj.type == "MESH"]
+            if len(meshes) < len(lit):
+                what = (
+                    "splats that Blender draws take baked light alone: Convert Splats to Mesh for live light"
+                )
+                self.report({"WARNING"} if meshes else {"ERROR"}, what)
+            baking.forget(meshes)
+            return {"FINISHED"} if meshes else {"CANCELLED"}
+        self._names = [obj.name for obj in lit]
+        stale = [obj for obj in lit if objects.needs_light(obj, fast=self.fast)]
+        try:
+            sources = {obj.name: objects.light_source(obj) for obj in stale}
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return self.begin(context, LightWork(sources, "lit", self.fast))
+
+    def done(self, context, work):
+        renewed = take_over(work)
+        count = bake(context, self._names, self.fast)
+        if renewed:
+            self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")
+        if not count:
+            self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
+
+
+CLASSES = (SetShading, SetUpRender, SetUpStage, BakeLight)
+
+
+def register():
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister():
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
