@@ -16,14 +16,16 @@ BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(CORE_SOURCES)
 	$(wildcard src/meshsplats/csrc/options.txt src/meshsplats/csrc/exports.*)
 
 # Blender's Python module exists for one version of Python only, and each version of it lives in a place of its own.
-# Before a release: make test-blender BPY="4.2.23 4.5.15 5.0.1 5.2.3". Since 5.1 it is Python 3.13, which is looked for
-# by its place, too, as below.
+# The oldest and the newest that there is a Python for: since 5.1 it is 3.13, which is looked for by its place, too, as
+# below. Before a release: make test-blender BPY="4.2.23 4.5.15 5.0.1 5.2.3 5.3.0".
 BLENDER_VENV ?= .venv-blender
-BPY ?= 4.2.23 5.0.1
 BLENDER_PYTHON ?= $(shell for name in python3.11 python3 python; do \
 	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && echo $$name && break; done)
 BLENDER_PYTHON_313 ?= $(shell for name in python3.13 $(wildcard $(HOME)/.pyenv/versions/3.13.*/bin/python) python3; do \
 	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 13))' 2>/dev/null && echo $$name && break; done)
+ifndef BPY
+BPY := 4.2.23 $(if $(BLENDER_PYTHON_313),5.3.0,5.0.1)
+endif
 before_5_1 = $(filter 4.% 5.0.%,$(1))
 
 # The lowest versions that pyproject.toml allows want the lowest Python. That of pyenv answers to its short name only

@@ -5,7 +5,7 @@
 *Unlit*: for each file, images of four sides against the splats' own image (``render_splats``, without its
 widening, which Blender has not; 3 x 3 samples), all harmonics and degree 0: as Blender draws them; with the
 colours and opacities of lit ones before even light (1 everywhere); and the mesh that ``convert`` makes of
-them, as ``render`` draws it, against the splats with their widening, 2 x 2 samples.
+them, as ``render(order="splat")`` draws it.
 
 *Lit*: splats sampled on a textured cow, as in ``blender_known_truth.py``, under sun and sky on a ground,
 against the textured mesh: as imported; with a diffuse material in their own colours, shaded by Blender; lit.
@@ -100,15 +100,9 @@ def unlit(report: Report, paths: list[Path], width: int, samples: int) -> None:
             drawn = [linear_to_srgb(np.clip(image, 0, 1)) for image in images(views, rotation, samples)]
             rows.append(" / ".join(f"{np.mean(list(map(ms.psnr, drawn, truth))):.1f}" for truth in truths))
         found = []
-        for degree, shown in ((None, mesh), (0, mesh.of_degree(0))):
-            pairs = (
-                (
-                    ms.render(shown, view, samples=2, order="splat").color,
-                    ms.render_splats(cloud, view, samples=2, sh_degree=degree).color,
-                )
-                for view in views
-            )
-            found.append(f"{np.mean([ms.psnr(a, b) for a, b in pairs]):.1f}")
+        for shown, truth in zip((mesh, mesh.of_degree(0)), truths, strict=True):
+            drawn = [ms.render(shown, view, samples=3, order="splat").color for view in views]
+            found.append(f"{np.mean(list(map(ms.psnr, drawn, truth))):.1f}")
         report.row(path.stem, *rows, " / ".join(found), f"{seconds:.0f}")
 
 

@@ -65,10 +65,8 @@ def places_of(obj: Any) -> tuple[np.ndarray, np.ndarray, float]:
     target = points_of(obj)
     if target is None:
         return np.zeros((0, 3)), np.zeros((0, 3)), 0.0
-    co = np.empty(3 * len(target.data.vertices), np.float32)
-    target.data.vertices.foreach_get("co", co)
     world = np.array(obj.matrix_world)
-    corners = co.reshape(-1, 3).astype(np.float64) @ world[:3, :3].T + world[:3, 3]
+    corners = versions.positions(target.data).astype(np.float64) @ world[:3, :3].T + world[:3, 3]
     a, b, c = corners.reshape(-1, 3, 3).swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -179,9 +177,7 @@ def smoothed(data: Any) -> np.ndarray:
     light = np.empty(12 * len(data.polygons), np.float32)
     data.attributes[LIGHT].data.foreach_get("color", light)
     light = light.reshape(-1, 3, 4)[:, :, :3].mean(axis=1, dtype=np.float64)
-    places = np.empty(9 * len(data.polygons), np.float32)
-    data.vertices.foreach_get("co", places)
-    corners = places.reshape(-1, 3, 3).astype(np.float64)
+    corners = versions.positions(data).reshape(-1, 3, 3).astype(np.float64)
     centers = corners.mean(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame
+from meshsplats.blender.inside import frame, versions
 from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.gltf.view_colors import put_back, stored_colors
 from meshsplats.mesh import Blending, SplatMesh
@@ -35,12 +35,10 @@ def splat_mesh(obj: Any) -> SplatMesh:
     data: Any = obj.data if obj is not None and obj.type == "MESH" else None
     if data is None or not len(data.color_attributes):
         raise ValueError("the object has no vertex colours")
-    faces = np.empty(len(data.loops), np.int32)
-    data.loops.foreach_get("vertex_index", faces)
+    faces = versions.corners(data)
     if len(faces) != 3 * len(data.polygons):
         raise ValueError("the object has faces that are not triangles: triangulate it first")
-    vertices = np.empty(3 * len(data.vertices), np.float32)
-    data.vertices.foreach_get("co", vertices)
+    vertices = versions.positions(data)
     colors = _at_vertices(
         data, data.color_attributes.active_color or data.color_attributes[0], "color", 4, faces
     )
@@ -53,7 +51,7 @@ def splat_mesh(obj: Any) -> SplatMesh:
     if blending == "display":
         colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
     arrays = {
-        "vertices": vertices.reshape(-1, 3),
+        "vertices": vertices,
         "faces": faces.reshape(-1, 3),
         "colors": colors,
         "face_splat": _owner(data),

@@ -134,9 +134,7 @@ def triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     of each."""
     count = len(mesh.polygons)
     if len(mesh.loops) == 3 * count:
-        faces = np.empty(3 * count, np.int32)
-        mesh.loops.foreach_get("vertex_index", faces)
-        return faces.reshape(-1, 3), np.arange(count, dtype=np.int32)
+        return versions.corners(mesh).reshape(-1, 3), np.arange(count, dtype=np.int32)
     mesh.calc_loop_triangles()
     faces = np.empty(3 * len(mesh.loop_triangles), np.int32)
     mesh.loop_triangles.foreach_get("vertices", faces)
@@ -154,13 +152,14 @@ def owners(mesh: Any) -> np.ndarray:
 
 def face_middles(mesh: Any) -> np.ndarray:
     """(f, 3) float32 means of the corners of each face of ``mesh``."""
-    corners, starts = np.empty(len(mesh.loops), np.int32), np.empty(len(mesh.polygons), np.int32)
-    mesh.loops.foreach_get("vertex_index", corners)
+    corners, places = versions.corners(mesh), versions.positions(mesh)
+    if len(corners) == 3 * len(mesh.polygons):
+        a, b, c = (places[corners[k::3]] for k in range(3))
+        return (a + b + c) / np.float32(3)
+    starts = np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("loop_start", starts)
-    places = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", places)
     counts = np.diff(starts, append=len(corners)).astype(np.float32)
-    return np.add.reduceat(places.reshape(-1, 3)[corners], starts) / counts[:, None]
+    return np.add.reduceat(places[corners], starts) / counts[:, None]
 
 
 def size(data: Any) -> int:
@@ -181,9 +180,7 @@ def local_points(obj: Any) -> np.ndarray:
         points = values(data, "position").astype(np.float64)
         points = points[values(data, "radiance:base")[:, 3] > _VISIBLE]
         return points[:: -(-max(len(points), 1) // SAMPLE)]
-    vertices = np.empty(3 * len(data.vertices), np.float32)
-    data.vertices.foreach_get("co", vertices)
-    points = vertices.reshape(-1, 3).astype(np.float64)
+    points = versions.positions(data).astype(np.float64)
     if COLOR in data.attributes and len(points):
         points = points[read_colors(data, COLOR)[:, 3] > _VISIBLE]
     return points[:: -(-max(len(points), 1) // SAMPLE)]

@@ -300,8 +300,7 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
     corners are cut into triangles."""
     if obj is None or obj.type != "MESH" or LIT not in obj.data or meshes.COLOR not in data.attributes:
         raise ValueError("the object was not made by MeshSplats")
-    vertices = np.empty(3 * len(data.vertices), np.float32)
-    data.vertices.foreach_get("co", vertices)
+    vertices = versions.positions(data)
     faces, polygon = meshes.triangles(data)
     facts, colors = obj.data, _unlit_colors(data, obj.data)
     owner = None
@@ -313,7 +312,7 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
             owner = np.cumsum(np.diff(owner, prepend=owner[:1]) != 0, dtype=np.int32)
     blending: Blending = "linear" if facts[LINEAR] else "display"
     found = SplatMesh(
-        vertices.reshape(-1, 3) + np.array(facts.get(ORIGIN, (0, 0, 0)), np.float32),
+        vertices + np.array(facts.get(ORIGIN, (0, 0, 0)), np.float32),
         faces,
         colors,
         face_splat=owner,

@@ -81,11 +81,10 @@ def binding_of(obj: Any) -> Binding:
     for field, name, _, key in _FIELDS:
         arrays[field.name] = np.empty(field.shape({"vertex": len(data.vertices)}), field.dtype)
         data.attributes[name].data.foreach_get(key, arrays[field.name].reshape(-1))
-    corners = np.empty(len(base.data.loops), np.int32)
-    base.data.loops.foreach_get("vertex_index", corners)
+    corners = versions.corners(base.data)
     if len(corners) != 3 * len(base.data.polygons):
         raise ValueError("the base has faces that are not triangles: undo that, or bind the splats anew")
-    return Binding(_coordinates(base.data), corners.reshape(-1, 3), **arrays, lift=data[LIFT])
+    return Binding(versions.positions(base.data), corners.reshape(-1, 3), **arrays, lift=data[LIFT])
 
 
 def follow(objs: Iterable[Any], depsgraph: Any) -> int:
@@ -140,15 +139,9 @@ def _evaluated(base: Any, depsgraph: Any) -> np.ndarray:
     evaluated = base.evaluated_get(depsgraph)
     mesh = evaluated.to_mesh()
     try:
-        return _coordinates(mesh)
+        return versions.positions(mesh)
     finally:
         evaluated.to_mesh_clear()
-
-
-def _coordinates(mesh: Any) -> np.ndarray:
-    coordinates = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", coordinates)
-    return coordinates.reshape(-1, 3)
 
 
 def after_update(scene: Any, depsgraph: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, materials, meshes
+from meshsplats.blender.inside import baking, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.splat_points import values
 
@@ -88,11 +88,7 @@ def shape(data: Any) -> str:
     if not hasattr(data, "vertices"):
         places = np.concatenate([values(data, name) for name in ("position", "scale", "rotation")], axis=1)
         return f"{_counts(data)}{zlib.crc32(places.tobytes()):08x}"
-    co = np.empty(3 * len(data.vertices), np.float32)
-    data.vertices.foreach_get("co", co)
-    corners = np.empty(len(data.loops), np.int32)
-    data.loops.foreach_get("vertex_index", corners)
-    checksum = zlib.crc32(corners.tobytes(), zlib.crc32(co.tobytes()))
+    checksum = zlib.crc32(versions.corners(data).tobytes(), zlib.crc32(versions.positions(data).tobytes()))
     return f"{_counts(data)}{checksum:08x}"
 
 

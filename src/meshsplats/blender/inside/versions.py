@@ -56,6 +56,28 @@ def set_corners(mesh: Any, faces: np.ndarray) -> None:
         mesh.loops.foreach_set("vertex_index", flat)
 
 
+def positions(mesh: Any) -> np.ndarray:
+    """(v, 3) float32 positions of the vertices of a bpy mesh, read as ``set_positions`` writes them."""
+    flat = np.empty(3 * len(mesh.vertices), np.float32)
+    attribute = mesh.attributes.get("position")
+    if attribute is not None and len(attribute.data) == len(mesh.vertices):  # none in edit mode
+        attribute.data.foreach_get("vector", flat)
+    else:
+        mesh.vertices.foreach_get("co", flat)
+    return flat.reshape(-1, 3)
+
+
+def corners(mesh: Any) -> np.ndarray:
+    """(l,) int32 vertices of the corners of a bpy mesh, read as ``set_corners`` writes them."""
+    found = np.empty(len(mesh.loops), np.int32)
+    attribute = mesh.attributes.get(".corner_vert")
+    if attribute is not None and len(attribute.data) == len(found):
+        attribute.data.foreach_get("value", found)
+    else:
+        mesh.loops.foreach_get("vertex_index", found)
+    return found
+
+
 def shade_flat(mesh: Any) -> None:
     """Shades each face of a bpy mesh flat, so that no vertex normals are computed and stored."""
     flat = mesh.attributes.new("sharp_face", "BOOLEAN", "FACE")
