@@ -68,6 +68,21 @@ def test_splats_are_chosen_and_a_mesh_is_none(job, tmp_path, budget):
         Converter(product, PLAIN).made(replace(splats, source=tmp_path / "m.npz"), [])
 
 
+@pytest.mark.parametrize("as_splats", [False, True])
+def test_a_preview_is_seen_from_where_the_file_opens(job, tmp_path, as_splats):
+    camera, asked, drawn = ms.Camera(np.eye(4), 50, 50, 32, 32, 64, 64), [], []
+
+    def opening(cloud, source, seen):
+        asked.append((len(cloud), source, seen))
+        return camera
+
+    own = replace(PLAIN, opening=opening, preview=lambda scene, path, camera=None: drawn.append(camera))
+    files = replace(job, outputs=(tmp_path / ("c.splat" if as_splats else "c.npz"),), configs=())
+    Converter(Product(as_splats=as_splats), own).made(files, [camera])
+    assert drawn == [camera]
+    assert asked == [(len(few_splats()), job.source, [camera])]
+
+
 def test_an_error_in_one_format_leaves_no_file_of_another(job, tmp_path):
     wrong = replace(job, outputs=(job.outputs[0], tmp_path / "b.none"))
     with pytest.raises(ValueError, match="does not name a mesh format"):

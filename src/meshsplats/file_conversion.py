@@ -204,8 +204,8 @@ class Converter:
             min_opacity=options.min_opacity,
             max_splats=None if merging else count,
         )
+        seen = seen_from(cameras, job.source, kept.origin)
         if merging and count is not None:
-            seen = seen_from(cameras, job.source, kept.origin)
             kept = simplify_for_views(kept, count, seen, up=product.direction)
         result = self.callbacks.place(scaled(kept, product.scale))
         with self._recorded(job):
@@ -219,7 +219,7 @@ class Converter:
                     save_scene(path, splats=result, mesh=mesh, collider=collider)
         seconds = time.perf_counter() - start
         if job.preview:
-            self.callbacks.preview(kept, job.preview)
+            self.callbacks.preview(kept, job.preview, self.callbacks.opening(cloud, job.source, seen))
         return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
 
     def _part(self, path: Path | None) -> SplatMesh | None:
