@@ -17,8 +17,8 @@ from PIL import Image
 
 from meshsplats import _toml as toml
 from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.cameras.files import save_cameras
-from meshsplats.cameras.trajectories import orbit
+from meshsplats.cameras.files import load_cameras, save_cameras
+from meshsplats.cameras.trajectories import look_at, orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
@@ -91,6 +91,18 @@ def test_a_model_folder_brings_its_cameras(folder, tmp_path):
     (model / "cameras.json").write_bytes((folder / "cameras.json").read_bytes())
     assert main(["view", str(model), "-o", str(tmp_path / "page.html")]) == 0
     assert len(settings(tmp_path / "page.html")["cameras"]) == 2
+
+
+def test_the_cameras_inside_a_surface_are_those_of_its_page_and_its_image(folder, tmp_path, capsys):
+    triangle = BaseMesh(np.eye(3, dtype=np.float32), [[0, 1, 2]], np.ones((3, 4)), up=(0, -1, 0))
+    inside = [look_at((0.1 * i, 0.2, -2), (0.3, 0.3, 0.3), width=60, height=40) for i in range(3)]
+    save_base(triangle, tmp_path / "room.glb", cameras=inside)
+    assert main(["view", str(tmp_path / "room.glb"), "-o", str(tmp_path / "page.html")]) == 0
+    assert len(settings(tmp_path / "page.html")["cameras"]) == 3
+    assert "seen from 3 of the 3 cameras in its file" in capsys.readouterr().err
+    assert main(["render", str(tmp_path / "room.glb"), "-o", str(tmp_path / "room.png")]) == 0
+    (drawn,) = load_cameras(tmp_path / "room.png.cameras.json")
+    np.testing.assert_allclose(drawn.center, inside[0].center, atol=1e-5)
 
 
 def test_a_crop_leaves_less(folder, tmp_path, capsys):

@@ -14,9 +14,10 @@ import pytest
 from _glb import read_glb
 from PIL import Image
 
-from meshsplats import BaseMesh, load_base, load_mesh, save_base
+from meshsplats import BaseMesh, load_base, load_mesh, look_at, save_base
 from meshsplats.base_mesh import Texture
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
+from meshsplats.formats.gltf.cameras import cameras_in_mesh
 from meshsplats.formats.surfaces.convex import THICK, convex_parts
 
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="install meshsplats[usd]")
@@ -71,6 +72,48 @@ def test_colours_of_vertices_come_back(tmp_path, suffix):
     np.testing.assert_array_equal(mesh.faces, base.faces)
     np.testing.assert_allclose(mesh.colors, base.colors, atol=1e-3)
     np.testing.assert_allclose(mesh.up, base.up, atol=1e-6)
+
+
+def some_views(far: float = 4.0):
+    """Of the tetrahedron, y down; the second has oblong pixels and a near plane."""
+    front = look_at((0, 0, -far), (0.3, 0.6, 1), up=(0, -1, 0), fov=50, width=90, height=60, name="front")
+    side = look_at((far, -0.2, 0.4), (0, 1, 0), up=(0, -1, 0), fov=70, width=64, height=64, near=0.05)
+    return [front, replace(side, fx=side.fx * 0.8)]
+
+
+@pytest.mark.parametrize("origin", [(0, 0, 0), (5e5, 4.5e6, 100)])
+@pytest.mark.parametrize("collision", [None, "convex"])
+def test_views_come_back(tmp_path, origin, collision):
+    base, given = tetrahedron(origin=origin), some_views()
+    save_base(base, tmp_path / "a.glb", cameras=given, collision=collision)
+    again = load_base(tmp_path / "a.glb")
+    found = [camera.relative_to(again.origin) for camera in cameras_in_mesh(tmp_path / "a.glb")]
+    assert [camera.name for camera in found] == ["front", "view 2"]
+    for camera, own in zip(found, given, strict=True):
+        scale = np.array([own.width / camera.width, own.height / camera.height])  # square pixels now
+        places, depths = own.project(base.vertices[base.faces].reshape(-1, 3))
+        seen = camera.project(again.vertices[again.faces].reshape(-1, 3))
+        assert np.abs(seen[0] * scale - places).max() < 0.02
+        np.testing.assert_allclose(seen[1], depths, rtol=1e-5)
+    save_base(base, tmp_path / "b.glb", collision=collision)
+    assert cameras_in_mesh(tmp_path / "b.glb") == []
+    with pytest.raises(ValueError, match=r"cameras are for \.glb, not for \.obj"):
+        save_base(base, tmp_path / "b.obj", cameras=given)
+
+
+def test_another_library_sees_the_surface_by_its_views(tmp_path):
+    """glTF's y points up, and its cameras look along -z: the peak is above the middle, and before them."""
+    trimesh = pytest.importorskip("trimesh")
+    save_base(tetrahedron(), tmp_path / "a.glb", cameras=some_views())
+    scene = trimesh.load_scene(tmp_path / "a.glb")
+    (name,) = (node for node in scene.graph.nodes if node == "front")
+    pose, _ = scene.graph.get(name)
+    # The file's world is ours, turned by half about x.
+    np.testing.assert_allclose(pose[:3, 3], [0, 0, 4], atol=1e-5)
+    np.testing.assert_allclose(
+        -pose[:3, 2], np.array([0.3, -0.6, -5]) / np.linalg.norm([0.3, 0.6, 5]), atol=1e-5
+    )
+    assert pose[1, 1] > 0.9, "upright"
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
@@ -289,6 +332,7 @@ def test_the_validator_finds_nothing(tmp_path, gltf_issues):
         (tetrahedron(textured=False), {}),
         (with_relief(), {}),
         (with_relief(), {"image": "webp"}),
+        (tetrahedron(), {"cameras": some_views()}),
         *(([(tetrahedron(), {"collision": "convex"})]) if importlib.util.find_spec("scipy") else []),
     ]
     files = [tmp_path / f"{i}.glb" for i in range(len(cases))]

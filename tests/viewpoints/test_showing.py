@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _glb import edit_glb
 
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.errors import DataWarning
+from meshsplats.formats.base_meshes import load_vertex_colored, save_base
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints import showing
@@ -130,3 +133,38 @@ def test_a_start_camera_is_of_the_only_splats_of_its_folder(tmp_path):
     (tmp_path / "settings.json").write_text(json.dumps({"camera": {"position": [1], "target": [0, 0, 0]}}))
     with pytest.warns(DataWarning, match="the start camera is not used"):
         assert opening_beside(tmp_path) is None
+
+
+@pytest.fixture
+def surface(tmp_path):
+    """A surface whose file has eight cameras, and the scene as commands read it."""
+    base = BaseMesh(np.eye(3) * 9, [[0, 1, 2]], np.ones((3, 4)), up=UP, origin=np.array([5e5, 0, 0]))
+    save_base(base, tmp_path / "room.glb", cameras=views(8))
+    return load_vertex_colored(tmp_path / "room.glb"), tmp_path / "room.glb"
+
+
+def test_a_mesh_is_seen_by_the_cameras_in_its_file(surface, tmp_path):
+    mesh, path = surface
+    found, said = default_views(mesh, path, 4, side=(80, 60))
+    assert said == "seen from 4 of the 8 cameras in its file"
+    np.testing.assert_allclose([c.center[0] for c in found], [0, 2, 4, 6], atol=1e-4)
+    assert {(c.width, c.height) for c in found} == {(80, 60)}
+    assert len(default_views(mesh, path, 1)[0]) == 1
+    film, said = default_views(mesh, path, 24, film=True)
+    assert (len(film), "on a round through" in said) == (24, True)
+    assert default_views(mesh, None, 4) is None
+    assert default_views(mesh, tmp_path, 4) is None
+
+
+def test_few_cameras_in_a_file_make_no_round(surface):
+    mesh, path = surface
+    save_base(BaseMesh(mesh.vertices, mesh.faces, mesh.colors, up=UP), path, cameras=views(3))
+    assert default_views(mesh, path, 24, film=True) is None
+    assert len(default_views(mesh, path, 24)[0]) == 3
+
+
+def test_broken_cameras_in_a_file_are_not_used(surface):
+    mesh, path = surface
+    edit_glb(path, lambda document: document["cameras"][0]["perspective"].pop("yfov"))
+    with pytest.warns(DataWarning, match="the cameras of the file are not used"):
+        assert default_views(mesh, path, 4) is None

@@ -12,8 +12,9 @@ from typing import Literal
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path, together
-from meshsplats._kinds import need, need_choice, need_path
+from meshsplats._kinds import need, need_all, need_choice, need_path
 from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.textures import gltf_textures
@@ -125,6 +126,7 @@ def save_base(
     unlit: bool = False,
     image: TextureImage | None = None,
     collision: Collision | None = None,
+    cameras: Sequence[Camera] = (),
 ) -> None:
     """Writes a surface, opaque, with its texture or else its vertex colours, whole or not at all.
 
@@ -150,6 +152,7 @@ def save_base(
             and it has neither texture nor colours. ``convex``: (`.glb`) it is drawn, and at most 32 convex
             hulls of its parts are colliders, meshes that nobody draws and that are named ``UCX_surface_00``
             and so on, by which Unreal makes them the collision of the surface; needs scipy.
+        cameras: (`.glb`) views of a place, the first one to open with, relative to the surface's origin.
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, or has
@@ -162,6 +165,9 @@ def save_base(
     target = Path(path)
     suffix = target.suffix.lower()
     check_writing(target, unlit=unlit, image=image, collision=collision)
+    need_all(Camera, cameras=cameras)
+    if cameras and suffix != ".glb":
+        raise ValueError(f"cameras are for .glb, not for {suffix}")
     if collision == "only":
         base = BaseMesh(base.vertices, base.faces, up=base.up, origin=base.origin)
     if image is not None and (suffix == ".npz" or suffix in PRINTED or not base.textured):
@@ -171,7 +177,9 @@ def save_base(
     check_texture(base)
     own = None if image is None else f".{image}"
     writers: dict[str, Callable[[Path], None]] = {
-        ".glb": lambda to: write_surface_glb(base, to, unlit=unlit, image=own, collision=collision),
+        ".glb": lambda to: write_surface_glb(
+            base, to, unlit=unlit, image=own, collision=collision, cameras=cameras
+        ),
         ".obj": lambda to: write_surface_obj(base, to, target, own),
         ".ply": lambda to: write_surface_ply(base, to, target, own),
         ".npz": lambda to: write_npz(plain_mesh(base), to),

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats._files.atomic import together
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.scene_files import SceneReading
@@ -27,6 +29,10 @@ from meshsplats.surfaces import draw_surface
 from meshsplats.surfaces.making import surfaces_from
 from meshsplats.surfaces.options import SurfaceOptions, level_options
 from meshsplats.surfaces.views import Sources, place_of, sources_of
+from meshsplats.viewpoints.finding import FoundCameras
+
+_VIEWS = 8
+"""Cameras in the file of a place."""
 
 
 @dataclass(frozen=True)
@@ -145,17 +151,35 @@ class SurfaceRun:
             base_meshes.save_base, unlit=chosen.unlit, image=chosen.image, collision=chosen.collision
         )
         said("saving", 0, 1)
+        asked = sources.found is not None or not chosen.no_preview
+        place = place_of(scene, sources) if asked else None
+        views = self._views(place, sources) if place is not None else []
         with together():
             for base, path in zip(bases, files, strict=True):
-                save(self.place(scaled(base, chosen.scale)), path)
+                own = views if path == files[0] and path.suffix.lower() == ".glb" else ()
+                save(self.place(scaled(base, chosen.scale)), path, cameras=own)
             self.record(beside(self.output, CONFIGURATION))
             if not chosen.no_preview:
-                self._draw_preview(scene, bases[0], sources)
+                self._draw_preview(scene, bases[0], place)
         return scene, list(zip(files, bases, strict=True))
 
-    def _draw_preview(self, scene: GaussianCloud | SplatMesh, base: BaseMesh, sources: Sources) -> None:
+    def _views(self, place: FoundCameras, sources: Sources) -> list[Camera]:
+        """Views of the place in the frame of the surface that is written, the first one to open with."""
+        factor = 1.0 if self.options.scale is None else self.options.scale
+        seen = [*place.cameras[:_VIEWS], *subsample(sources.depth, _VIEWS - 1)][:_VIEWS]
+        made = []
+        for camera in seen:
+            matrix = camera.world_to_camera.copy()
+            matrix[:3, 3] *= factor
+            near = None if camera.near is None else camera.near * factor
+            made.append(replace(camera, world_to_camera=matrix, near=near))
+        return made
+
+    def _draw_preview(
+        self, scene: GaussianCloud | SplatMesh, base: BaseMesh, place: FoundCameras | None
+    ) -> None:
         camera = preview_camera(scene)
-        if place := place_of(scene, sources):
+        if place is not None:
             self.say(place.seen_in_words())
             camera = place.cameras[0].within(camera.width)
         save_image(self.preview, draw_surface(base, camera, threads=self.threads))

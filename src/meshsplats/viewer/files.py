@@ -190,8 +190,6 @@ def _cameras(
     if options.cameras is not None:
         return load_cameras(options.cameras, origin=scene.origin)
     beside = cameras_beside(source, scene.origin)
-    if isinstance(scene, BaseMesh):
-        return beside or []
     opening = opening_beside(source, scene.origin) if isinstance(scene, GaussianCloud) else None
     first = [] if opening is None else [opening]
     if beside is not None:

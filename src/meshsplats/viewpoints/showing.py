@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._json import read_json
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.cameras.viewer_settings import NAME, start_camera
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats.gltf.cameras import cameras_in_gltf
+from meshsplats.formats.gltf.cameras import cameras_in_gltf, cameras_in_mesh
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named
 from meshsplats.gaussians import GaussianCloud
@@ -24,6 +25,9 @@ from meshsplats.viewpoints.finding import find_cameras, worth_a_look
 from meshsplats.viewpoints.kind import kind_from_outside
 from meshsplats.viewpoints.relief import find_relief
 from meshsplats.viewpoints.walking import keys_of, walk
+
+_ROUND = 4
+"""Fewest cameras of a mesh's file that a round leads through."""
 
 
 def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
@@ -61,7 +65,7 @@ def opened_with(
 
 
 def default_views(
-    scene: GaussianCloud | SplatMesh,
+    scene: GaussianCloud | SplatMesh | BaseMesh,
     source: Path | None,
     count: int,
     *,
@@ -72,7 +76,7 @@ def default_views(
     threads: int | None = None,
 ) -> tuple[list[Camera], str] | None:
     """Up to ``count`` views of splats that are no object, and a line that says where they come from. None for
-    objects, which are seen from all around, and for meshes.
+    objects, which are seen from all around, and for meshes, unless their glTF file has cameras.
 
     The cameras of a model folder come first, then those that ``find_cameras`` finds. A start camera
     (``opening_beside``) is the first of these, and of an object, too, where one view is asked for.
@@ -85,7 +89,9 @@ def default_views(
         given: cameras relative to the scene's origin, in place of those of the folder.
         threads: at most this many; all processors by default.
     """
-    if not isinstance(scene, GaussianCloud) or not len(scene):
+    if not isinstance(scene, GaussianCloud):
+        return _of_mesh(scene, source, count, side, film)
+    if not len(scene):
         return None
     if count == 1 and not film and (opening := opening_beside(source, scene.origin)) is not None:
         return [_in_shape(opening, side)], "seen as the start camera beside or inside the file does"
@@ -114,6 +120,28 @@ def default_views(
         return walk(found.cameras, count, found.up), f"{found.in_words()}: {words}"
     views = opened_with(found.cameras, source, scene.origin, side)
     return views, found.seen_in_words()
+
+
+def _of_mesh(
+    mesh: SplatMesh | BaseMesh, source: Path | None, count: int, side: tuple[int, int], film: bool
+) -> tuple[list[Camera], str] | None:
+    """As ``default_views``, by the cameras inside the file of a mesh. A DataWarning says where they cannot be
+    read."""
+    if source is None or not source.is_file() or source.suffix.lower() not in (".glb", ".gltf"):
+        return None
+    try:
+        given = [camera.relative_to(mesh.origin) for camera in cameras_in_mesh(source)]
+    except FileFormatError as error:
+        warnings.warn(f"{error}; the cameras of the file are not used", DataWarning, stacklevel=3)
+        return None
+    if not given or (film and len(given) < _ROUND):
+        return None
+    some = _spread(given, keys_of(count) if film else count)
+    views = [_in_shape(camera.with_near_plane(mesh.vertices), side) for camera in some]
+    words = f"{len(views)} of the {len(given)} cameras in its file"
+    if film:
+        return walk(views, count, mesh.up), f"seen on a round through {words}"
+    return views, f"seen from {words}"
 
 
 def _spread(cameras: Sequence[Camera], count: int) -> list[Camera]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
+from meshsplats.formats.gltf.cameras import camera_node, lens_of
 from meshsplats.formats.gltf.scene_parts import COLLIDES, INVISIBLE
 from meshsplats.formats.surfaces.convex import convex_parts
 from meshsplats.formats.surfaces.corners import corners_of, normal_file, texture_file
@@ -24,7 +27,13 @@ _UNREAL = "UCX_surface_{:02d}"
 
 
 def write_surface_glb(
-    base: BaseMesh, path: Path, *, unlit: bool, image: str | None, collision: str | None = None
+    base: BaseMesh,
+    path: Path,
+    *,
+    unlit: bool,
+    image: str | None,
+    collision: str | None = None,
+    cameras: Sequence[Camera] = (),
 ) -> None:
     """Writes ``base`` to ``path``: see ``save_base``."""
     chunk, shape = BinaryChunk(), corners_of(base)
@@ -91,6 +100,10 @@ def write_surface_glb(
             own = _UNREAL.format(number)
             meshes.append({"name": own, "primitives": [primitive], "extras": COLLIDES})
             nodes.append({"name": own, "mesh": 1 + number})
+    if cameras:
+        nodes[0]["children"] = [*nodes[0].get("children", ()), *range(len(nodes), len(nodes) + len(cameras))]
+        nodes += [camera_node(camera, number) for number, camera in enumerate(cameras)]
+        more["cameras"] = [lens_of(camera, base.vertices) for camera in cameras]
     document = chunk.document(nodes, meshes, materials) | more
     write_binary(path, document, chunk, what="the surface", advice="; choose fewer faces")
 
