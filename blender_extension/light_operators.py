@@ -119,8 +119,7 @@ class SetUpStage(Modal, bpy.types.Operator):
         wanted = {}
         try:
             for obj in objects.subjects(context.scene):
-                unlit = not objects.is_lit(obj) and not obj.hide_render
-                if (unlit and self.make_lit) or objects.needs_light(obj, fast=self.fast):
+                if (not objects.is_lit(obj) and self.make_lit) or objects.needs_light(obj, fast=self.fast):
                     wanted[obj.name] = objects.light_source(obj)
         except ValueError as error:
             self.report({"ERROR"}, str(error))

@@ -17,7 +17,7 @@ from _blender_extension import registered
 from _blender_scenes import ball_splats
 from _splat_points import splat_points
 
-from meshsplats import GaussianCloud, convert, orbit, psnr, render_splats
+from meshsplats import DataWarning, GaussianCloud, convert, orbit, psnr, render_splats
 from meshsplats.blender.inside import (
     baking,
     lit_points,
@@ -79,13 +79,14 @@ def even_world(strength: float = 1.0) -> None:
 
 def test_unlit_splats_are_those_that_were_imported(scene):
     obj = splat_points(ball(), "ball", scene.collection)
-    own = bpy.data.materials.new("the user's")
-    obj.data.materials.append(own)
+    own = [bpy.data.materials.new("the user's"), bpy.data.materials.new("another")]
+    for material in own:
+        obj.data.materials.append(material)
     before, names = attributes(obj), sorted(a.name for a in obj.data.attributes)
     cloud = reader.cloud_of(obj, bpy.context.evaluated_depsgraph_get())
     lit(obj, fast=True)
     assert attributes(obj)["radiance:base"] != before["radiance:base"], "opacities for linear light"
-    assert [m.name for m in obj.data.materials] == ["Splats, lit"]
+    assert [m.name for m in obj.data.materials] == ["Splats, lit", "another"]
     assert len(obj.children) >= 2
     assert not obj.visible_shadow
     again = reader.cloud_of(obj, bpy.context.evaluated_depsgraph_get())
@@ -93,11 +94,39 @@ def test_unlit_splats_are_those_that_were_imported(scene):
     lit_points.unlight(obj)
     assert attributes(obj) == before
     assert sorted(a.name for a in obj.data.attributes) == names
-    assert list(obj.data.materials) == [own]
+    assert list(obj.data.materials) == own
     assert not obj.children
     assert obj.visible_shadow
     assert not objects.is_lit(obj)
     assert not [key for key in (*obj.keys(), *obj.data.keys()) if key.startswith("meshsplats")]
+
+
+def test_splats_that_were_joined_to_lit_ones_keep_their_opacity(scene):
+    """They lack the attributes of lit ones, which Blender fills with zeros."""
+    obj = lit(splat_points(ball(100), "lit", scene.collection), fast=True)
+    other = splat_points(ball(50), "other", scene.collection)
+    for each in (obj, other):
+        each.select_set(True)
+    bpy.context.view_layer.objects.active = obj
+    bpy.ops.object.join()
+    wanted = np.concatenate([ball(100).opacities, ball(50).opacities])
+    found = reader.cloud_of(obj, bpy.context.evaluated_depsgraph_get()).opacities
+    np.testing.assert_array_equal(found, wanted)
+    lit_points.unlight(obj)
+    np.testing.assert_array_equal(reader.values(obj.data, "radiance:base")[:, 3], wanted)
+
+
+def test_what_cannot_be_drawn_comes_back_too(scene):
+    obj = splat_points(ball(100), "ball", scene.collection)
+    broken = reader.values(obj.data, "radiance:base")
+    broken[3], broken[5, 3] = (np.nan, 0, 0, 0.5), 1.5
+    obj.data.attributes["radiance:base"].data.foreach_set("vector", broken.ravel())
+    obj.data.update_tag()
+    before = attributes(obj)
+    with pytest.warns(DataWarning, match="1 of 100 splats"):
+        lit(obj, fast=True)
+    lit_points.unlight(obj)
+    assert attributes(obj) == before
 
 
 def test_light_is_that_of_a_mesh_of_the_splats(scene):

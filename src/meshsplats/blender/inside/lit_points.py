@@ -24,7 +24,7 @@ from meshsplats.conversion import convert
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-_MATERIALS = "meshsplats_materials"
+_MATERIAL = "meshsplats_material"
 """Property of lit splats: the material that they had before, where they had one."""
 _OPAQUE = 0.9999
 """Opacity from which an exponent on the transparency cannot be told from colours."""
@@ -78,16 +78,13 @@ def prepare(
     colors = np.ones((source.count, 4), np.float32)
     colors[source.points, :3] = srgb_to_linear(cloud.colors)
     colors[points, :3] = arrays["colors"][first, :3]
-    opacities = np.zeros(source.count, np.float32)
-    opacities[source.points] = cloud.opacities
-    shown = opacities.copy()
-    shown[points] = _with_exponents(mesh, arrays["colors"], first, cloud.opacities[rows])
     index = np.zeros(source.count, np.int32)
     index[points] = arrays["light_point_of"][first]
     return {
         **{name: arrays[name] for name in ("faces", "colors", *stand_ins.ARRAYS)},
-        **{"vertices": mesh.vertices, "light_point_of": index, "splat_colors": colors},
-        **{"opacities": opacities, "shown": shown, "views": list(within), "fast": fast, **facts},
+        **{"vertices": mesh.vertices, "light_point_of": index, "splat_colors": colors, "points": points},
+        "opacities": _with_exponents(mesh, arrays["colors"], first, cloud.opacities[rows]),
+        **{"views": list(within), "fast": fast, **facts},
     }
 
 
@@ -110,17 +107,16 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
         ValueError: there are other points than ``prepared`` was made for.
     """
     data = obj.data
-    if len(data.points) != len(prepared["opacities"]):
+    if len(data.points) != len(prepared["splat_colors"]):
         raise ValueError(f"{obj.name} was edited meanwhile")
     unlight(obj)
     _store(data, meshes.COLOR, "FLOAT_COLOR", "color", prepared["splat_colors"])
     _store(data, materials.LIGHT, "FLOAT_COLOR", "color", np.ones((len(data.points), 4), np.float32))
-    _store(data, splat_points.OPACITY, "FLOAT", "value", prepared["opacities"])
-    _show_opacities(data, prepared["shown"])
-    if len(data.materials):
-        data[_MATERIALS] = data.materials[0]
-        data.materials.clear()
-    data.materials.append(materials.glowing())
+    opacities = splat_points.imported_opacities(data)
+    _store(data, splat_points.OPACITY, "FLOAT", "value", opacities)
+    opacities[prepared["points"]] = prepared["opacities"]
+    _show_opacities(data, opacities)
+    _take_material(data)
     data[LIT] = True
     stand_ins.add(
         obj,
@@ -140,22 +136,30 @@ def unlight(obj: Any) -> None:
     """Takes the light from the splats ``obj``, which Blender then draws as they were imported."""
     data = obj.data
     if splat_points.OPACITY in data.attributes:
-        before = np.empty(len(data.points), np.float32)
-        data.attributes[splat_points.OPACITY].data.foreach_get("value", before)
-        _show_opacities(data, before)
+        _show_opacities(data, splat_points.imported_opacities(data))
     for name in (meshes.COLOR, materials.LIGHT, splat_points.OPACITY, baking.POINT):
         if name in data.attributes:
             data.attributes.remove(data.attributes[name])
     if data.get(LIT):
-        data.materials.clear()
-        if data.get(_MATERIALS) is not None:
-            data.materials.append(data[_MATERIALS])
-        for name in (LIT, _MATERIALS):
+        if data.get(_MATERIAL) is not None or len(data.materials) > 1:
+            data.materials[0] = data.get(_MATERIAL)
+        else:
+            data.materials.clear()
+        for name in (LIT, _MATERIAL):
             data.pop(name, None)
         stand_ins.remove(obj)
     for name in (stand_ins.SHAPE, ROUGH):
         obj.pop(name, None)
     data.update_tag()
+
+
+def _take_material(data: Any) -> None:
+    """Puts the lit material in the place of the first one, by which Blender draws splats."""
+    if not len(data.materials):
+        data.materials.append(None)
+    if data.materials[0] is not None:
+        data[_MATERIAL] = data.materials[0]
+    data.materials[0] = materials.glowing()
 
 
 def _show_opacities(data: Any, opacities: np.ndarray) -> None:

@@ -130,8 +130,10 @@ def splat_objects(scene: Any) -> list[Any]:
 
 
 def subjects(scene: Any) -> list[Any]:
-    """What light can act on: the splat meshes of ``scene``, and the splats that Blender draws itself."""
-    return [*splat_objects(scene), *(obj for obj in scene.objects if lit_points.can_be_lit(obj))]
+    """What light can act on: the splat meshes of ``scene``, and the splats that Blender draws itself, without
+    those that images do not show, as meshes may have taken their place."""
+    drawn = (obj for obj in scene.objects if lit_points.can_be_lit(obj) and not obj.hide_render)
+    return [*splat_objects(scene), *drawn]
 
 
 def is_lit(obj: Any) -> bool | None:

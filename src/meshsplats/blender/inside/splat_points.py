@@ -56,12 +56,20 @@ def usable(obj: Any, depsgraph: Any) -> tuple[GaussianCloud, np.ndarray]:
     rows.sh[:, 0] = base[:, :3]
     for k in range(terms):
         rows.sh[:, 1 + k] = values(data, HARMONIC.format(k))
-    opacities = base[:, 3]
-    if OPACITY in data.attributes:
-        data.attributes[OPACITY].data.foreach_get("value", opacities := np.empty(count, np.float32))
-    np.clip(opacities, 0, 1, out=rows.opacities)
+    np.clip(imported_opacities(data), 0, 1, out=rows.opacities)
     kept = np.flatnonzero(builder.keep(rows))
     return builder.finish("3dgs", strict=False), kept
+
+
+def imported_opacities(data: Any) -> np.ndarray:
+    """(n,) float32 opacities that the splats ``data`` were imported with, also where they are lit. Of splats
+    that were joined to lit ones, which lack the attribute of these, those that they have."""
+    shown = values(data, "radiance:base")[:, 3]
+    if OPACITY not in data.attributes:
+        return shown
+    before = np.empty(len(shown), np.float32)
+    data.attributes[OPACITY].data.foreach_get("value", before)
+    return np.where(before == 0, shown, before)
 
 
 def _terms(data: Any) -> int:
