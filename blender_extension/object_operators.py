@@ -128,7 +128,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         return self.begin(context, CloudWork(cloud, f"{source.name} mesh", frame.up_of(source), choices))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, splat_points, views
+        from meshsplats.blender.inside import lit_points, objects, splat_points, views
 
         (result,) = work.results
         obj = objects.add(result.prepared[0], result.name, context.collection)
@@ -143,6 +143,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
                 origin = result.prepared[0]["origin"]
                 views.remember(obj, [view.relative_to(origin) for view in result.views])
             if self.hide_splats:
+                lit_points.unlight(source)  # or its stand-in still casts a shadow
                 source.hide_viewport = source.hide_render = True
         settle(self, context, [obj])
         self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")

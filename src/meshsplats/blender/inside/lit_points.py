@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, frame, materials, meshes, splat_points, stand_ins, views
+from meshsplats.blender.inside import baking, frame, materials, splat_points, stand_ins, views
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIT
 from meshsplats.blender.inside.stand_ins import ROUGH
@@ -110,7 +110,7 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
     if len(data.points) != len(prepared["splat_colors"]):
         raise ValueError(f"{obj.name} was edited meanwhile")
     unlight(obj)
-    _store(data, meshes.COLOR, "FLOAT_COLOR", "color", prepared["splat_colors"])
+    _store(data, splat_points.COLOR, "FLOAT_COLOR", "color", prepared["splat_colors"])
     _store(data, materials.LIGHT, "FLOAT_COLOR", "color", np.ones((len(data.points), 4), np.float32))
     opacities = splat_points.imported_opacities(data)
     _store(data, splat_points.OPACITY, "FLOAT", "value", opacities)
@@ -133,23 +133,24 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
 
 
 def unlight(obj: Any) -> None:
-    """Takes the light from the splats ``obj``, which Blender then draws as they were imported."""
+    """Takes the light from the splats ``obj``, if they are lit: Blender then draws them as they were
+    imported."""
     data = obj.data
-    if splat_points.OPACITY in data.attributes:
-        _show_opacities(data, splat_points.imported_opacities(data))
-    for name in (meshes.COLOR, materials.LIGHT, splat_points.OPACITY, baking.POINT):
+    if not data.get(LIT):
+        return
+    _show_opacities(data, splat_points.imported_opacities(data))
+    for name in (splat_points.COLOR, materials.LIGHT, splat_points.OPACITY, baking.POINT):
         if name in data.attributes:
             data.attributes.remove(data.attributes[name])
-    if data.get(LIT):
-        if data.get(_MATERIAL) is not None or len(data.materials) > 1:
-            data.materials[0] = data.get(_MATERIAL)
-        else:
-            data.materials.clear()
-        for name in (LIT, _MATERIAL):
-            data.pop(name, None)
-        stand_ins.remove(obj)
+    if data.get(_MATERIAL) is not None or len(data.materials) > 1:
+        data.materials[0] = data.get(_MATERIAL)
+    else:
+        data.materials.clear()
+    for name in (LIT, _MATERIAL):
+        data.pop(name, None)
     for name in (stand_ins.SHAPE, ROUGH):
         obj.pop(name, None)
+    stand_ins.remove(obj)
     data.update_tag()
 
 
@@ -159,7 +160,7 @@ def _take_material(data: Any) -> None:
         data.materials.append(None)
     if data.materials[0] is not None:
         data[_MATERIAL] = data.materials[0]
-    data.materials[0] = materials.glowing()
+    data.materials[0] = materials.glowing(splat_points.COLOR)
 
 
 def _show_opacities(data: Any, opacities: np.ndarray) -> None:

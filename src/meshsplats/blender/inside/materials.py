@@ -138,12 +138,12 @@ def lit(
     return material
 
 
-def glowing(name: str = "Splats, lit") -> Any:
+def glowing(attribute: str, name: str = "Splats, lit") -> Any:
     """For splats that Blender draws itself, which have their opacity from it: they glow with their linear
-    colours of ``COLOR`` times the light of ``LIGHT``."""
+    colours of ``attribute`` times the light of ``LIGHT``."""
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
-    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
     light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
     product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
     tree.link(color.outputs["Color"], product.inputs[0])

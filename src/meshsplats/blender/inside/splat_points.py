@@ -18,6 +18,8 @@ HARMONIC = "radiance:sh_{}"
 """Name of the attribute with harmonic k from 0, of degree 1 and more, in red, green, blue."""
 OPACITY = "meshsplats_opacity"
 """Attribute of lit splats (``lit_points``): the opacity that they were imported with."""
+COLOR = "meshsplats_color"
+"""Attribute of lit splats: their linear RGB."""
 KEYS = {"FLOAT_VECTOR": "vector", "FLOAT4": "vector", "FLOAT_COLOR": "color", "QUATERNION": "value"}
 """Blender's name of the value, by the type of the attribute."""
 
