@@ -47,6 +47,18 @@ def draw_warning(layout, text):
         column.label(text=line, icon="BLANK1" if i else "ERROR")
 
 
+def draw_blenders(layout, scene, obj):
+    """Shows what can be done with splats that Blender draws itself."""
+    warning = light_warning(scene, obj)
+    if warning:
+        draw_warning(layout, warning)
+    layout.label(text="Light of these splats")
+    row, now = layout.row(align=True), bool(obj.data.get(LIT))
+    for shading, lit in (("unlit", False), ("lit", True)):
+        button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=lit == now)
+        button.shading = shading
+
+
 class MeshSplatsPanel(bpy.types.Panel):
     bl_idname = "VIEW3D_PT_meshsplats"
     bl_label = "MeshSplats"
@@ -63,7 +75,7 @@ class MeshSplatsPanel(bpy.types.Panel):
         if ConvertSplats.poll(context):
             layout.operator(ConvertSplats.bl_idname, icon="MESH_DATA")
         if is_blenders(obj):
-            self._blenders(layout, obj)
+            draw_blenders(layout, context.scene, obj)
         for collection in context.scene.collection.children_recursive:
             if CHAIN in collection:
                 self._chain(layout, collection)
@@ -99,16 +111,6 @@ class MeshSplatsPanel(bpy.types.Panel):
                 button = row.operator(ShowLevel.bl_idname, text=str(child[LEVEL]), depress=shown)
                 button.chain, button.level, button.where = chain.name, child[LEVEL], where
         box.operator(FitLevel.bl_idname, icon="CAMERA_DATA").chain = chain.name
-
-    def _blenders(self, layout, obj):
-        warning = light_warning(bpy.context.scene, obj)
-        if warning:
-            draw_warning(layout, warning)
-        layout.label(text="Light of these splats")
-        row, now = layout.row(align=True), bool(obj.data.get(LIT))
-        for shading, lit in (("unlit", False), ("lit", True)):
-            button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=lit == now)
-            button.shading = shading
 
     def _object(self, layout, obj):
         if obj.meshsplats.path:

@@ -162,8 +162,14 @@ if points is not None:
     points.location = (7, 0, 0)
     bpy.context.view_layer.update()
     drawn = []
+
+    def button(name, **_):
+        drawn.append(name)
+        return SimpleNamespace()
+
     # What follows the buttons of the active object is of no interest here.
-    layout = SimpleNamespace(operator=lambda name, **_: drawn.append(name), separator=lambda: 1 / 0)
+    layout = SimpleNamespace(operator=button, label=lambda text: None, separator=lambda: 1 / 0)
+    layout.row = lambda align: layout
     with contextlib.suppress(ZeroDivisionError):
         sys.modules[addon + ".panel"].MeshSplatsPanel.draw(SimpleNamespace(layout=layout), bpy.context)
     answer = sorted(bpy.ops.object.meshsplats_from_splats(shading="lit", max_triangles=800))

@@ -20,6 +20,7 @@ from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
 from meshsplats.formats.gltf.cameras import cameras_in_mesh
 from meshsplats.formats.surfaces.convex import THICK, convex_parts
 
+needs_scipy = pytest.mark.skipif(importlib.util.find_spec("scipy") is None, reason="install meshsplats[base]")
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="install meshsplats[usd]")
 
 
@@ -82,7 +83,7 @@ def some_views(far: float = 4.0):
 
 
 @pytest.mark.parametrize("origin", [(0, 0, 0), (5e5, 4.5e6, 100)])
-@pytest.mark.parametrize("collision", [None, "convex"])
+@pytest.mark.parametrize("collision", [None, pytest.param("convex", marks=needs_scipy)])
 def test_views_come_back(tmp_path, origin, collision):
     base, given = tetrahedron(origin=origin), some_views()
     save_base(base, tmp_path / "a.glb", cameras=given, collision=collision)
