@@ -11,6 +11,7 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import ball_splats
+from _eevee import draw_by_eevee
 
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
@@ -133,17 +134,15 @@ def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
     cloud, _ = ball_splats(400)
     mesh = convert(cloud, mode="flat")
     view = orbit(mesh, 1, elevation=35, azimuth=20, width=64, height=48, distance=2.2)[0]
-    from meshsplats.blender import draw
-
-    draw(mesh, [view], images=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
+    draw_by_eevee(mesh, [view], images=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
     plain = rendering.read_pixels(tmp_path / "plain.exr")[..., :3]
     assert psnr(np.clip(plain, 0, 1), render(mesh, view).color) > 30
     light = LightOptions(sun=(100, 40), sky=0.2)
     options = SceneOptions(light=light, engine="eevee", samples=2)
-    draw(mesh, [view], images=[tmp_path / "lit.exr"], options=options)
+    draw_by_eevee(mesh, [view], images=[tmp_path / "lit.exr"], options=options)
     bare = replace(options, light=replace(light, sun_strength=0.0))
     lit = rendering.read_pixels(tmp_path / "lit.exr").mean(axis=2)
-    draw(mesh, [view], images=[tmp_path / "bare.exr"], options=bare)
+    draw_by_eevee(mesh, [view], images=[tmp_path / "bare.exr"], options=bare)
     dark = rendering.read_pixels(tmp_path / "bare.exr").mean(axis=2)
     floor = (render(mesh, view).alpha < 0.01) & (np.arange(48) > 30)[:, None]
     sun = (lit - dark)[floor]

@@ -10,6 +10,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
+from _eevee import draw_by_eevee
 from conftest import shared_data
 
 from meshsplats import convert, load_gaussians, orbit, render, save_mesh
@@ -48,7 +49,7 @@ def test_eevee_takes_as_many_attributes(degree, tmp_path):
     """It draws wrong colours, or nothing, where a material reads more than 14."""
     mesh = colorful(degree)
     view = orbit(mesh, 1, azimuth=20, width=120, height=100)[0]
-    draw(mesh, [view], images=[tmp_path / "a.exr"], options=SceneOptions(engine="eevee"))
+    draw_by_eevee(mesh, [view], images=[tmp_path / "a.exr"], options=SceneOptions(engine="eevee"))
     drawn = read_pixels(tmp_path / "a.exr")[..., :3].clip(0, 1)
     image = render(mesh, view, samples=4, order="splat").color.clip(0, 1)
     plain = render(mesh.of_degree(0), view, samples=4, order="splat").color
