@@ -9,13 +9,14 @@ from meshsplats.blender import BlenderError, draw
 
 ATTEMPTS = 4
 _ANIMATION = """
-import sys
+import os, sys
 import bpy
 from meshsplats.blender.inside import far_to_near
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
 if bpy.app.version < (4, 5, 0):
     bpy.app.handlers.frame_change_post.append(lambda scene, _: far_to_near.follow_camera(scene))
 bpy.ops.render.render(animation=True)
+os._exit(0)  # Blender 4.2 crashes when it ends
 """
 
 
