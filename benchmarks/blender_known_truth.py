@@ -155,12 +155,12 @@ def add_truth(obj, texture: Path, like) -> None:
     bpy.context.scene.collection.objects.link(target)
 
 
-def shot(made) -> np.ndarray:
-    """The linear image of the scene's camera."""
+def shot(scene) -> np.ndarray:
+    """The linear image of the camera of a Blender scene."""
     from meshsplats.blender.inside import rendering
 
     with tempfile.TemporaryDirectory() as scratch:
-        rendering.render_to(made.scene, Path(scratch) / "image.exr")
+        rendering.render_to(scene, Path(scratch) / "image.exr")
         return rendering.read_pixels(Path(scratch) / "image.exr")[..., :3]
 
 
@@ -190,7 +190,7 @@ def flicker(
         for i, (view, camera) in enumerate(zip(views, made.cameras, strict=True)):
             made.scene.frame_set(i)
             stage.aim(made.scene, view, camera)
-            frames.append(display(shot(made)))
+            frames.append(display(shot(made.scene)))
         drawn[name] = np.stack(frames)
     drawn["splats, unlit"] = np.stack([render(mesh, view, samples=4).color for view in views])
     cow = np.stack([render(mesh, view).alpha > 0.98 for view in views])
@@ -248,9 +248,9 @@ def compare(
             bare = replace(scene.Subject(**arrays, **facts), surface_vertices=None)
             made = scene.build(bare, [view], options, limit, edges=False)
             made.obj.hide_render = True
-            ground = shot(made)
+            ground = shot(made.scene)
             add_truth(obj, folder / "spot_texture.png", made.obj)
-            target = shot(made)
+            target = shot(made.scene)
             shown.append(display(target))
             captions.append("textured mesh")
         covered = render(mesh, view).alpha
@@ -268,7 +268,7 @@ def compare(
                     self_shadow=0.0,
                     surface_vertices=None,
                 )
-            drawn = shot(scene.build(taken, [view], options, limit, edges=False))
+            drawn = shot(scene.build(taken, [view], options, limit, edges=False).scene)
             dark = (drawn.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
             cow = covered > 0.98
             rows.append(

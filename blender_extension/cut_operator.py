@@ -283,14 +283,4 @@ class AdjustSplats(bpy.types.Operator):
             adjusting.put_back(data, kept)
 
 
-CLASSES = (CutSplats, CleanSplats, AdjustSplats)
-
-
-def register():
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister():
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory((CutSplats, CleanSplats, AdjustSplats))

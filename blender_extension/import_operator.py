@@ -70,7 +70,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, priors, sources, views
+        from meshsplats.blender.inside import objects, priors, sources
 
         objs = []
         for result in work.results:
@@ -84,9 +84,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
                 obj.meshsplats.path = path
                 copy_choices(obj.meshsplats, self)
                 sources.mark(obj)
-            if result.views:
-                origin = result.prepared[0]["origin"]
-                views.remember(made[0], [view.relative_to(origin) for view in result.views])
+            result.remember_views(made[0])
             objs.append(made[0])
         if self.at_origin:  # all by the same way: files of one capture keep their places to each other
             roots = [priors.base_of(obj) or obj for obj in objs]

@@ -204,14 +204,4 @@ class BakeLight(Modal, bpy.types.Operator):
             self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
 
 
-CLASSES = (SetShading, SetUpRender, SetUpStage, BakeLight)
-
-
-def register():
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister():
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory((SetShading, SetUpRender, SetUpStage, BakeLight))

@@ -128,7 +128,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         return self.begin(context, CloudWork(cloud, f"{source.name} mesh", frame.up_of(source), choices))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import lit_points, objects, splat_points, views
+        from meshsplats.blender.inside import lit_points, objects, splat_points
 
         (result,) = work.results
         obj = objects.add(result.prepared[0], result.name, context.collection)
@@ -139,9 +139,7 @@ class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
         else:
             splat_points.take_place(obj, source, result.prepared[0]["origin"])
             context.view_layer.update()
-            if result.views:
-                origin = result.prepared[0]["origin"]
-                views.remember(obj, [view.relative_to(origin) for view in result.views])
+            result.remember_views(obj)
             if self.hide_splats:
                 lit_points.unlight(source)  # or its stand-in still casts a shadow
                 source.hide_viewport = source.hide_render = True
@@ -239,20 +237,6 @@ class FitLevel(ChainOperator, bpy.types.Operator):
         return level
 
 
-CLASSES = (
-    ConvertAgain,
-    ConvertSplats,
-    FollowBase,
-    ShowLevel,
-    FitLevel,
+register, unregister = bpy.utils.register_classes_factory(
+    (ConvertAgain, ConvertSplats, FollowBase, ShowLevel, FitLevel)
 )
-
-
-def register():
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister():
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)

@@ -53,10 +53,15 @@ def draw_blenders(layout, scene, obj):
     if warning:
         draw_warning(layout, warning)
     layout.label(text="Light of these splats")
-    row, now = layout.row(align=True), bool(obj.data.get(LIT))
+    draw_shadings(layout, bool(obj.data.get(LIT)))
+
+
+def draw_shadings(layout, now):
+    """Buttons for unlit and lit; ``now``: whether the object is lit, None where it is neither."""
+    row = layout.row(align=True)
     for shading, lit in (("unlit", False), ("lit", True)):
-        button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=lit == now)
-        button.shading = shading
+        shown = now is not None and bool(now) == lit
+        row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=shown).shading = shading
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -144,11 +149,8 @@ class MeshSplatsPanel(bpy.types.Panel):
         if LIT not in obj.data and not obj.data.color_attributes:
             return
         layout.label(text="Material and light of this object")
-        row, now = layout.row(align=True), obj.data.get(LIT)
-        for shading, lit in (("unlit", False), ("lit", True)):
-            shown = now is not None and bool(now) == lit
-            button = row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=shown)
-            button.shading = shading
+        now = obj.data.get(LIT)
+        draw_shadings(layout, now)
         if now:
             from meshsplats.blender.inside import materials
 

@@ -28,6 +28,14 @@ class Result:
     """A ``Camera`` for each view of a place from within, relative to the file's origin, the first one to open
     with; none of an object. None: not looked for."""
 
+    def remember_views(self, obj):
+        """Stores them with ``obj``, the finest level."""
+        from meshsplats.blender.inside import views
+
+        if self.views:
+            origin = self.prepared[0]["origin"]
+            views.remember(obj, [view.relative_to(origin) for view in self.views])
+
 
 @contextmanager
 def own_warnings():
@@ -173,20 +181,15 @@ class Work:
 
         lit = self.choices["shading"] == "lit"
         self._at(begin + 0.6 * share, "counting layers")
-        announce = self._announce(begin, share, (0.6, 0.7, 0.8, 0.9))
+        phases = iter((0.6, 0.7, 0.8, 0.9))
+
+        def announce(phase):  # Escape takes effect between phases
+            self._at(begin + next(phases, 0.9) * share, f"{phase} for light")
+
         fast = self.choices.get("fast", False)
         prepared = objects.prepare(mesh, lit, fast=fast, views=views, announce=announce)
         self._at(begin + share, "building")
         return prepared
-
-    def _announce(self, begin, share, reached):
-        """Is told the phases of what is lit; ``reached`` are their shares."""
-        phases = iter(reached)
-
-        def announce(phase):  # Escape takes effect between phases
-            self._at(begin + next(phases, reached[-1]) * share, f"{phase} for light")
-
-        return announce
 
 
 class CloudWork(Work):
@@ -246,15 +249,7 @@ class LightWork(Work):
         self._views_of = {name: objects.views_within(obj) for name, obj in named.items()}
 
     def _one(self, path, index):
-        from meshsplats.blender.inside import lit_points
-
-        source, views = self._sources[path], self._views_of[path]
-        if not isinstance(source, lit_points.Source):
-            return Result("", path, (self._ready(source, index, 1.0, views),))
-        self._at(index, "converting")
-        announce = self._announce(index, 1.0, (0.2, 0.3, 0.5, 0.7))
-        prepared = lit_points.prepare(source, fast=self.choices["fast"], within=views, announce=announce)
-        return Result("", path, (prepared,))
+        return Result("", path, (self._ready(self._sources[path], index, 1.0, self._views_of[path]),))
 
 
 class Modal:

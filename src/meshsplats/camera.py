@@ -195,6 +195,14 @@ def from_opengl(matrix: np.ndarray) -> np.ndarray | None:
     return result
 
 
+def to_opengl(matrix: np.ndarray) -> np.ndarray:
+    """(4, 4) camera to world in OpenGL's axes of a ``matrix`` (4, 4), world to camera in OpenCV's."""
+    pose = np.eye(4)
+    pose[:3, :3] = matrix[:3, :3].T * OPENGL
+    pose[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
+    return pose
+
+
 def hiding_near_plane(cameras: Sequence[Camera], points: np.ndarray) -> str:
     """What to say if ``cameras`` see none of ``points`` (n, 3) because the near planes that they name are
     farther; empty otherwise."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, to_opengl
 from meshsplats.cameras.framing import front_axes
 
 
@@ -25,10 +25,8 @@ def up_of(obj: Any) -> np.ndarray:
 
 def camera_pose(camera: Camera, rotation: np.ndarray) -> np.ndarray:
     """(4, 4) float64 camera-to-world matrix in Blender's frame; Blender's cameras look along -z with y up."""
-    world_to_camera = camera.world_to_camera[:3, :3]
-    pose = np.eye(4)
-    pose[:3, :3] = rotation @ world_to_camera.T @ np.diag([1.0, -1.0, -1.0])
-    pose[:3, 3] = rotation @ camera.center
+    pose = to_opengl(camera.world_to_camera)
+    pose[:3] = rotation @ pose[:3]
     return pose
 
 

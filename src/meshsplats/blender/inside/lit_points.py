@@ -65,6 +65,7 @@ def prepare(
         ValueError: no splat can be seen, or nothing is solid, so that it takes no light.
     """
     cloud = source.cloud
+    announce("conversion")
     mesh = convert(cloud, mode="flat", up=source.up)
     if within is None:
         announce("looking for a view")

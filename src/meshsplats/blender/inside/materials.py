@@ -124,16 +124,11 @@ def lit(
     alpha = tree.math("MULTIPLY", 2, 5, color.outputs["Alpha"], seen)
     baked = tree.node("ShaderNodeValue", 0, 8, name=BAKED, label=BAKED)
     baked.outputs[0].default_value = 0
-    light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
-    product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
-    tree.link(color.outputs["Color"], product.inputs[0])
-    tree.link(light.outputs["Color"], product.inputs[1])
-    glow = tree.node("ShaderNodeEmission", 3, 0)
-    tree.link(product.outputs[0], glow.inputs["Color"])
+    glow = _glow(tree, color.outputs["Color"])
     both = tree.node("ShaderNodeMixShader", 4, 0)
     tree.link(baked.outputs[0], versions.socket(both.inputs, "Fac", "Factor"))
     tree.link(shader, both.inputs[1])
-    tree.link(glow.outputs[0], both.inputs[2])
+    tree.link(glow, both.inputs[2])
     _translucent(tree, material, alpha, both.outputs[0])
     return material
 
@@ -144,18 +139,23 @@ def glowing(attribute: str, name: str = "Splats, lit") -> Any:
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
     color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
-    light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
-    product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
-    tree.link(color.outputs["Color"], product.inputs[0])
-    tree.link(light.outputs["Color"], product.inputs[1])
-    glow = tree.node("ShaderNodeEmission", 2, 0)
-    tree.link(product.outputs[0], glow.inputs["Color"])
-    out = tree.node("ShaderNodeOutputMaterial", 3, 0)
-    tree.link(glow.outputs[0], out.inputs["Surface"])
+    out = tree.node("ShaderNodeOutputMaterial", 4, 0)
+    tree.link(_glow(tree, color.outputs["Color"]), out.inputs["Surface"])
     baked = tree.node("ShaderNodeValue", 0, 2, name=BAKED, label=BAKED)
     baked.outputs[0].default_value = 1
     material.cycles.emission_sampling = "NONE"
     return material
+
+
+def _glow(tree: _Tree, color: Any) -> Any:
+    """Output that glows with ``color`` times the light of ``LIGHT``."""
+    light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
+    product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
+    tree.link(color, product.inputs[0])
+    tree.link(light.outputs["Color"], product.inputs[1])
+    glow = tree.node("ShaderNodeEmission", 3, 0)
+    tree.link(product.outputs[0], glow.inputs["Color"])
+    return glow.outputs[0]
 
 
 def _seen(tree: _Tree, color: Any, terms: int) -> Any:

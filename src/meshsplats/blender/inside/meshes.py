@@ -176,11 +176,10 @@ def world_points(obj: Any) -> np.ndarray:
 def local_points(obj: Any) -> np.ndarray:
     """(k, 3) float64 sample of the visible vertices, or splats, of ``obj``, in its own frame."""
     data = obj.data
-    if is_splats(obj):
-        points = values(data, "position").astype(np.float64)
+    own = is_splats(obj)  # of Blender
+    points = (values(data, "position") if own else versions.positions(data)).astype(np.float64)
+    if own:
         points = points[values(data, "radiance:base")[:, 3] > _VISIBLE]
-        return points[:: -(-max(len(points), 1) // SAMPLE)]
-    points = versions.positions(data).astype(np.float64)
-    if COLOR in data.attributes and len(points):
+    elif COLOR in data.attributes and len(points):
         points = points[read_colors(data, COLOR)[:, 3] > _VISIBLE]
     return points[:: -(-max(len(points), 1) // SAMPLE)]

@@ -50,7 +50,7 @@ LAYERS = "meshsplats_layers"
 
 
 def prepare(
-    mesh: SplatMesh,
+    mesh: SplatMesh | lit_points.Source,
     lit: bool,
     *,
     fast: bool = False,
@@ -60,7 +60,9 @@ def prepare(
     """Everything that takes time and does not touch Blender, so that it may run in another thread. Coplanar
     layers of a mesh prior are separated, as in exports; a filter is baked for images of the whole subject.
     ``fast``: a lit mesh for a preview. ``views``: those within a place, as in ``lit_subject``. ``announce``
-    is told the phases of a lit one, and may raise."""
+    is told the phases of a lit one, and may raise. Splats that Blender draws (``light_source``) are lit."""
+    if isinstance(mesh, lit_points.Source):
+        return lit_points.prepare(mesh, fast=fast, within=views, announce=announce)
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
         mesh = prior.pose(lift=prior.export_lift)
@@ -144,12 +146,9 @@ def is_lit(obj: Any) -> bool | None:
 
 
 def count_layers(objs: Iterable[Any]) -> int:
-    """Most layers of triangles behind each other of ``objs``; of the levels of a chain, one is shown at a
-    time."""
+    """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
     most: dict[tuple[bool, str], int] = {}
     for obj in objs:
-        if obj.type != "MESH":
-            continue
         chain = levels.chain_of(obj)
         key = (True, chain.name) if chain is not None else (False, obj.name)
         most[key] = max(most.get(key, 0), int(obj.data.get(LAYERS, 256)))
@@ -177,14 +176,9 @@ def renew_light(scene: Any, objs: Iterable[Any], *, fast: bool = False) -> list[
     stand_ins.remove_strays(scene)
     found = []
     for obj in objs:
-        if not needs_light(obj, fast=fast):
-            continue
-        source, within = light_source(obj), views_within(obj)
-        if isinstance(source, SplatMesh):
-            take_light(obj, prepare(source, True, fast=fast, views=within))
-        else:
-            take_light(obj, lit_points.prepare(source, fast=fast, within=within))
-        found.append(obj.name)
+        if needs_light(obj, fast=fast):
+            take_light(obj, prepare(light_source(obj), True, fast=fast, views=views_within(obj)))
+            found.append(obj.name)
     return found
 
 
@@ -378,8 +372,9 @@ def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions 
     light = light or LightOptions(exposure=0.0)
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
+    objs = [obj for obj in objs if obj.type == "MESH"]  # splats that Blender draws have no triangles
     layers = count_layers(objs)
-    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs if obj.type == "MESH")
+    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
     limit = bounce_limit(layers)
     if lit:
         rendering.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import OPENGL, Camera
+from meshsplats.camera import OPENGL, Camera, to_opengl
 from meshsplats.choices import MAX_SIDE
 from meshsplats.formats._orientation import HALF_TURN_Z, up_quaternion
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
@@ -64,8 +64,7 @@ def _cameras(document: GltfDocument, frame: np.ndarray) -> list[Camera]:
 
 def camera_node(camera: Camera, number: int) -> dict[str, Any]:
     """The node of the camera ``number`` of a file, at the place of ``camera`` in the frame of its parent."""
-    pose = np.linalg.inv(camera.world_to_camera)
-    pose[:3, :3] *= OPENGL
+    pose = to_opengl(camera.world_to_camera)
     return {"name": camera.name or f"view {number + 1}", "camera": number, "matrix": pose.T.ravel().tolist()}
 
 
