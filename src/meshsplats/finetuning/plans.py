@@ -24,9 +24,6 @@ from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-MANY_TRIANGLES, FEWER_TRIANGLES = 2_000_000, 1_000_000
-"""Of more, a run that had no time for a step names the limit that would have left it some."""
-
 
 @dataclass(frozen=True)
 class Trained:
@@ -161,8 +158,6 @@ class RunResult:
         made = f"{files.mesh} ({in_words(files.mesh.stat().st_size)}, {self.trained.summary})"
         yield f"{made}: {steps:,} steps in {self._total:.1f} s{resumed}{quality}"
         yield from _sizes_in_words(self.trained.sizes, steps if lines or self.trained.sizes else None)
-        if steps == 0 and self.trained.sizes and self.trained.counts.get("triangles", 0) > MANY_TRIANGLES:
-            yield f"  or fewer triangles: ``max_triangles`` {FEWER_TRIANGLES}"
         yield f"preview: {files.preview}" + (f"; metrics: {files.folder}/metrics.jsonl" if lines else "")
 
 
@@ -173,11 +168,12 @@ def _views(count: int) -> str:
 def _sizes_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[str]:
     """At each image width, the conversion against the tuned mesh; which one was written, if not that; and
     whether no step was taken. ``steps``: None if unknown."""
-    if sizes is not None and steps:
+    if sizes is not None:
         pairs = (
-            f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items()
+            f"{width} px {old:.1f}" + (f" -> {sizes.tuned[width]:.1f}" if steps else "")
+            for width, old in sizes.converted.items()
         )
-        yield f"converted -> tuned, dB: {', '.join(pairs)}"
+        yield f"converted{' -> tuned' if steps else ''}, dB: {', '.join(pairs)}"
     if sizes is not None and sizes.loses:
         where = ", ".join(str(width) for width in sizes.worse_at)
         count = f"{steps or 0:,} step" + ("" if steps == 1 else "s")
