@@ -32,7 +32,7 @@ class Result:
         """Stores them with ``obj``, the finest level."""
         from meshsplats.blender.inside import views
 
-        if self.views:
+        if self.views is not None:
             origin = self.prepared[0]["origin"]
             views.remember(obj, [view.relative_to(origin) for view in self.views])
 

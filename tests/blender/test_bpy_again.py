@@ -146,8 +146,11 @@ def test_a_place_that_is_converted_again_is_not_searched_again(captures, monkeyp
     one, _ = captures
     bpy.context.scene.meshsplats_fast = True
     known = [look_at((0.1, y, 0.3), (1, 0.4, 0.3), fov=60, width=400, height=400) for y in (0.1, 0.2)]
-    for cameras, times in ((known, 0), ([], 1)):
-        views.remember(one, cameras)
+    for cameras, times in ((known, 0), ([], 0), (None, 1)):
+        if cameras is None:
+            del one[views.VIEWS]
+        else:
+            views.remember(one, cameras)  # none: of what is seen from around
         one.meshsplats.shading = "lit"
         bpy.ops.object.meshsplats_convert_again()
         assert len(asked) == times

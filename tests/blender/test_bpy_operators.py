@@ -111,14 +111,14 @@ def test_a_place_is_searched_for_views_once(extension, tmp_path, monkeypatch):
         asked.append(len(cloud))
         return given, "a place"
 
-    def lit_arrays(mesh, cameras, **options):
+    def shape_for_light(mesh, cameras, *options):
         seen.append([camera.world_to_camera for camera in cameras])
-        return made(mesh, cameras, **options)
+        return made(mesh, cameras, *options)
 
-    made = subject.lit_arrays
+    made = subject.shape_for_light
     monkeypatch.setattr("meshsplats.viewpoints.showing.default_views", default_views)
     monkeypatch.setattr(subject, "default_views", default_views)
-    monkeypatch.setattr(subject, "lit_arrays", lit_arrays)
+    monkeypatch.setattr(subject, "shape_for_light", shape_for_light)
     bpy.ops.wm.read_factory_settings()
     bpy.context.scene.meshsplats_fast = True
     for shading in ("lit", "unlit"):

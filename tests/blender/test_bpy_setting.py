@@ -271,6 +271,18 @@ def test_a_place_is_seen_from_within(tmp_path):
     for broken in ([1.0] * 5, [float("nan")] * 18, [0.0] * 18, [1.0] * 20, "view", {"a": 1}, [{"a": 1}], obj):
         obj[views.VIEWS] = broken
         assert views.opening([obj]) is None
+        assert views.within(obj, np.zeros(3)) is None
+
+
+def test_what_is_seen_from_around_stays_so_until_it_changes():
+    bpy.ops.wm.read_factory_settings()
+    obj = ball()
+    assert views.within(obj, np.zeros(3)) is None
+    views.remember(obj, [])
+    assert views.within(obj, np.zeros(3)) == []
+    assert views.opening([obj]) is None
+    obj.data.transform(Matrix.Scale(3, 4))
+    assert views.within(obj, np.zeros(3)) is None, "other things may be in it now"
 
 
 def test_studio_looks_at_a_place_from_within(empty):

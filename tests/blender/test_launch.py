@@ -91,6 +91,8 @@ def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
 
 STAND_IN = """
 import json, os, sys, time
+while not os.path.exists(sys.argv[-1]):
+    time.sleep(0.02)
 job = json.load(open(sys.argv[-1]))
 for path in job["temporary"].values():
     open(path, "wb").close()  # as Blender's own writer begins
@@ -283,8 +285,12 @@ def test_missing_graphics_libraries_are_named(program, monkeypatch, tmp_path):
         raise OSError(name)
 
     monkeypatch.setattr(ctypes, "CDLL", absent)
-    with pytest.raises(MissingDependencyError, match=r"libEGL\.so\.1.*apt install libegl1.*--engine cycles"):
-        launch.run_job([], [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
+    eevee = SceneOptions(engine="eevee")
+    with (
+        pytest.raises(MissingDependencyError, match=r"libEGL\.so\.1.*apt install libegl1.*--engine cycles"),
+        launch.begun(eevee, executable=program("Blender 5.0.1")),
+    ):
+        pass
 
 
 @linux

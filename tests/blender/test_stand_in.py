@@ -15,7 +15,7 @@ from meshsplats.blender import subject
 from meshsplats.blender.files import PictureOptions, PictureRun
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import LightOptions, SceneOptions
-from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
+from meshsplats.blender.stand_in import _Feet, field_around, stand_in, surface_net
 from meshsplats.blender.subject import ground_height, prepare
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import shading_normals
@@ -42,15 +42,14 @@ def test_places_are_lit_by_what_is_seen_from_within(monkeypatch):
     know no splats have none."""
     seen = []
 
-    def arrays(mesh, cameras, **options):
+    def shape(mesh, cameras, *options):
         seen.append(list(cameras))
-        return {}, 0.0
+        return {"n": len(cameras)}, {}, None
 
     mesh = convert(ball_splats(300)[0])
     given, found = orbit(mesh, 3)[:1], orbit(mesh, 2)
     views = iter([(found, "a place"), None])
-    monkeypatch.setattr(subject, "lit_arrays", arrays)
-    monkeypatch.setattr(subject, "_stand_in_arrays", lambda mesh, lit, cameras, *_: ({"n": len(cameras)}, 0))
+    monkeypatch.setattr(subject, "shape_for_light", shape)
     monkeypatch.setattr(subject, "default_views", lambda cloud, *_, **__: next(views))
     counts = [subject.lit_subject(part, given)[0]["n"] for part in (mesh, mesh)]
     assert counts == [3, 1]
@@ -145,22 +144,23 @@ def ball():
     mesh = convert(more, mode="flat")
     normals = shading_normals(mesh)
     colors = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
-    return mesh, stand_in(mesh, normals, colors, resolution=48)
+    return mesh, stand_in(mesh, normals, field_around(mesh, resolution=48)), colors
 
 
 def test_stand_in_is_the_surface_that_the_splats_form(ball):
-    _, made = ball
+    _, made, own = ball
+    colors = made.colors(own)
     radii = np.linalg.norm(made.vertices, axis=1)
     assert np.abs(radii - 1).max() < 0.03
     assert 0.95 < volume(made.vertices, made.faces) / (4 / 3 * np.pi) < 1.05
     red = made.vertices[:, 1] < -0.65
-    assert made.colors[red, 0].mean() > 3 * made.colors[red, 2].mean()
-    grey = made.colors[(made.vertices[:, 1] > -0.3) & (made.vertices[:, 2] < 0.8)]
+    assert colors[red, 0].mean() > 3 * colors[red, 2].mean()
+    grey = colors[(made.vertices[:, 1] > -0.3) & (made.vertices[:, 2] < 0.8)]
     assert np.abs(grey - srgb_to_linear(np.float32(0.7))).max() < 0.01
 
 
 def test_splats_take_the_light_at_their_foot(ball):
-    mesh, made = ball
+    mesh, made, _ = ball
     near = np.linalg.norm(mesh.vertices, axis=1) < 1.01
     points, normals = made.points[made.point_of[near]], made.normals[made.point_of[near]]
     assert np.linalg.norm(points - mesh.vertices[near], axis=1).max() < 0.2
@@ -170,7 +170,7 @@ def test_splats_take_the_light_at_their_foot(ball):
 
 
 def test_thin_parts_cast_their_own_shadow_and_floaters_none(ball):
-    mesh, made = ball
+    mesh, made, _ = ball
     centers = np.zeros((mesh.face_splat.max() + 1, 3))
     for k in range(3):
         corners = mesh.vertices[mesh.faces].mean(axis=1)[:, k]
@@ -216,7 +216,7 @@ def test_a_ground_below_a_scene_with_a_street_leaves_the_street_in_the_light():
 def test_nothing_solid_has_no_stand_in():
     cloud, _ = ball_splats(200)
     mesh = convert(replace(cloud, opacities=np.full(200, 0.05)), mode="flat")
-    assert stand_in(mesh, shading_normals(mesh), mesh.colors, resolution=16) is None
+    assert stand_in(mesh, shading_normals(mesh), field_around(mesh, resolution=16)) is None
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ from _blender_scenes import ball_splats, sheets
 
 from meshsplats import convert
 from meshsplats.blender.linear import linear_colors
-from meshsplats.blender.subject import lit_arrays
+from meshsplats.blender.subject import lit_subject
 from meshsplats.colors import srgb_to_linear
-from meshsplats.conversion.normals import shading_normals, typical_spacing
+from meshsplats.conversion.normals import shading_normals, surfels_of, typical_spacing
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.gaussians import GaussianCloud
 
@@ -60,7 +60,7 @@ def test_a_mesh_without_splats_and_degenerate_ones_work():
     assert (np.abs(shading_normals(plain)[:, 2]) > 0.99).all()
     point = replace(plain, vertices=np.zeros_like(plain.vertices))
     assert np.isfinite(shading_normals(point)).all()
-    assert typical_spacing(point) > 0
+    assert typical_spacing(point, surfels_of(point).centers) > 0
     nothing = plain.take(np.zeros(2, bool))
     assert shading_normals(nothing).shape == (0, 3)
 
@@ -69,7 +69,7 @@ def test_a_mesh_without_splats_and_degenerate_ones_work():
 def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
     cloud, _ = ball_splats(500)
     mesh = convert(cloud)
-    arrays, distance = lit_arrays(mesh)
+    arrays, facts = lit_subject(mesh)
     a, b, c = (mesh.vertices[arrays["faces"][:, k]] for k in range(3))
     facing = (np.cross(b - a, c - a) * arrays["normals"][arrays["faces"]].sum(axis=1)).sum(axis=1)
     assert (facing >= 0).all()
@@ -79,8 +79,8 @@ def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
     assert (plain[:, 3] == mesh.colors[:, 3]).all()
     assert np.abs(arrays["colors"] - plain).mean() < 0.1, "fitted to blending in linear light"
     assert (arrays["colors"] != plain).any()
-    assert 0 < distance < 1
-    assert (lit_arrays(replace(mesh, blending="linear"))[0]["colors"] == mesh.colors).all()
+    assert 0 < facts["self_shadow"] < 1
+    assert (lit_subject(replace(mesh, blending="linear"))[0]["colors"] == mesh.colors).all()
 
 
 def test_a_street_faces_up_though_it_is_seen_better_from_below():

@@ -219,6 +219,27 @@ class FillingStruct(CoreStruct):
     ]
 
 
+class FeetStruct(CoreStruct):
+    _fields_ = [
+        *pointers("places", "normals", "ids", "vertices", "vertex_normals", "index", "found"),
+        *int64("count"),
+        ("size", c_int64 * 3),
+        ("low", c_double * 3),
+        *doubles("side", "facing_away"),
+        *int32("reach", "threads"),
+    ]
+
+
+class CellSumsStruct(CoreStruct):
+    _fields_ = [
+        *pointers("points", "cell", "beside", "middle", "values", "total"),
+        *int64("count"),
+        *int32("around", "channels"),
+        *doubles("falloff"),
+        *int32("threads"),
+    ]
+
+
 class ResamplingStruct(CoreStruct):
     _fields_ = [
         *pointers("points", "bytes", "values", "result"),

@@ -23,7 +23,7 @@ from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
-    from meshsplats.blender.launch import BlenderError, Progress
+    from meshsplats.blender.launch import BlenderError, Job, Progress
     from meshsplats.blender.plan import Schedule
 
 __all__ = [
@@ -87,7 +87,7 @@ def draw(
 
     Warns with a DataWarning if more layers lie behind each other than Blender can follow (1024).
     """
-    from meshsplats.blender import launch, plan, subject
+    from meshsplats.blender import launch
 
     options = options or SceneOptions()
     options.check()
@@ -104,8 +104,27 @@ def draw(
         raise ValueError("a chain of levels of detail makes a .blend; for images, give one mesh of it")
     if any(len(level.faces) == 0 for level in chain.meshes):
         raise ValueError("the mesh has no triangles: there is nothing to draw")
-    launch.command(None if executable is None else Path(executable))  # fail before the work
     _check_folders([*targets, *([] if blend is None else [Path(blend)])])
+    with launch.begun(
+        options,
+        images=targets,
+        blend=None if blend is None else Path(blend),
+        executable=None if executable is None else Path(executable),
+    ) as job:
+        return _drawn(job, chain, cameras, len(targets), options, announce, progress)
+
+
+def _drawn(
+    job: Job,
+    chain: LevelMeshes,
+    cameras: Sequence[Camera],
+    images: int,
+    options: SceneOptions,
+    announce: Callable[[dict[str, Any]], object] | None,
+    progress: Callable[[Progress], object] | None,
+) -> dict[str, Any]:
+    from meshsplats.blender import launch, plan, subject
+
     meshes = [_without_filter(level, cameras) for level in chain.meshes]
     counted = [subject.count(level, cameras, options) for level in meshes]
     layers, limit = max(counted)
@@ -122,7 +141,7 @@ def draw(
             "layers": layers,
             "bounce_limit": limit,
             "samples": samples,
-            "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
+            "pixels": sum(camera.width * camera.height for camera in cameras[:images]),
             "mean_layers": mean,
             "mean_square_layers": mean_square,
             "harmonics": 0 if finest.harmonics is None else finest.harmonics.shape[1],
@@ -134,22 +153,13 @@ def draw(
 
     def begin(phase: str) -> None:
         if tell is not None:
-            tell(launch.Progress(0, len(targets), 0.0, phase, None))
+            tell(launch.Progress(0, images, 0.0, phase, None))
 
     subjects = []
     for level, size in zip(meshes, chain.screen_sizes, strict=True):
         arrays, facts = subject.prepare(level, cameras, options, layers, begin)
         subjects.append((arrays, facts | {"name": chain.name, "screen_size": size}))
-    result = launch.run_job(
-        subjects,
-        cameras,
-        options,
-        limit=limit,
-        images=targets,
-        blend=None if blend is None else Path(blend),
-        executable=None if executable is None else Path(executable),
-        progress=tell,
-    )
+    result = job.run(subjects, cameras, limit=limit, progress=tell)
     return result | {"layers": layers, "bounce_limit": limit}
 
 
@@ -191,5 +201,5 @@ def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: Scen
         f" beyond, it is black ({share:.2%} of the pixels of a view are touched); draw fewer, with"
         " --max-triangles on conversion, or a smaller part",
         DataWarning,
-        stacklevel=3,
+        stacklevel=4,
     )

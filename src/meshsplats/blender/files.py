@@ -26,7 +26,7 @@ from meshsplats.blender.plan import in_words
 from meshsplats.blender.subject import views_within
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
-from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.conversion.merging_views import convert_within_limits, views_of_place
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
@@ -165,7 +165,14 @@ class PictureOptions:
         # Crossed ellipses stand upright on the surface, where they catch too little light.
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
         options = ConversionOptions(max_splats=self.most_splats, mode=mode)
+        limited = len(scene) > (self.most_splats or len(scene))
+        # Merging by what is seen takes three times as long; of an object, it is worth 0.4 dB.
+        if self.fast and limited and self._is_object(scene, source):
+            return convert(scene, options, up=self.up, threads=self.threads)
         return convert_within_limits(scene, options, up=self.up, source=source, threads=self.threads)
+
+    def _is_object(self, cloud: GaussianCloud, source: Path) -> bool:
+        return views_of_place(cloud, source, up=self.up, threads=self.threads) is None
 
 
 @dataclass(frozen=True)

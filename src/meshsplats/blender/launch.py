@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._files.atomic import is_promised, temporary_beside
+from meshsplats._files.atomic import is_promised, temporary_beside, write_text
 from meshsplats._files.locks import try_lock
 from meshsplats.blender import guard
 from meshsplats.blender.inside import MISSING, worker
@@ -29,6 +29,8 @@ from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
 
 OLDEST = (4, 2)
+JOB = "job.json"
+"""For which the worker waits, in the folder of the process."""
 
 _GRAPHICS = "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
 _LIBRARIES = (
@@ -93,65 +95,106 @@ def command(executable: Path | None) -> list[str]:
     return [str(found), *flags, str(Path(worker.__file__).resolve()), "--"]
 
 
-def run_job(
-    subjects: Sequence[tuple[dict[str, np.ndarray], dict[str, Any]]],
-    cameras: Sequence[Camera],
+class Job:
+    """A job of Blender's, which has been started and loads; see ``begun``."""
+
+    def __init__(
+        self,
+        process: subprocess.Popen[str],
+        folder: Path,
+        options: SceneOptions,
+        images: Sequence[Path],
+        blend: Path | None,
+        temporary: Mapping[str, str],
+    ) -> None:
+        self._process, self._folder, self._options = process, folder, options
+        self._images, self._blend, self._temporary = images, blend, temporary
+
+    def run(
+        self,
+        subjects: Sequence[tuple[dict[str, np.ndarray], dict[str, Any]]],
+        cameras: Sequence[Camera],
+        *,
+        limit: int,
+        progress: Callable[[Progress], object] | None = None,
+    ) -> dict[str, Any]:
+        """Has Blender build the scene, save the file and render the images; once.
+
+        Args:
+            subjects: arrays and facts, the fields of ``inside.scene.Subject``; of a chain, those of each
+                level, the finest first.
+            cameras: at least one per image.
+            limit: on transparent bounces.
+            progress: called whenever Blender reports progress.
+
+        Returns:
+            ``{"blender": version, "build_seconds": s, "build_processor_seconds": s, "image_seconds": [s,
+            ...], "image_processor_seconds": [s, ...]}``.
+
+        Raises:
+            BlenderError: Blender failed; the message quotes it.
+            MissingDependencyError: system libraries are missing; see also ``command``.
+            OSError: an output cannot be written (a full disk, a name that another process has taken
+            meanwhile).
+        """
+        stored = []
+        for level, (arrays, facts) in enumerate(subjects):
+            files = {name: str(self._folder / f"{name}_{level}.npy") for name in arrays}
+            for name, array in arrays.items():
+                np.save(files[name], array, allow_pickle=False)
+            stored.append((files, facts))
+        outputs = [path for path in (*self._images, self._blend) if path is not None]
+        job = {
+            "subjects": stored,
+            "cameras": [_plain_camera(camera) for camera in cameras],
+            "options": _plain_options(self._options),
+            "limit": limit,
+            "blend": None if self._blend is None else os.path.abspath(self._blend),
+            "images": [os.path.abspath(path) for path in self._images],
+            "temporary": dict(self._temporary),
+            "new": [os.path.abspath(path) for path in outputs if is_promised(path)],
+        }
+        write_text(self._folder / JOB, json.dumps(job))
+        return _follow(self._process, self._options, len(self._images), progress)
+
+
+@contextmanager
+def begun(
     options: SceneOptions,
     *,
-    limit: int,
     images: Sequence[Path] = (),
     blend: Path | None = None,
     executable: Path | None = None,
-    progress: Callable[[Progress], object] | None = None,
-) -> dict[str, Any]:
-    """Has Blender build the scene, save ``blend`` and render ``images``, one per camera.
+) -> Iterator[Job]:
+    """Starts Blender, which loads while its job is prepared.
 
-    Blender ends with this process, however that ends, and leaves nothing behind (``guard``).
+    Blender ends with the context and with this process, however that ends, and leaves nothing behind
+    (``guard``).
 
     Args:
-        subjects: arrays and facts, the fields of ``inside.scene.Subject``; of a chain, those of each level,
-            the finest first.
-        cameras: at least one per image.
-        limit: on transparent bounces.
-        progress: called whenever Blender reports progress.
+        images, blend: what the job will write.
 
-    Returns:
-        ``{"blender": version, "build_seconds": s, "build_processor_seconds": s, "image_seconds": [s, ...],
-        "image_processor_seconds": [s, ...]}``.
-
-    Raises:
-        BlenderError: Blender failed; the message quotes it.
-        MissingDependencyError: system libraries are missing; see also ``command``.
-        OSError: an output cannot be written (a full disk, a name that another process has taken meanwhile).
+    Raises MissingDependencyError where libraries for EEVEE are missing, and what ``command`` raises.
     """
     start = command(executable)
     if options.engine == "eevee":
         _check_graphics()
+    outputs = [path for path in (*images, blend) if path is not None]
     with _scratch() as (folder, lock):
-        stored = []
-        for level, (arrays, facts) in enumerate(subjects):
-            files = {name: os.path.join(folder, f"{name}_{level}.npy") for name in arrays}
-            for name, array in arrays.items():
-                np.save(files[name], array, allow_pickle=False)
-            stored.append((files, facts))
-        job = {
-            "subjects": stored,
-            "cameras": [_plain_camera(camera) for camera in cameras],
-            "options": _plain_options(options),
-            "limit": limit,
-            "blend": None if blend is None else os.path.abspath(blend),
-            "images": [os.path.abspath(path) for path in images],
-        }
-        outputs = [path for path in (*images, blend) if path is not None]
         temporary = {os.path.abspath(path): str(temporary_beside(path)) for path in outputs}
-        job["temporary"] = temporary
-        job["new"] = [os.path.abspath(path) for path in outputs if is_promised(path)]
-        plan = {"command": [*start, str(folder / "job.json")], "remove": [*temporary.values(), str(folder)]}
+        plan = {"command": [*start, str(folder / JOB)], "remove": [*temporary.values(), str(folder)]}
+        (folder / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
+        process = _start(start, folder, lock)
         try:
-            for name, content in (("job.json", job), ("plan.json", plan)):
-                (folder / name).write_text(json.dumps(content), encoding="utf-8")
-            return _watch(plan, folder, lock, options, len(images), progress)
+            yield Job(process, folder, options, images, blend, temporary)
+        except BaseException:
+            _end(process)
+            raise
         finally:
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    with suppress(OSError):
+                        pipe.close()
             for path in temporary.values():  # of a Blender that crashed
                 Path(path).unlink(missing_ok=True)
 
@@ -181,26 +224,15 @@ def _scratch() -> Iterator[tuple[Path, int]]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _watch(
-    plan: dict[str, Any],
-    folder: Path,
-    lock: int,
-    options: SceneOptions,
-    images: int,
-    progress: Callable[[Progress], object] | None,
-) -> dict[str, Any]:
-    arguments = plan["command"]
+def _start(command: Sequence[str], folder: Path, lock: int) -> subprocess.Popen[str]:
     environment = dict(os.environ)
-    if arguments[1] == "-m":
+    if command[1] == "-m":
         # The worker must import this very package, wherever this process found it.
         paths = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     # Blender's own temporary files go into our folder.
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
-    result: dict[str, Any] = {"image_seconds": [], "image_processor_seconds": []}
-    said: deque[str] = deque(maxlen=40)
-    finished, failure, unloadable, status = False, None, None, None
-    process = subprocess.Popen(
+    return subprocess.Popen(
         [sys.executable, "-I", "-S", guard.__file__, str(folder / "plan.json")],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -211,44 +243,54 @@ def _watch(
         start_new_session=True,  # the guard must survive our process group to clean up
         pass_fds=() if sys.platform == "win32" else (lock,),
     )
-    at = Progress(0, images, 0.0, "starting", None)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Has the guard end Blender."""
+    assert process.stdin is not None
+    with suppress(OSError):
+        process.stdin.close()
     try:
-        assert process.stdin is not None and process.stdout is not None  # noqa: PT018
-        for line in process.stdout:
-            if not line.startswith(worker.MARK):
-                said.append(line.rstrip())
-                continue
-            message = json.loads(line[len(worker.MARK) :])
-            if "built" in message:
-                result |= {"blender": message["blender"], "build_seconds": message["built"]}
-                result["build_processor_seconds"] = message["processor"]
-            elif "image" in message:
-                result["image_seconds"].append(message["seconds"])
-                result["image_processor_seconds"].append(message["processor"])
-                at = Progress(at.done + 1, images, 0.0, "", None)
-            elif "stage" in message:
-                at = replace(at, share=message["share"], stage=message["stage"], left=message["left"])
-            status = message.get("ended", status)
-            if progress is not None and ("image" in message or "stage" in message):
-                progress(at)
-            finished |= "done" in message
-            failure = message.get("error", failure)
-            unloadable = message.get("unloadable", unloadable)
-        ended = process.wait()
-        status = ended if status is None else status
-    except BaseException:
-        process.stdin.close()  # type: ignore[union-attr]
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        raise
-    finally:
-        for pipe in (process.stdin, process.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _follow(
+    process: subprocess.Popen[str],
+    options: SceneOptions,
+    images: int,
+    progress: Callable[[Progress], object] | None,
+) -> dict[str, Any]:
+    """What the worker says, until it ends."""
+    result: dict[str, Any] = {"image_seconds": [], "image_processor_seconds": []}
+    said: deque[str] = deque(maxlen=40)
+    finished, failure, unloadable, status = False, None, None, None
+    at = Progress(0, images, 0.0, "starting", None)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if not line.startswith(worker.MARK):
+            said.append(line.rstrip())
+            continue
+        message = json.loads(line[len(worker.MARK) :])
+        if "built" in message:
+            result |= {"blender": message["blender"], "build_seconds": message["built"]}
+            result["build_processor_seconds"] = message["processor"]
+        elif "image" in message:
+            result["image_seconds"].append(message["seconds"])
+            result["image_processor_seconds"].append(message["processor"])
+            at = Progress(at.done + 1, images, 0.0, "", None)
+        elif "stage" in message:
+            at = replace(at, share=message["share"], stage=message["stage"], left=message["left"])
+        status = message.get("ended", status)
+        if progress is not None and ("image" in message or "stage" in message):
+            progress(at)
+        finished |= "done" in message
+        failure = message.get("error", failure)
+        unloadable = message.get("unloadable", unloadable)
+    ended = process.wait()
+    status = ended if status is None else status
     if unloadable is not None:
         raise MissingDependencyError(f"Blender's module bpy cannot be loaded: {unloadable}.{_LIBRARIES}")
     if isinstance(failure, list):

@@ -103,10 +103,10 @@ def _with(
     """(v, 4) colours with the factors and exponents whose logarithms are ``values`` (n, 4), and the (v,)
     exponents; ``clear`` (v,) is the logarithm of the transparency."""
     factors = np.exp(values)[owner]
-    colors = np.empty_like(plain)
-    np.clip(factors[:, :3] * plain[:, :3], 0, 1, out=colors[:, :3])
-    colors[:, 3] = np.where(plain[:, 3] >= 1, 1, -np.expm1(factors[:, 3] * clear))
-    return colors, factors[:, 3]
+    colors = factors * plain
+    colors[:, 3] = -np.expm1(factors[:, 3] * clear)
+    colors[plain[:, 3] >= 1, 3] = 1
+    return np.clip(colors, 0, 1, out=colors), factors[:, 3]
 
 
 def _views(mesh: SplatMesh, cameras: Sequence[Camera], count: int) -> tuple[list[Camera], list[Camera]]:

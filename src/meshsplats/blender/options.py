@@ -105,10 +105,9 @@ class Effort:
     """Of the fit of colours to linear light."""
     fit_views: int = 24
     """Views around the scene that this fit sees."""
-    normal_views: int = 24
-    """Views that tell on which side of a surface a splat is."""
-    surface_views: int = 40
-    """Depth images of which the surface is made that stands in for the splats."""
+    views: int = 40
+    """Depth images around the scene: of them the surface is made that stands in for the splats, and they
+    tell on which side of it a splat is."""
     resolution: int = 96
     """Voxels along the longest side of that surface."""
     samples: int = 12
@@ -116,7 +115,7 @@ class Effort:
 
 
 CAREFUL = Effort()
-FAST = Effort(steps=12, fit_views=4, normal_views=8, surface_views=12, resolution=48, samples=4)
+FAST = Effort(steps=12, fit_views=4, views=12, resolution=48, samples=4)
 """For previews: see docs/blender.md for what it costs and loses."""
 FAST_SPLATS, FAST_SAMPLES = 30_000, 4
 """What the command's previews have by default."""

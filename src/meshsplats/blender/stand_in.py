@@ -11,17 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from meshsplats._cells import Cells
+from meshsplats._core.cells import VertexGrid, nearest_vertices
 from meshsplats._core.surfaces import Grid
 from meshsplats._geometry import vertex_normals
 from meshsplats.blender.options import CAREFUL
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
-from meshsplats.conversion.normals import typical_spacing, unit, views_around
+from meshsplats.conversion.normals import Sight, sight_of, typical_spacing, unit, views_around
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import Rendering
 from meshsplats.surfaces.fusion import MIN_PART, grid_around, signed_distances
 
 SIDE = 3
@@ -43,7 +46,6 @@ _FILLS = 4
 _SIDES = 1e4
 """Weight of a squared distance to a point of the surface that faces the other way: such a point counts where
 no other one is near. A street may be a slab of two voxels."""
-_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +56,10 @@ class StandIn:
     """(w, 3) float32, frame of the splats."""
     faces: np.ndarray
     """(g, 3) int32, facing out."""
-    colors: np.ndarray
-    """(w, 3) float32 linear light."""
+    feet: np.ndarray
+    """(v,) int64 for each vertex of the splat mesh the one of ``vertices`` that is nearest to its splat."""
+    weights: np.ndarray
+    """(v,) float64 what its colour counts there, beside its opacity."""
     fine: np.ndarray
     """(f,) bool: faces of the splat mesh that cast shadows of their own, as the surface lacks them."""
     points: np.ndarray
@@ -67,43 +71,83 @@ class StandIn:
     size: float
     """Distance of neighbouring points, scene units."""
 
+    def colors(self, colors: np.ndarray) -> np.ndarray:
+        """(w, 3) float32 colours of the surface: means of the ``colors`` (v, 4), RGBA in linear light, of
+        what has its foot near each of its vertices, by opacity."""
+        weight = colors[:, 3].astype(np.float64) * self.weights
+        count = len(self.vertices)
+        columns = [np.bincount(self.feet, weight * colors[:, k], count) for k in range(3)]
+        total = np.stack([*columns, np.bincount(self.feet, weight, count)], axis=1)
+        mean = total.sum(axis=0)
+        fallback = mean[:3] / mean[3] if mean[3] > 0 else np.full(3, 0.5)
+        # A vertex without splats, or with hidden ones only, takes the colour of those beside it.
+        typical = float(np.median(total[total[:, 3] > 0, 3])) if mean[3] > 0 else 1.0
+        for _ in range(_FILLS):
+            beside = np.zeros_like(total)
+            for corner in range(3):
+                for k in range(4):
+                    beside[:, k] += np.bincount(
+                        self.faces[:, corner], total[self.faces[:, corner - 1], k], count
+                    )
+            total += beside * (0.05 * typical / np.maximum(beside[:, 3:] + total[:, 3:], 1e-300))
+        held = total[:, 3:]
+        return np.where(held > 0, total[:, :3] / np.maximum(held, 1e-300), fallback).astype(np.float32)
 
-def stand_in(
+
+class Field(NamedTuple):
+    """Distances to the surface that the splats form, and the images that they come from."""
+
+    grid: Grid
+    distances: np.ndarray
+    """(x, y, z) float32, as of ``signed_distances``."""
+    sights: list[Sight]
+
+
+def field_around(
     mesh: SplatMesh,
-    normals: np.ndarray,
-    colors: np.ndarray,
     cameras: Sequence[Camera] = (),
     *,
     resolution: int = CAREFUL.resolution,
-    views: int = CAREFUL.surface_views,
+    views: int = CAREFUL.views,
     threads: int | None = None,
-) -> StandIn | None:
-    """The stand-in of ``mesh``; None where its images show nothing solid.
+) -> Field | None:
+    """That of ``mesh``; None without extent.
 
     Args:
-        normals: (v, 3) unit shading normals.
-        colors: (v, 4) RGBA, linear light.
         cameras: they see the scene, besides those around it: a room is visible from inside only.
         resolution: voxels along the longest side.
         views: depth images from around the scene.
     """
     try:
         grid = grid_around(mesh, resolution)
-    except ValueError:  # no extent
+    except ValueError:
         return None
-    placed = views_around(mesh, views, SIDE * resolution, cameras, 8)
-    field = signed_distances(mesh, placed, grid, behind=_BEHIND, threads=threads)
+    placed = views_around(mesh, views, SIDE * resolution, cameras)
+    sights: list[Sight] = []
+
+    def keep(camera: Camera, image: Rendering) -> None:
+        sights.append(sight_of(camera, image, len(sights) < views))
+
+    distances = signed_distances(mesh, placed, grid, behind=_BEHIND, threads=threads, each=keep)
+    return Field(grid, distances, sights)
+
+
+def stand_in(
+    mesh: SplatMesh, normals: np.ndarray, around: Field, threads: int | None = None
+) -> StandIn | None:
+    """The stand-in of ``mesh`` with the unit shading ``normals`` (v, 3); None where its images show nothing
+    solid."""
+    grid, field = around.grid, around.distances
     vertices, faces, cells = surface_net(field)
     if not len(faces):
         return None
     surface = (grid.low + grid.voxel * vertices).astype(np.float32)
     outward = _smooth(vertex_normals(surface, faces), faces)
-    feet = _Feet(grid, field, surface, outward, cells)
+    feet = _Feet(grid, field, surface, outward, cells, threads)
     splats = _Splats(mesh, normals)
     foot, found = feet.of(splats.centers, splats.normals)
     above = np.einsum("ij,ij->i", splats.centers - surface[foot], outward[foot]) > -_BELOW * grid.voxel
     weights = np.where(found & above, 1.0, _HIDDEN)
-    albedo = _albedo(mesh, colors, splats, foot, weights, faces, len(surface))
     fine = splats.opacity > _SOLID
     fine &= ~found
     if fine.any():
@@ -127,7 +171,8 @@ def stand_in(
     return StandIn(
         surface,
         faces,
-        albedo,
+        foot[splats.of_vertex],
+        weights[splats.of_vertex],
         fine[splats.of_face],
         (points + 0.1 * grid.voxel * ways).astype(np.float32),
         ways.astype(np.float32),
@@ -215,69 +260,54 @@ class _Splats:
         count = len(splats)
         self.of_face = splats.of_face
         self.of_vertex = np.maximum(splats.of_vertex, 0)  # vertices of no triangle are not drawn
-        corner, owner = mesh.faces.ravel(), np.repeat(self.of_face, 3)
-        weight = mesh.colors[corner, 3].astype(np.float64) + 1e-6
+        corner, owner, first = mesh.faces.ravel(), np.repeat(self.of_face, 3), 3 * splats.starts
+        opacity = mesh.colors[corner, 3].astype(np.float64)
         self.centers = splats.centers(mesh.vertices, mesh.colors[:, 3])
         self.normals = np.empty((count, 3))
         for axis in range(3):
-            self.normals[:, axis] = np.bincount(owner, weight * normals[corner, axis], count)
+            self.normals[:, axis] = np.add.reduceat((opacity + 1e-6) * normals[corner, axis], first)
         self.normals /= np.maximum(np.linalg.norm(self.normals, axis=1, keepdims=True), 1e-12)
-        self.opacity = np.zeros(count)
-        np.maximum.at(self.opacity, owner, mesh.colors[corner, 3])
-        away = np.linalg.norm(mesh.vertices - self.centers[self.of_vertex], axis=1)
-        self.reach = np.zeros(count)
-        np.maximum.at(self.reach, self.of_vertex, away)
+        self.opacity = np.maximum.reduceat(opacity, first)
+        away = np.linalg.norm(mesh.vertices[corner] - self.centers[owner], axis=1)
+        self.reach = np.maximum.reduceat(away, first)
 
 
 class _Feet:
     """Finds the vertex of a surface net that is nearest to a place."""
 
     def __init__(
-        self, grid: Grid, field: np.ndarray, vertices: np.ndarray, normals: np.ndarray, cells: np.ndarray
+        self,
+        grid: Grid,
+        field: np.ndarray,
+        vertices: np.ndarray,
+        normals: np.ndarray,
+        cells: np.ndarray,
+        threads: int | None = None,
     ) -> None:
-        self.grid, self.field = grid, field
+        self.grid, self.field, self._threads = grid, field, threads
         self.vertices, self.normals = vertices, normals
-        self.fine = np.full(field.shape, -1, np.int32)
-        self.fine[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
-        self.coarse = np.full([-(-n // _COARSE) for n in field.shape], -1, np.int32)
-        self.coarse[tuple((cells // _COARSE).T)] = np.arange(len(cells), dtype=np.int32)
+
+        def sorted_into(block: int) -> VertexGrid:
+            ids = np.full([-(-n // block) for n in field.shape], -1, np.int32)
+            ids[tuple((cells // block).T)] = np.arange(len(cells), dtype=np.int32)
+            return VertexGrid(ids, grid.low, block * grid.voxel, vertices, np.ascontiguousarray(normals))
+
+        self._fine, self._coarse = sorted_into(1), sorted_into(_COARSE)
 
     def of(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(k,) indices of vertices for ``places`` (k, 3), and (k,) bool where there is one: near the surface,
         and inside it wherever that is."""
-        index = np.zeros(len(places), np.int64)
-        found = np.zeros(len(places), bool)
-        for begin in range(0, len(places), _CHUNK):
-            part = slice(begin, begin + _CHUNK)
-            index[part], found[part] = self._nearest(places[part], normals[part], self.fine, 1, _NEAR)
+        index, found = self._nearest(places, normals, self._fine, _NEAR)
         steps = np.rint((places - self.grid.low) / self.grid.voxel).astype(np.int64)
         steps = np.clip(steps, 0, np.array(self.field.shape) - 1)
         deep = np.flatnonzero(~found & (self.field[tuple(steps.T)] < 0))
-        for begin in range(0, len(deep), _CHUNK):
-            rows = deep[begin : begin + _CHUNK]
-            index[rows], found[rows] = self._nearest(places[rows], normals[rows], self.coarse, _COARSE, _FAR)
+        index[deep], found[deep] = self._nearest(places[deep], normals[deep], self._coarse, _FAR)
         return index, found
 
     def _nearest(
-        self, places: np.ndarray, normals: np.ndarray, ids: np.ndarray, block: int, reach: int
+        self, places: np.ndarray, normals: np.ndarray, grid: VertexGrid, reach: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        low = np.floor((places - self.grid.low) / (block * self.grid.voxel))
-        cell = np.clip(low, -reach - 1, np.array(ids.shape) + reach).astype(np.int64)
-        best, index = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
-        span = range(-reach, reach + 1)
-        for step in ((x, y, z) for x in span for y in span for z in span):
-            at = cell + step
-            inside = ((at >= 0) & (at < ids.shape)).all(axis=1)
-            vertex = np.where(inside, ids[tuple(np.where(inside[:, None], at, 0).T)], -1)
-            rows = np.flatnonzero(vertex >= 0)
-            if not len(rows):
-                continue
-            vertex = vertex[rows]
-            away = np.square(places[rows] - self.vertices[vertex]).sum(axis=1)
-            away *= np.where(np.einsum("ij,ij->i", normals[rows], self.normals[vertex]) < 0, _SIDES, 1)
-            nearer = away < best[rows]
-            best[rows[nearer]], index[rows[nearer]] = away[nearer], vertex[nearer]
-        return index, np.isfinite(best)
+        return nearest_vertices(places, normals, grid, reach=reach, facing_away=_SIDES, threads=self._threads)
 
     def facing(self, index: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(k, 3) unit normals of the surface at the vertices ``index`` (k,) for splats with ``normals``
@@ -297,35 +327,6 @@ class _Feet:
         length = np.linalg.norm(offset, axis=1, keepdims=True)
         offset *= np.minimum(1, self.grid.voxel / np.maximum(length, 1e-300))
         return self.vertices[index] + offset
-
-
-def _albedo(
-    mesh: SplatMesh,
-    colors: np.ndarray,
-    splats: _Splats,
-    foot: np.ndarray,
-    weights: np.ndarray,
-    faces: np.ndarray,
-    count: int,
-) -> np.ndarray:
-    """(count, 3) float32 colours of the surface: means of the splats whose ``foot`` (n,) is near each vertex,
-    by opacity and ``weights`` (n,)."""
-    weight = colors[:, 3].astype(np.float64) * weights[splats.of_vertex]
-    vertex = foot[splats.of_vertex]
-    columns = [np.bincount(vertex, weight * colors[:, k], count) for k in range(3)]
-    total = np.stack([*columns, np.bincount(vertex, weight, count)], axis=1)
-    mean = total.sum(axis=0)
-    fallback = mean[:3] / mean[3] if mean[3] > 0 else np.full(3, 0.5)
-    # A vertex without splats, or with hidden ones only, takes the colour of those beside it.
-    typical = float(np.median(total[total[:, 3] > 0, 3])) if mean[3] > 0 else 1.0
-    for _ in range(_FILLS):
-        beside = np.zeros_like(total)
-        for corner in range(3):
-            for k in range(4):
-                beside[:, k] += np.bincount(faces[:, corner], total[faces[:, corner - 1], k], count)
-        total += beside * (0.05 * typical / np.maximum(beside[:, 3:] + total[:, 3:], 1e-300))
-    held = total[:, 3:]
-    return np.where(held > 0, total[:, :3] / np.maximum(held, 1e-300), fallback).astype(np.float32)
 
 
 def _clustered(

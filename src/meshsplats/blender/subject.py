@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
+from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import CAREFUL, MAX_LAYERS, Effort, SceneOptions
+from meshsplats.blender.stand_in import StandIn, field_around, stand_in
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
-from meshsplats.conversion.normals import shading_normals, typical_spacing
+from meshsplats.conversion.normals import shading_normals, surfels_of, typical_spacing
 from meshsplats.conversion.recovery import splats_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -152,12 +155,15 @@ def lit_subject(
     mesh = mesh.plain
     announce("colours")
     cameras = [*cameras, *(views_within(mesh, threads=threads) if within is None else within)]
-    lit, self_shadow = lit_arrays(mesh, cameras, effort=effort, threads=threads, announce=announce)
-    arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
-    if mesh.binding is None:
-        announce("surface")
-        made, facts["light_spacing"] = _stand_in_arrays(mesh, lit, cameras, effort, threads)
-        arrays |= made
+    with ThreadPoolExecutor(1) as pool:  # each of the two leaves processors idle
+        shape = pool.submit(shape_for_light, mesh, cameras, effort, threads)
+        colors = linear_colors(mesh, cameras, steps=effort.steps, views=effort.fit_views, threads=threads)
+        if mesh.binding is None:
+            announce("surface")
+        arrays, facts, surface = shape.result()
+    arrays |= {"colors": colors, "display": mesh.colors}
+    if surface is not None:
+        arrays["surface_colors"] = surface.colors(colors)
     return arrays, facts
 
 
@@ -176,60 +182,39 @@ def views_within(
     return views[0] if views else []
 
 
-def lit_arrays(
-    mesh: SplatMesh,
-    cameras: Sequence[Camera] = (),
-    *,
-    effort: Effort = CAREFUL,
-    threads: int | None = None,
-    announce: Announce = lambda phase: None,
-) -> tuple[dict[str, np.ndarray], float]:
-    """Arrays for a lit material and its self-shadow distance.
+def shape_for_light(
+    mesh: SplatMesh, cameras: Sequence[Camera] = (), effort: Effort = CAREFUL, threads: int | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, float], StandIn | None]:
+    """What of ``lit_subject`` does not depend on colours, and the stand-in, where there is one.
 
-    Returns:
-        ``colors`` (v, 4) in linear light, ``normals`` (v, 3), and ``faces`` (f, 3) wound to face outwards;
-        and the distance, scene units, within which layers must not shade each other.
+    ``normals`` (v, 3), and ``faces`` (f, 3) wound to face outwards; ``self_shadow``: the distance, scene
+    units, within which layers must not shade each other; arrays of the stand-in, and ``light_spacing``: the
+    distance of its points.
     """
-    from meshsplats.blender.linear import linear_colors
-
-    colors = linear_colors(mesh, cameras, steps=effort.steps, views=effort.fit_views, threads=threads)
-    announce("normals")
-    normals = shading_normals(mesh, cameras, views=effort.normal_views, threads=threads)
-    arrays = {"colors": colors, "normals": normals, "faces": _facing_out(mesh, normals)}
-    return arrays, SELF_SHADOW * typical_spacing(mesh)
-
-
-def _stand_in_arrays(
-    mesh: SplatMesh,
-    lit: dict[str, np.ndarray],
-    cameras: Sequence[Camera],
-    effort: Effort,
-    threads: int | None,
-) -> tuple[dict[str, np.ndarray], float]:
-    """The stand-in of ``mesh`` by the names that ``inside.scene.Subject`` has for its arrays, and the
-    distance of its points, scene units; ``lit`` as from ``lit_arrays``. Empty where nothing is solid."""
-    from meshsplats.blender.stand_in import stand_in
-
-    found = stand_in(
-        mesh,
-        lit["normals"],
-        lit["colors"],
-        cameras,
-        resolution=effort.resolution,
-        views=effort.surface_views,
-        threads=threads,
+    surfels, field, side = surfels_of(mesh), None, effort.resolution
+    if mesh.binding is None:
+        field = field_around(mesh, cameras, resolution=side, views=effort.views, threads=threads)
+    sights = None if field is None else field.sights
+    normals = shading_normals(
+        mesh, cameras, views=effort.views, surfels=surfels, sights=sights, threads=threads
     )
-    if found is None:
-        return {}, 0.0
-    return {
-        "surface_vertices": found.vertices,
-        "surface_faces": found.faces,
-        "surface_colors": found.colors,
-        "fine_faces": found.fine,
-        "light_points": found.points,
-        "light_normals": found.normals,
-        "light_point_of": found.point_of,
-    }, found.size
+    arrays = {"normals": normals, "faces": _facing_out(mesh, normals)}
+    facts = {"self_shadow": SELF_SHADOW * typical_spacing(mesh, surfels.centers)}
+    if mesh.binding is not None:
+        return arrays, facts, None
+    surface = None if field is None else stand_in(mesh, normals, field, threads)
+    facts["light_spacing"] = 0.0
+    if surface is not None:
+        facts["light_spacing"] = surface.size
+        arrays |= {
+            "surface_vertices": surface.vertices,
+            "surface_faces": surface.faces,
+            "fine_faces": surface.fine,
+            "light_points": surface.points,
+            "light_normals": surface.normals,
+            "light_point_of": surface.point_of,
+        }
+    return arrays, facts, surface
 
 
 def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:

@@ -9,24 +9,28 @@ upper one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats._core.cells import sums_around
 from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds
 from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import render
+from meshsplats.rendering import Rendering, render
 
 CELL = 2.5
 """Side of the cells in which neighbours are sought, in spacings: measured on splats of a known surface,
 clean and noisy, where 2 to 3 give the least error (see docs/blender.md)."""
 VIEWS = 24
+GIVEN = 16
+"""Views around a scene by which is decided what is outside, and the most of given cameras."""
 _SIDE = 160
-"""Side in pixels of the images that decide visibility."""
+"""Side in pixels of their images."""
 _BOTH = 0.15
 """A splat is part of a sheet if its side that is seen less is seen this often, against the other one. Cameras
 below the scene then do not count: they see a street as a whole, those above it between houses only."""
@@ -35,26 +39,44 @@ _SOLID = 0.3
 _CHUNK = 1 << 16
 
 
+class Surfels(NamedTuple):
+    """The splats of a mesh as pieces of a surface, n of them; each triangle is one without ``face_splat``."""
+
+    centers: np.ndarray
+    """(n, 3) float64"""
+    weights: np.ndarray
+    """(n,) float64 area times opacity, relative to the largest."""
+    spread: np.ndarray
+    """(n, 6) float64 sums of weight times normal times normal over their triangles: the components ``_PAIRS``
+    of symmetric matrices."""
+
+
 def shading_normals(
-    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, views: int = VIEWS, threads: int | None = None
+    mesh: SplatMesh,
+    cameras: Sequence[Camera] = (),
+    *,
+    views: int = VIEWS,
+    surfels: Surfels | None = None,
+    sights: Iterable[Sight] | None = None,
+    threads: int | None = None,
 ) -> np.ndarray:
     """(v, 3) float32 unit normals of the surface that the splats of ``mesh`` form, pointing outwards.
 
     All vertices of a splat share one. A mesh with normals keeps them. Without ``face_splat``, each triangle
     counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` see the scene, besides
-    ``views`` around it: a room is visible from inside only.
+    ``views`` around it: a room is visible from inside only. ``surfels``: those of the mesh, and ``sights``:
+    what is seen of it, where they are known.
     """
     if mesh.normals is not None:
         return mesh.normals
     if len(mesh.faces) == 0:
         return np.zeros_like(mesh.vertices)
-    centers, weights, spread = _splats(mesh)
+    centers, weights, spread = surfels_of(mesh) if surfels is None else surfels
     cell = CELL * typical_spacing(mesh, centers)
-    around = _Neighbours(centers, cell)
-    tensors = np.stack([spread[:, i, j] for i, j in _PAIRS], axis=1)
+    around = _Neighbours(centers, cell, threads)
     normals = np.empty((len(centers), 3))
     moments = np.column_stack(
-        [weights, weights[:, None] * centers, weights[:, None] * _products(centers), tensors]
+        [weights, weights[:, None] * centers, weights[:, None] * _products(centers), spread]
     )
     for part, total in around.sums(moments, 1.0):
         weight = np.maximum(total[:, :1], 1e-300)
@@ -65,7 +87,9 @@ def shading_normals(
         # Both have trace 1: along the normal the discs' tensor is large, the scatter of the centres small.
         both = discs - np.divide(scatter, size, out=np.zeros_like(scatter), where=size > 0)
         normals[part] = np.linalg.eigh(both)[1][:, :, 2]
-    side = _seen_side(mesh, centers, normals, cell, cameras, views, threads)
+    if sights is None:
+        sights = _sights(mesh, views, cameras, threads)
+    side = _seen_side(mesh, centers, normals, cell, sights)
     normals *= np.where(side < 0, -1.0, 1.0)[:, None]
     # Splats that no camera sees have no weight here and take the side of their neighbours.
     trust = np.where(side == 0, 1e-3, 1.0) * weights
@@ -77,10 +101,8 @@ def shading_normals(
     return _to_vertices(mesh, mesh.splats.of_face, unit(smooth, normals))
 
 
-def typical_spacing(mesh: SplatMesh, centers: np.ndarray | None = None) -> float:
-    """Median spacing of the splats of ``mesh``, scene units, > 0."""
-    if centers is None:
-        centers = _splats(mesh)[0]
+def typical_spacing(mesh: SplatMesh, centers: np.ndarray) -> float:
+    """Median spacing of the splats of ``mesh`` with these ``centers`` (n, 3), scene units, > 0."""
     median = float(np.median(spacing(centers.astype(np.float32)))) if len(centers) else 0.0
     return median if median > 0 else max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-6) / 100
 
@@ -107,67 +129,88 @@ def unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
     return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), instead)
 
 
-def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the n splats: centres (n, 3), weights (n,), area times opacity, and (n, 3, 3) sums of weight times
-    normal times normal over their triangles."""
+def surfels_of(mesh: SplatMesh) -> Surfels:
+    """Those of a ``mesh`` with triangles."""
     splats = mesh.splats
-    weights = np.empty(len(splats))
-    centers = np.empty((len(splats), 3))
-    spread = np.empty((len(splats), 3, 3))
-    for begin in range(0, len(splats), _CHUNK):
+    count = len(splats)
+    weights, centers, spread = np.empty(count), np.empty((count, 3)), np.empty((count, 6))
+    columns = mesh.vertices.T.astype(np.float64)  # gathered and summed far faster than rows
+    for begin in range(0, count, _CHUNK):
         some = slice(begin, begin + _CHUNK)
         part = splats.part(some)
-        corners = mesh.vertices[part.faces].astype(np.float64)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        double = np.linalg.norm(cross, axis=1)
+        a, b, c = columns[:, part.faces.T].transpose(1, 0, 2)
+        cross = np.cross(b - a, c - a, axis=0)
+        double = np.linalg.norm(cross, axis=0)
         weight = 0.5 * double * mesh.colors[part.faces, 3].mean(axis=1) + 1e-300  # nothing divides by zero
-        normal = cross / np.maximum(double, 1e-300)[:, None]
+        normal = cross / np.maximum(double, 1e-300)
         weights[some] = part.sums(weight)
-        centroids = part.sums(weight[:, None] * corners.mean(axis=1))
-        centers[some] = centroids / weights[some, None]
-        products = normal[:, :, None] * normal[:, None, :]
-        spread[some] = part.sums(weight[:, None, None] * products)
-    return centers, weights / weights.max(), spread / weights.max()
+        for axis, middle in enumerate((a + b + c) / 3):
+            centers[some, axis] = part.sums(weight * middle) / weights[some]
+        for k, (i, j) in enumerate(_PAIRS):
+            spread[some, k] = part.sums(weight * normal[i] * normal[j])
+    return Surfels(centers, weights / weights.max(), spread / weights.max())
 
 
 class _Neighbours:
     """Points (n, 3) sorted into cubic cells; sums over the 27 cells around each of them."""
 
-    def __init__(self, points: np.ndarray, side: float) -> None:
-        self.points, self.side = points, side
+    def __init__(self, points: np.ndarray, side: float, threads: int | None = None) -> None:
+        self._points, self._side, self._threads = points, side, threads
         low = points.min(axis=0)
         # Distant strays must not overflow the cell indices.
-        steps = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64) + 1
-        self.keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
-        self.cells, self.cell_of = np.unique(self.keys, return_inverse=True)
-        self.cell_of = self.cell_of.reshape(-1)
+        x, y, z = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64).T + 1
+        keys, cell_of = np.unique((x << 42) | (y << 21) | z, return_inverse=True)
+        self._cell_of = cell_of.reshape(-1).astype(np.int32)
+        self._count = len(keys)
+        span = (-1, 0, 1)
+        steps = [(x << 42) + (y << 21) + z for x in span for y in span for z in span]
+        self._beside = np.empty((len(keys), len(steps)), np.int32)
+        for k, step in enumerate(steps):
+            found = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
+            self._beside[:, k] = np.where(keys[found] == keys + step, found, -1)
+        sizes = np.bincount(self._cell_of, minlength=len(keys))
+        self._middles = self._cell_sums(points) / sizes[:, None]
+
+    def _cell_sums(self, values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(self._cell_of, column, self._count) for column in values.T], axis=1)
 
     def sums(self, values: np.ndarray, width: float) -> Iterator[tuple[slice, np.ndarray]]:
         """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the
         distance to each cell's centre with standard deviation ``width`` cells."""
-        count = len(self.cells)
-        totals = [np.bincount(self.cell_of, values[:, k], count) for k in range(values.shape[1])]
-        cell_values = np.stack(totals, axis=1)
-        sizes = np.bincount(self.cell_of, minlength=count)
-        middles = [np.bincount(self.cell_of, self.points[:, k], count) / sizes for k in range(3)]
-        middle = np.stack(middles, axis=1)
-        steps = [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
-        for begin in range(0, len(self.points), _CHUNK):
+        totals = np.ascontiguousarray(self._cell_sums(values))
+        for begin in range(0, len(self._points), _CHUNK):
             part = slice(begin, begin + _CHUNK)
-            points, keys = self.points[part], self.keys[part]
-            total = np.zeros((len(points), values.shape[1]))
-            for step in steps:
-                found = np.minimum(np.searchsorted(self.cells, keys + step), count - 1)
-                there = self.cells[found] == keys + step
-                near, row = found[there], np.flatnonzero(there)
-                square = np.square(middle[near] - points[row]).sum(axis=1)
-                share = np.exp(-square / (2 * (width * self.side) ** 2))
-                total[row] += share[:, None] * cell_values[near]
-            yield part, total
+            yield (
+                part,
+                sums_around(
+                    self._points[part],
+                    self._cell_of[part],
+                    self._beside,
+                    self._middles,
+                    totals,
+                    deviation=width * self._side,
+                    threads=self._threads,
+                ),
+            )
+
+
+class Sight(NamedTuple):
+    """What a camera sees of a mesh."""
+
+    camera: Camera
+    depth: np.ndarray
+    """(h, w) float32, infinite where nothing is solid."""
+    is_around: bool
+    """Whether it is one of the cameras around the scene, which may look at it from below."""
+
+
+def sight_of(camera: Camera, image: Rendering, is_around: bool) -> Sight:
+    """By an ``image`` with depth."""
+    return Sight(camera, image.mean_depth(min_alpha=_SOLID), is_around)
 
 
 def views_around(
-    mesh: SplatMesh, count: int, side: int, cameras: Sequence[Camera] = (), most: int = 1
+    mesh: SplatMesh, count: int, side: int, cameras: Sequence[Camera] = (), most: int = GIVEN
 ) -> list[Camera]:
     """``count`` square cameras all around ``mesh``, and ``most`` of ``cameras`` at most, evenly chosen; their
     images have at most ``side`` pixels a side."""
@@ -175,28 +218,26 @@ def views_around(
     return views + [camera.within(side) for camera in subsample(cameras or (), most)]
 
 
+def _sights(mesh: SplatMesh, views: int, cameras: Sequence[Camera], threads: int | None) -> Iterator[Sight]:
+    for i, camera in enumerate(views_around(mesh, views, _SIDE, cameras)):
+        yield sight_of(camera, render(mesh, camera, depth=True, threads=threads), i < views)
+
+
 def _seen_side(
-    mesh: SplatMesh,
-    centers: np.ndarray,
-    normals: np.ndarray,
-    tolerance: float,
-    cameras: Sequence[Camera],
-    views: int,
-    threads: int | None,
+    mesh: SplatMesh, centers: np.ndarray, normals: np.ndarray, tolerance: float, sights: Iterable[Sight]
 ) -> np.ndarray:
     """(n,) positive where the cameras that see a centre are on the side of its normal, negative on the other
     one; 0 where none sees it."""
     front, back, upper = np.zeros((3, len(centers)))
     up, middle = guess_up(mesh), scene_bounds(mesh).center
-    for i, camera in enumerate(views_around(mesh, views, _SIDE, cameras, 16)):
-        surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
+    for camera, depth, is_around in sights:
         shown, column, row, z = camera.pixels_of(centers)
-        visible = shown[z < surface[row, column] + tolerance]
+        visible = shown[z < depth[row, column] + tolerance]
         away = camera.center - centers[visible]
         side = np.einsum("ij,ij->i", normals[visible], away) / np.linalg.norm(away, axis=1)
         front[visible] += np.maximum(side, 0)
         back[visible] += np.maximum(-side, 0)
-        if i >= views or (camera.center - middle) @ up > 0:
+        if not is_around or (camera.center - middle) @ up > 0:
             upper[visible] += side
     sheet = (np.minimum(front, back) > _BOTH * np.maximum(front, back)) & (upper != 0)
     return np.where(sheet, upper, front - back)

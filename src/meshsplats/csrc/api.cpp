@@ -13,6 +13,7 @@
 #include "hidden_new.h"
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
+#include "cells.h"
 #include "fusion.h"
 #include "listing.h"
 #include "merging.h"
@@ -404,6 +405,14 @@ MS_EXPORT int ms_fill_depths(const MsFilling *filling, char *message, int messag
 
 MS_EXPORT int ms_count_views(const MsCarving *carving, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::count_views(*carving); });
+}
+
+MS_EXPORT int ms_find_feet(const MsFeet *feet, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::find_feet(*feet); });
+}
+
+MS_EXPORT int ms_sum_cells(const MsCellSums *sums, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::sum_cells(*sums); });
 }
 
 MS_EXPORT int ms_resample(const MsResampling *resampling, char *message, int message_size) {

@@ -9,6 +9,7 @@
 #include "edges.h"
 #include "fans.h"
 #ifndef MS_WIDE_ONLY
+#include "cells.h"
 #include "fusion.h"
 #include "listing.h"
 #include "merging.h"
@@ -126,6 +127,10 @@ constexpr MsField FIELDS[] = {
     MS_STRUCT(MsCarving, views, inverse, points, agree, past, count, tolerance, past_tolerance),
     MS_STRUCT(MsFusion, points, normals, pixels, colors, sure, patches, count, wanted, threads, largest,
               found),
+    MS_STRUCT(MsFeet, places, normals, ids, vertices, vertex_normals, index, found, count, size, low, side,
+              facing_away, reach, threads),
+    MS_STRUCT(MsCellSums, points, cell, beside, middle, values, total, count, around, channels, falloff,
+              threads),
     MS_STRUCT(MsResampling, points, bytes, values, result, count, height, width, channels, wraps, threads),
 #endif
 };

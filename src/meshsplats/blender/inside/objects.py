@@ -202,11 +202,12 @@ def take_light(obj: Any, prepared: dict[str, Any]) -> None:
 
 
 def views_within(obj: Any) -> list[Camera] | None:
-    """The views of the place ``obj`` from within that its import has found, for ``prepare``, in the frame of
-    ``as_splat_mesh``; None where they are to be looked for."""
+    """The views of ``obj`` from within that its import has found, for ``prepare``, in the frame of
+    ``as_splat_mesh``; none of what is seen from around. None where they are to be looked for."""
     origin = np.array(obj.data.get(ORIGIN, (0, 0, 0)), np.float64)
     # All levels of a chain stand where the finest does, which has them.
-    return views.within(obj, origin) or views.within(levels.with_levels(obj)[0], origin)
+    own = views.within(obj, origin)
+    return views.within(levels.with_levels(obj)[0], origin) if own is None else own
 
 
 def needs_light(obj: Any, *, fast: bool = False) -> bool:

@@ -13,7 +13,7 @@ from meshsplats.cameras.framing import scene_bounds
 
 VIEWS = "MeshSplats view"
 """Name of an object's property: views of a place from within, the first one to open with, as ``remember``
-stores them."""
+stores them; none of what is seen from around."""
 _NUMBERS = 18
 """Stored numbers of a view: its pose, the tangent of half its angle, its near plane."""
 _SIDE = 400
@@ -40,12 +40,16 @@ class View(NamedTuple):
 
 
 def remember(obj: Any, views: Sequence[Camera]) -> None:
-    """Stores with the place ``obj`` ``views`` of it from within, relative to the object's origin."""
+    """Stores with ``obj`` ``views`` of it from within, relative to the object's origin; none of what is seen
+    from around, in which they need not be looked for again."""
     numbers: list[float] = []
     for view in views:
         half = max(view.width / view.fx, view.height / view.fy) / 2
         numbers += [*frame.camera_pose(view, np.eye(3)).ravel().tolist(), half, view.near or 0.0]
-    bounds = scene_bounds(meshes.local_points(obj))
+    points = meshes.local_points(obj)
+    if not len(points):  # too faint or small to be seen
+        return
+    bounds = scene_bounds(points)
     obj[VIEWS] = [*numbers, *bounds.center.tolist(), float(bounds.radius)]
 
 
@@ -53,7 +57,8 @@ def opening(objs: Sequence[Any]) -> View | None:
     """The first view that is stored with one of ``objs``, where that stands now; None of objects, which are
     seen from around."""
     for obj in objs:
-        for numbers in _stored(obj):
+        stored = _stored(obj)
+        for numbers in () if stored is None else stored:
             pose = np.array(obj.matrix_world) @ numbers[:16].reshape(4, 4)
             scale = np.linalg.norm(pose[:3, :3], axis=0)
             if scale.all():
@@ -65,34 +70,34 @@ def opening(objs: Sequence[Any]) -> View | None:
 
 
 def within(obj: Any, origin: np.ndarray) -> list[Camera] | None:
-    """The views that are stored with the place ``obj``, in a frame in which the object's origin lies at
-    ``origin`` (3,); None where none are, or only the one to open with: then more are to be looked for."""
+    """The views that are stored with ``obj``, in a frame in which the object's origin lies at ``origin``
+    (3,); none of what is seen from around. None where it is not known, or only the one to open with: then
+    they are to be looked for."""
     stored = _stored(obj)
-    if len(stored) < 2:
+    if stored is None or len(stored) == 1:
         return None
     cameras = [_camera(n[:16].reshape(4, 4), n[16], n[17], _SIDE, _SIDE) for n in stored]
     return [camera.relative_to(-origin) for camera in cameras]
 
 
-def _stored(obj: Any) -> np.ndarray:
-    """(n, ``_NUMBERS``) views of ``obj``; none if there are none, if the property is of someone else, or if
-    the mesh was cropped, joined with others or scaled since."""
-    none = np.zeros((0, _NUMBERS))
+def _stored(obj: Any) -> np.ndarray | None:
+    """(n, ``_NUMBERS``) views of ``obj``; None if nothing is stored, if the property is of someone else, or
+    if the mesh was cropped, joined with others or scaled since."""
     try:
         numbers = np.array(obj.get(VIEWS, ()), np.float64).ravel()
     except (TypeError, ValueError):  # a file may hold anything by this name
-        return none
+        return None
     whole = len(numbers) // _NUMBERS * _NUMBERS
     views, bounds = numbers[:whole].reshape(-1, _NUMBERS), numbers[whole:]
-    if not whole or not np.isfinite(numbers).all() or not (views[:, 16] > 0).all():
-        return none
+    if not len(numbers) or not np.isfinite(numbers).all() or not (views[:, 16] > 0).all():
+        return None
     if len(bounds) == 4:
         points = meshes.local_points(obj)
         now = scene_bounds(points) if len(points) else None
         moved = np.inf if now is None else np.linalg.norm(now.center - bounds[:3])
         if now is None or max(moved, abs(now.radius - bounds[3])) > _CHANGE * bounds[3]:
-            return none
-    return views if len(bounds) in (0, 4) else none
+            return None
+    return views if len(bounds) in (0, 4) else None
 
 
 def _camera(pose: np.ndarray, half: float, near: float, width: int, height: int) -> Camera:

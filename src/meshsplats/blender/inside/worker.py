@@ -73,6 +73,8 @@ def main(job_path: str) -> None:
 
     if bpy.app.version < versions.OLDEST:
         raise ValueError(f"Blender 4.2 or newer is needed, this is {bpy.app.version_string}")
+    while not os.path.exists(job_path):  # it is prepared meanwhile
+        time.sleep(0.02)
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     subject, *coarser = (
         Subject(**{name: np.load(file, allow_pickle=False) for name, file in arrays.items()}, **facts)
