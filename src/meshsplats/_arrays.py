@@ -24,6 +24,18 @@ def subsample(items: Sequence[T] | np.ndarray, most: int) -> Sequence[T] | np.nd
     return items[:: max(1, -(-len(items) // most))]
 
 
+def block_means(values: np.ndarray, side: int) -> np.ndarray:
+    """(h, w, ...) float32: means of blocks of ``side`` x ``side`` of ``values``, without what is left over at
+    the ends of their first two axes. Several times as fast as ``mean`` over two axes."""
+    height, width = (n // side * side for n in values.shape[:2])
+    total = np.zeros((height // side, width // side, *values.shape[2:]), np.float32)
+    for y in range(side):
+        for x in range(side):
+            total += values[y:height:side, x:width:side]
+    total /= side * side
+    return total
+
+
 def spread_indices(count: int, most: int) -> list[int]:
     """At most ``most`` indices below ``count``, ascending, evenly spread from the first to the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

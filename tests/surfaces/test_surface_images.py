@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshsplats import BaseMesh, Camera, SplatMesh, orbit, psnr, render
+from meshsplats._arrays import block_means
 from meshsplats.base_mesh import Texture
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.surfaces import draw_surface
@@ -177,12 +178,21 @@ def test_cells_do_not_overlap(count, more):
         assert apart.any(axis=1).all()
 
 
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 3), st.sampled_from(["u1", "f2", "f4", "bool"]))
+def test_means_of_blocks_are_means(rows, columns, side, kind):
+    values = (255 * np.random.default_rng(0).random((rows, columns, 2))).astype(kind)
+    found = block_means(values, side)
+    assert found.shape == (rows // side, columns // side, 2)
+    for y, x in np.ndindex(found.shape[:2]):
+        block = values[y * side : (y + 1) * side, x * side : (x + 1) * side].astype(np.float64)
+        np.testing.assert_allclose(found[y, x], block.mean(axis=(0, 1)), rtol=1e-6)
+
+
 @needs_atlas
-@pytest.mark.parametrize("fast", [False, True])
-def test_charts_of_an_atlas_do_not_overlap(fast):
+def test_charts_of_an_atlas_do_not_overlap():
     points, faces = unit_ball(3)
     side = 256
-    uv = unwrap(points, faces, side, fast=fast).astype(np.float64) * side
+    uv = unwrap(points, faces, side).astype(np.float64) * side
     assert uv.min() >= 0
     assert uv.max() <= side
     y, x = np.mgrid[:side, :side] + 0.5

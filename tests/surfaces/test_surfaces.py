@@ -469,7 +469,7 @@ def test_every_part_of_the_work_has_a_name(tmp_path):
 def test_an_atlas_that_fails_has_fewer_triangles_unless_their_number_is_named(monkeypatch):
     counts = []
 
-    def unwrap(vertices, faces, side, fast):
+    def unwrap(vertices, faces, side):
         counts.append(len(faces))
         if len(faces) > 300:
             raise ValueError("too many")

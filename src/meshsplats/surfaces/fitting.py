@@ -135,8 +135,10 @@ def fit(
         )
         sums = image.texel_sums(error, weight)
         part = RELAXATION[0] + (RELAXATION[1] - RELAXATION[0]) * number / total
-        change = sums[..., :3] * (part / (sums[..., 3:] + DOUBT))
-        surface = surface._replace(vertices=vertices, texels=np.clip(surface.texels - change, 0, 1))
+        texels = sums[..., :3]
+        texels *= np.float32(-part) / (sums[..., 3:] + np.float32(DOUBT))
+        texels += surface.texels
+        surface = surface._replace(vertices=vertices, texels=np.clip(texels, 0, 1))
         if progress is not None:
             progress()
     return surface._replace(across=None)

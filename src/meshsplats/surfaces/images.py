@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import block_means
 from meshsplats._core.surfaces import Samples, coordinate_gradients, texel_sums, texture_samples
 from meshsplats._kinds import need
 from meshsplats.base_mesh import BaseMesh
@@ -86,7 +87,7 @@ class SurfaceImage:
         if empty.ndim == 3:
             empty = empty.repeat(SAMPLES, axis=0).repeat(SAMPLES, axis=1)
         self._colors = texture_samples(self._samples, surface.texels, empty, threads=threads)
-        self.color, self.coverage = _pixels(self._colors), _pixels(covered.astype(np.float32))
+        self.color, self.coverage = block_means(self._colors, SAMPLES), block_means(covered, SAMPLES)
 
     def vertex_gradients(self, gradient: np.ndarray) -> np.ndarray:
         """(v, 3) float64 gradient of a loss with respect to the vertices, of which ``gradient`` (h, w, 3)
@@ -157,9 +158,3 @@ def draw_surface(
         behind = np.asarray(background, np.float32)
         return SurfaceImage(surface, camera, behind, gradients=False, threads=threads).color
     return render(plain_mesh(base), camera, background=background, samples=SAMPLES, threads=threads).color
-
-
-def _pixels(samples: np.ndarray) -> np.ndarray:
-    """The means over the samples of each pixel."""
-    rows, columns = samples.shape[0] // SAMPLES, samples.shape[1] // SAMPLES
-    return samples.reshape(rows, SAMPLES, columns, SAMPLES, *samples.shape[2:]).mean(axis=(1, 3))

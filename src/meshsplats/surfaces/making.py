@@ -139,7 +139,7 @@ def surfaces_from(
         seen = replace(sources, views=views)
         least = 0 if chosen.faces is None else len(faces)
         said("texture coordinates", 0, 1)
-        blank = _blank(vertices, faces, grid, level.texture, least=least, fast=not sources.closed)
+        blank = _blank(vertices, faces, grid, level.texture, least=least)
         base, fitted = _surface_of(scene, blank, seen, level, threads, said)
         vertices, faces, uv = blank.vertices, blank.faces, blank.uv
         if level.texture and relief is not None:
@@ -150,15 +150,13 @@ def surfaces_from(
     return result
 
 
-def _blank(
-    vertices: np.ndarray, faces: np.ndarray, grid: Grid, side: int, *, least: int = 0, fast: bool = False
-) -> Surface:
+def _blank(vertices: np.ndarray, faces: np.ndarray, grid: Grid, side: int, *, least: int = 0) -> Surface:
     """The surface of these triangles with a texture without colours. Its charts are as large as on the
     ``grid``: what is far from all cameras of a place needs few texels. Where they do not fit, or the library
-    fails, it has fewer triangles, but not fewer than ``least``. ``fast``: as for ``unwrap``."""
+    fails, it has fewer triangles, but not fewer than ``least``."""
     while True:
         try:
-            uv, texels = _blank_texture(grid.contracted(vertices), faces, side, fast)
+            uv, texels = _blank_texture(grid.contracted(vertices), faces, side)
             return Surface(vertices, faces, uv, texels)
         except ValueError:
             fewer = int(_FEWER * len(faces))
@@ -199,12 +197,10 @@ def _surface_of(
     return textured, fitted
 
 
-def _blank_texture(
-    vertices: np.ndarray, faces: np.ndarray, side: int, fast: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def _blank_texture(vertices: np.ndarray, faces: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates, and texels without colours; for a ``side`` of 0 those of triangles one by one."""
     if side:
-        return unwrap(vertices, faces, side, fast=fast), np.zeros((side, side, 3), np.float32)
+        return unwrap(vertices, faces, side), np.zeros((side, side, 3), np.float32)
     side = cells_side(len(faces))
     return cells(len(faces), side), np.zeros((side, side, 3), np.float32)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import block_means
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.placing import has_surroundings
@@ -145,18 +146,14 @@ def smaller(view: View, factor: int) -> View:
     camera, image = view.camera, view.load()
     height, width = camera.height // factor, camera.width // factor
 
-    def blocks(values: np.ndarray) -> np.ndarray:
-        kept = values[: height * factor, : width * factor]
-        return kept.reshape(height, factor, width, factor, *values.shape[2:])
-
     def means(values: np.ndarray) -> np.ndarray:
-        mean = blocks(values).mean(axis=(1, 3), dtype=np.float32)
+        mean = block_means(values, factor)
         return np.rint(mean).astype(np.uint8) if values.dtype == np.uint8 else mean.astype(values.dtype)
 
     small = ViewImage(
         means(image.color),
         None if image.alpha is None else means(image.alpha),
-        None if image.mask is None else np.asarray(blocks(image.mask).all(axis=(1, 3))),
+        None if image.mask is None else block_means(image.mask, factor) == 1,
     )
     lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
     return replace(view, camera=replace(camera, width=width, height=height, **lens), source=small)
