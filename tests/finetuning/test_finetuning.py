@@ -29,6 +29,8 @@ from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
     TRAINING_MIN_TRANSMITTANCE,
+    dropout_factors,
+    dropout_share,
     for_views,
     kept_faces,
     make_step,
@@ -359,6 +361,49 @@ def test_a_step_changes_only_what_its_view_shows(scene):
     assert near.camera.sees(mesh.vertices[moved]).mean() > 0.8
     far = np.full((1, 3), 1e3, np.float32)
     assert not near.camera.sees(far).any()
+
+
+def test_dropout_leaves_splats_out_and_thickens_the_others(scene, monkeypatch):
+    """A step is that of the mesh without them: image, loss and gradients."""
+    _, dataset, mesh = scene
+    view, found = dataset.train[0], []
+    monkeypatch.setattr(State, "step", lambda state, gradients, *rest, **more: found.append(gradients))
+
+    def step(mesh, dropout):
+        state = State.begin(mesh, 1, make_config(dropout=dropout), None)
+        return make_step(state, [view], 40, 0.5, Blended(state.config)), state
+
+    loss, state = step(mesh, 0.4)
+    factors = dropout_factors(state, 0.4, 40)
+    faint = mesh.colors[:, 3] < 0.6
+    assert set(factors[faint]) == {0, np.float32(1 / np.float32(0.6))}
+    assert np.abs((factors == 0).mean() - 0.4) < 0.1
+    kept = replace(mesh, colors=mesh.colors * np.column_stack([np.ones((len(factors), 3), "f4"), factors]))
+    assert kept.colors[~faint & (factors > 0), 3] == pytest.approx(1)
+    assert loss == step(kept, 0.0)[0]
+    dropped, alone = found
+    assert not dropped.vertices[factors == 0].any()
+    np.testing.assert_array_equal(dropped.vertices, alone.vertices)
+    np.testing.assert_array_equal(dropped.colors[:, :3], alone.colors[:, :3])
+    np.testing.assert_array_equal(dropped.colors[:, 3], alone.colors[:, 3] * factors)
+    assert step(mesh, 0.0)[0] != loss
+
+
+def test_dropout_grows_with_the_passes():
+    config = make_config(dropout=0.2)
+    shares = [dropout_share(config, passes) for passes in (0, 10, 25, 40, 100)]
+    assert shares == pytest.approx([0, 0, 0.1, 0.2, 0.2])
+
+
+def test_dropout_is_for_few_photographs(scene):
+    _, dataset, _ = scene
+    photos = [replace(view, source=ViewImage(view.load().color)) for view in dataset.train]
+    for count, share in ((2, 0.15), (30, 0.15), (45, 0.075), (60, 0), (100, 0)):
+        views = [photos[i % len(photos)] for i in range(count)]
+        assert for_views(make_config(dropout=None), views).dropout == pytest.approx(share)
+        assert for_views(make_config(dropout=0.3), views).dropout == 0.3
+    assert for_views(make_config(dropout=None), dataset.train).dropout == 0
+    assert for_views(make_config(), photos[:2]).dropout == 0
 
 
 def test_positions_move_by_the_size_of_their_splats(scene):

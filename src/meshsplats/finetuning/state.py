@@ -324,9 +324,12 @@ class State:
         }
         return {need for need, there in of_state.items() if there}
 
-    def tape(self, camera: Camera, options: TapeOptions) -> Taped:
-        """The mesh as it is now from ``camera``, with a backward pass."""
-        return self._session.tape(self.triangles, camera, options)
+    def tape(self, camera: Camera, options: TapeOptions, factors: np.ndarray | None = None) -> Taped:
+        """The mesh as it is now from ``camera``, its opacities times ``factors`` (v,), with a backward pass."""
+        colors = self.colors if factors is None else self.colors.copy()
+        if factors is not None:
+            colors[:, 3] *= factors
+        return self._session.tape(self.triangles._replace(colors=colors), camera, options)
 
     def whole_steps(self, camera: Camera, needs: Collection[Need]) -> WholeSteps | None:
         """What takes whole steps with images of this camera, in ``whole_step``; None: only ``step`` does."""

@@ -52,6 +52,16 @@ PHOTOGRAPHS_HARMONICS_RATE = 0.005
 0.02 35.40."""
 
 
+DROPOUT_PASSES = 10, 40
+"""How often each view was seen when dropout begins, and when it is whole."""
+DROPOUT = 0.15
+"""``dropout`` for photographs that are ``FEW``. Saharov, 28 photographs, 1,100 steps: 20.69 dB, without
+20.33."""
+FEW = 30, 60
+"""Numbers of photographs up to which it is whole, and from which on it is 0. Lego, 100 photographs, 2,500
+steps at half the size: 34.00 dB, without 34.27."""
+
+
 class Plan(NamedTuple):
     """How a step draws its view, and what follows from the gradient."""
 
@@ -70,6 +80,8 @@ class Plan(NamedTuple):
     """Least opacity at which edges are visible and move positions; None: their motion does not count."""
     listing: DrawOrder | None = None
     """Order of a file in which triangles are blended; None: that of the mesh."""
+    dropout: float = 0.0
+    """Share of the splats that are left out."""
 
 
 class Schedule(Protocol):
@@ -83,6 +95,21 @@ def view_of_step(config: FinetuneConfig, step: int, views: int) -> int:
     """Index of the training view of step ``step``, of ``views``: a new permutation in each epoch."""
     epoch, position = divmod(step, views)
     return int(np.random.default_rng([config.seed, epoch, 0]).permutation(views)[position])
+
+
+def dropout_share(config: FinetuneConfig, passes: float) -> float:
+    """Share of the splats that a step leaves out, where each view was seen ``passes`` times."""
+    first, whole = DROPOUT_PASSES
+    return (config.dropout or 0.0) * min(max((passes - first) / (whole - first), 0.0), 1.0)
+
+
+def dropout_factors(state: State, share: float, step: int) -> np.ndarray:
+    """(v,) float32: 0 for the vertices of splats that step ``step`` leaves out, a ``share`` of all; by what
+    the opacities of the others grow, at most to 1."""
+    splats = state.mesh.splats
+    kept = np.random.default_rng([state.config.seed, step, 2]).random(len(splats)) >= share
+    factors = kept.astype(np.float32)[np.maximum(splats.of_vertex, 0)] / np.float32(1 - share)
+    return np.minimum(factors, 1 / np.maximum(state.colors[:, 3], np.float32(1e-6)))
 
 
 def uses_point_targets(view: View, config: FinetuneConfig, fraction: float) -> bool:
@@ -153,7 +180,7 @@ def samples_of(view: View, config: FinetuneConfig, fraction: float = 1.0) -> int
 
 def for_views(config: Config, views: Sequence[View]) -> Config:
     """``config`` with the numbers that it leaves to the kind of ``views``: ``one_sample_share``,
-    ``by_splat_share`` and ``harmonics_rate``."""
+    ``by_splat_share``, ``harmonics_rate`` and ``dropout``."""
     rendered = are_rendered(views)
     one_sample, by_splat, harmonics = config.one_sample_share, config.by_splat_share, config.harmonics_rate
     if one_sample is None:
@@ -162,7 +189,17 @@ def for_views(config: Config, views: Sequence[View]) -> Config:
         by_splat = 0.0 if rendered else BY_SPLAT_SHARE
     if harmonics is None:
         harmonics = HARMONICS_RATE if rendered else PHOTOGRAPHS_HARMONICS_RATE
-    return replace(config, one_sample_share=one_sample, by_splat_share=by_splat, harmonics_rate=harmonics)
+    dropout = config.dropout
+    if dropout is None:
+        share = (FEW[1] - len(views)) / (FEW[1] - FEW[0])
+        dropout = 0.0 if rendered else DROPOUT * min(max(share, 0.0), 1.0)
+    return replace(
+        config,
+        one_sample_share=one_sample,
+        by_splat_share=by_splat,
+        harmonics_rate=harmonics,
+        dropout=dropout,
+    )
 
 
 def tape_options(state: State, background: Sequence[float], plan: Plan) -> TapeOptions:
@@ -214,7 +251,9 @@ def make_step(
         return None
     loss = loss or DefaultLoss.of(config, state.threads)
     default = loss if isinstance(loss, DefaultLoss) else None
-    needs: tuple[Need, ...] = ("loss",) if default is None else ()
+    plan = plan._replace(dropout=dropout_share(config, step / len(views)))
+    needs: list[Need] = ["loss"] if default is None else []
+    needs += ["dropout"] if plan.dropout else []
     steps = state.whole_steps(view.camera, needs)
     if steps is not None and default is not None:
         return _whole_step(state, steps, view, step, plan, target, default)
@@ -229,7 +268,8 @@ def view_gradients(
     """Loss and gradients of the training view ``numbered``. DivergenceError if they are not finite."""
     config, (index, view) = state.config, numbered
     options = tape_options(state, target.background, plan)
-    taped, linear = state.tape(view.camera, options), state.mesh.blending == "linear"
+    factors = dropout_factors(state, plan.dropout, step) if plan.dropout else None
+    taped, linear = state.tape(view.camera, options, factors), state.mesh.blending == "linear"
     rendered = RenderedView(taped, linear, state.harmonics)
     image = rendered.color
     if state.exposures is not None:
@@ -264,6 +304,8 @@ def view_gradients(
         expected = expected_error(target.color, target.mask, config, share)
         grad_image = grad_image * np.float32(1 - share)
     gradients = rendered.backward(grad_image, expected)._replace(exposure=grad_exposure)
+    if factors is not None:
+        gradients.colors[:, 3] *= factors
     if edges is not None:
         np.add(gradients.vertices, edges, out=gradients.vertices)
     if not gradients.finite():

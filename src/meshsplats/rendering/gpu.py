@@ -43,6 +43,7 @@ RUN_BY_RUN: frozenset[Need] = frozenset(
         "frozen",
         "depth groups",
         "loss",
+        "dropout",
     )
 )
 """What whole steps do not know. Such runs take the rest of each step themselves, with images and gradients

@@ -39,6 +39,7 @@ class TrainConfig(FinetuneConfig):
     order: Literal["mesh", "fragment", "splat"] = "mesh"
     exposure: bool | None = None
     opacity_decay: float = 0.003
+    dropout: float | None = None
     epsilon: float = 1e-8
     """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a
     pixel that has an error: what views hardly reach, at their borders, does not take whole steps."""
