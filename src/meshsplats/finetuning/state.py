@@ -325,7 +325,7 @@ class State:
         return {need for need, there in of_state.items() if there}
 
     def tape(self, camera: Camera, options: TapeOptions, factors: np.ndarray | None = None) -> Taped:
-        """The mesh as it is now from ``camera``, its opacities times ``factors`` (v,), with a backward pass."""
+        """The mesh as it is now from ``camera``, opacities times ``factors`` (v,), with a backward pass."""
         colors = self.colors if factors is None else self.colors.copy()
         if factors is not None:
             colors[:, 3] *= factors
