@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -135,8 +137,8 @@ def test_blender_gets_it_baked(tmp_path, monkeypatch):
 
     mesh, view = fans(7, 30, z=6.0), camera(40, 40)
     jobs = []
-    monkeypatch.setattr(launch, "command", lambda executable: [])
-    monkeypatch.setattr(launch, "run_job", lambda arrays, *_, **__: jobs.append(arrays) or {})
+    job = SimpleNamespace(run=lambda arrays, *_, **__: jobs.append(arrays) or {})
+    monkeypatch.setattr(launch, "begun", lambda *_, **__: nullcontext(job))
     blender.draw(mesh, [view], images=[tmp_path / "p.png"])
     np.testing.assert_array_equal(jobs[0][0][0]["vertices"], bake_filter(mesh, [view]).vertices)
     with pytest.warns(DataWarning, match="bake_filter"):
