@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
+from meshsplats.blender.background import Background
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import CAREFUL, MAX_LAYERS, Effort, SceneOptions
@@ -155,12 +156,12 @@ def lit_subject(
     mesh = mesh.plain
     announce("colours")
     cameras = [*cameras, *(views_within(mesh, threads=threads) if within is None else within)]
-    with ThreadPoolExecutor(1) as pool:  # each of the two leaves processors idle
-        shape = pool.submit(shape_for_light, mesh, cameras, effort, threads)
-        colors = linear_colors(mesh, cameras, steps=effort.steps, views=effort.fit_views, threads=threads)
-        if mesh.binding is None:
-            announce("surface")
-        arrays, facts, surface = shape.result()
+    # Each of the two leaves processors idle.
+    shape = Background(partial(shape_for_light, mesh, cameras, effort, threads))
+    colors = linear_colors(mesh, cameras, steps=effort.steps, views=effort.fit_views, threads=threads)
+    if mesh.binding is None:
+        announce("surface")
+    arrays, facts, surface = shape.result()
     arrays |= {"colors": colors, "display": mesh.colors}
     if surface is not None:
         arrays["surface_colors"] = surface.colors(colors)
