@@ -465,9 +465,9 @@ def test_fans_of_a_training_are_nearly_ellipses(trained, ball):
 def test_photographs_have_one_sample_a_pixel_at_first(ball, start, monkeypatch):
     drawn = []
 
-    def noted(state, camera, options):
+    def noted(state, camera, options, *rest):
         drawn.append(options.samples)
-        return real(state, camera, options)
+        return real(state, camera, options, *rest)
 
     real = State.tape
     monkeypatch.setattr(State, "tape", noted)
@@ -494,7 +494,7 @@ def test_what_follows_from_the_kind_of_views(ball, room):
         assert for_views(make_config("paper"), data.train) == make_config("paper")
         cut = for_views(make_config(opacity="cutoff"), data.train)
         assert (cut.one_sample_share, cut.by_splat_share) == (0.0, None)
-        given = train_config(one_sample_share=0.3, by_splat_share=0.2)
+        given = train_config(one_sample_share=0.3, by_splat_share=0.2, dropout=0.1)
         assert for_views(given, data.train) == given
 
 
