@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._core.library import pointer, run, thread_count
-from meshsplats._core.structures import CellSumsStruct, FeetStruct
+from meshsplats._core.structures import CellSumsStruct, NearestVerticesStruct
 
 
 class VertexGrid(NamedTuple):
@@ -44,15 +44,17 @@ def nearest_vertices(
     ``facing_away`` times. Of vertices that are as near as each other, that of the lowest cell.
     """
     places, normals = np.ascontiguousarray(places, np.float64), np.ascontiguousarray(normals, np.float64)
+    vertices = np.ascontiguousarray(grid.vertices, np.float32)
+    vertex_normals = np.ascontiguousarray(grid.normals, np.float64)
     index, found = np.empty(len(places), np.int64), np.empty(len(places), bool)
     run(
-        "ms_find_feet",
-        FeetStruct(
+        "ms_nearest_vertices",
+        NearestVerticesStruct(
             places=pointer(places),
             normals=pointer(normals),
             ids=pointer(grid.ids),
-            vertices=pointer(grid.vertices),
-            vertex_normals=pointer(grid.normals),
+            vertices=pointer(vertices),
+            vertex_normals=pointer(vertex_normals),
             index=pointer(index),
             found=pointer(found),
             count=len(places),

@@ -219,7 +219,7 @@ class FillingStruct(CoreStruct):
     ]
 
 
-class FeetStruct(CoreStruct):
+class NearestVerticesStruct(CoreStruct):
     _fields_ = [
         *pointers("places", "normals", "ids", "vertices", "vertex_normals", "index", "found"),
         *int64("count"),

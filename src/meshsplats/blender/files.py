@@ -156,6 +156,10 @@ class PictureOptions:
         """To which splats are merged; None: not at all."""
         return self.max_splats or (FAST_SPLATS if self.fast else None)
 
+    def merges(self, cloud: GaussianCloud) -> bool:
+        """Whether it has more splats than that."""
+        return len(cloud) > (self.most_splats or len(cloud))
+
     def converted(self, scene: GaussianCloud | SplatMesh, source: Path) -> SplatMesh:
         """The mesh of ``scene``, from ``source``. OptionsError for ``max_splats`` of a mesh."""
         if isinstance(scene, SplatMesh):
@@ -165,9 +169,8 @@ class PictureOptions:
         # Crossed ellipses stand upright on the surface, where they catch too little light.
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
         options = ConversionOptions(max_splats=self.most_splats, mode=mode)
-        limited = len(scene) > (self.most_splats or len(scene))
         # Merging by what is seen takes three times as long; of an object, it is worth 0.4 dB.
-        if self.fast and limited and self._is_object(scene, source):
+        if self.fast and self.merges(scene) and self._is_object(scene, source):
             return convert(scene, options, up=self.up, threads=self.threads)
         return convert_within_limits(scene, options, up=self.up, source=source, threads=self.threads)
 
@@ -220,7 +223,7 @@ class PictureRun:
         count = 1 if suffix else 60
         views = chosen.chosen_views()
         # The search for most views comes first: what asks for fewer, or for cameras, gets some of these.
-        if isinstance(scene, GaussianCloud) and len(scene) > (chosen.most_splats or len(scene)):
+        if isinstance(scene, GaussianCloud) and chosen.merges(scene):
             views_of_place(scene, self.source, up=chosen.up, threads=chosen.threads)
         if options.light is not None and not tileset:
             within = views_within(scene, self.source, up=chosen.up, threads=chosen.threads)

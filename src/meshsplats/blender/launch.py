@@ -95,20 +95,18 @@ def command(executable: Path | None) -> list[str]:
     return [str(found), *flags, str(Path(worker.__file__).resolve()), "--"]
 
 
+@dataclass(frozen=True)
 class Job:
     """A job of Blender's, which has been started and loads; see ``begun``."""
 
-    def __init__(
-        self,
-        process: subprocess.Popen[str],
-        folder: Path,
-        options: SceneOptions,
-        images: Sequence[Path],
-        blend: Path | None,
-        temporary: Mapping[str, str],
-    ) -> None:
-        self._process, self._folder, self._options = process, folder, options
-        self._images, self._blend, self._temporary = images, blend, temporary
+    process: subprocess.Popen[str]
+    folder: Path
+    """Of the process."""
+    options: SceneOptions
+    images: Sequence[Path]
+    blend: Path | None
+    temporary: Mapping[str, str]
+    """Where each output is written before it has its name."""
 
     def run(
         self,
@@ -139,23 +137,22 @@ class Job:
         """
         stored = []
         for level, (arrays, facts) in enumerate(subjects):
-            files = {name: str(self._folder / f"{name}_{level}.npy") for name in arrays}
+            files = {name: str(self.folder / f"{name}_{level}.npy") for name in arrays}
             for name, array in arrays.items():
                 np.save(files[name], array, allow_pickle=False)
             stored.append((files, facts))
-        outputs = [path for path in (*self._images, self._blend) if path is not None]
         job = {
             "subjects": stored,
             "cameras": [_plain_camera(camera) for camera in cameras],
-            "options": _plain_options(self._options),
+            "options": _plain_options(self.options),
             "limit": limit,
-            "blend": None if self._blend is None else os.path.abspath(self._blend),
-            "images": [os.path.abspath(path) for path in self._images],
-            "temporary": dict(self._temporary),
-            "new": [os.path.abspath(path) for path in outputs if is_promised(path)],
+            "blend": None if self.blend is None else os.path.abspath(self.blend),
+            "images": [os.path.abspath(path) for path in self.images],
+            "temporary": dict(self.temporary),
+            "new": [path for path in self.temporary if is_promised(path)],
         }
-        write_text(self._folder / JOB, json.dumps(job))
-        return _follow(self._process, self._options, len(self._images), progress)
+        write_text(self.folder / JOB, json.dumps(job))
+        return _follow(self.process, self.options, len(self.images), progress)
 
 
 @contextmanager

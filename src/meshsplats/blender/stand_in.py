@@ -22,7 +22,7 @@ from meshsplats._geometry import vertex_normals
 from meshsplats.blender.options import CAREFUL
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
-from meshsplats.conversion.normals import Sight, sight_of, typical_spacing, unit, views_around
+from meshsplats.conversion.normals import DepthImage, depth_image_of, typical_spacing, unit, views_around
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering
 from meshsplats.surfaces.fusion import MIN_PART, grid_around, signed_distances
@@ -94,13 +94,13 @@ class StandIn:
         return np.where(held > 0, total[:, :3] / np.maximum(held, 1e-300), fallback).astype(np.float32)
 
 
-class Field(NamedTuple):
+class DistanceField(NamedTuple):
     """Distances to the surface that the splats form, and the images that they come from."""
 
     grid: Grid
     distances: np.ndarray
     """(x, y, z) float32, as of ``signed_distances``."""
-    sights: list[Sight]
+    depth_images: list[DepthImage]
 
 
 def field_around(
@@ -110,7 +110,7 @@ def field_around(
     resolution: int = CAREFUL.resolution,
     views: int = CAREFUL.views,
     threads: int | None = None,
-) -> Field | None:
+) -> DistanceField | None:
     """That of ``mesh``; None without extent.
 
     Args:
@@ -123,17 +123,17 @@ def field_around(
     except ValueError:
         return None
     placed = views_around(mesh, views, SIDE * resolution, cameras)
-    sights: list[Sight] = []
+    depth_images: list[DepthImage] = []
 
     def keep(camera: Camera, image: Rendering) -> None:
-        sights.append(sight_of(camera, image, len(sights) < views))
+        depth_images.append(depth_image_of(camera, image, len(depth_images) < views))
 
     distances = signed_distances(mesh, placed, grid, behind=_BEHIND, threads=threads, each=keep)
-    return Field(grid, distances, sights)
+    return DistanceField(grid, distances, depth_images)
 
 
 def stand_in(
-    mesh: SplatMesh, normals: np.ndarray, around: Field, threads: int | None = None
+    mesh: SplatMesh, normals: np.ndarray, around: DistanceField, threads: int | None = None
 ) -> StandIn | None:
     """The stand-in of ``mesh`` with the unit shading ``normals`` (v, 3); None where its images show nothing
     solid."""
@@ -290,7 +290,7 @@ class _Feet:
         def sorted_into(block: int) -> VertexGrid:
             ids = np.full([-(-n // block) for n in field.shape], -1, np.int32)
             ids[tuple((cells // block).T)] = np.arange(len(cells), dtype=np.int32)
-            return VertexGrid(ids, grid.low, block * grid.voxel, vertices, np.ascontiguousarray(normals))
+            return VertexGrid(ids, grid.low, block * grid.voxel, vertices, normals)
 
         self._fine, self._coarse = sorted_into(1), sorted_into(_COARSE)
 

@@ -189,22 +189,19 @@ def shape_for_light(
     """What of ``lit_subject`` does not depend on colours, and the stand-in, where there is one.
 
     ``normals`` (v, 3), and ``faces`` (f, 3) wound to face outwards; ``self_shadow``: the distance, scene
-    units, within which layers must not shade each other; arrays of the stand-in, and ``light_spacing``: the
-    distance of its points.
+    units, within which layers must not shade each other; of a stand-in also its arrays, and
+    ``light_spacing``: the distance of its points.
     """
     surfels, field, side = surfels_of(mesh), None, effort.resolution
     if mesh.binding is None:
         field = field_around(mesh, cameras, resolution=side, views=effort.views, threads=threads)
-    sights = None if field is None else field.sights
+    depth_images = None if field is None else field.depth_images
     normals = shading_normals(
-        mesh, cameras, views=effort.views, surfels=surfels, sights=sights, threads=threads
+        mesh, cameras, views=effort.views, surfels=surfels, depth_images=depth_images, threads=threads
     )
     arrays = {"normals": normals, "faces": _facing_out(mesh, normals)}
     facts = {"self_shadow": SELF_SHADOW * typical_spacing(mesh, surfels.centers)}
-    if mesh.binding is not None:
-        return arrays, facts, None
     surface = None if field is None else stand_in(mesh, normals, field, threads)
-    facts["light_spacing"] = 0.0
     if surface is not None:
         facts["light_spacing"] = surface.size
         arrays |= {

@@ -26,9 +26,8 @@ from meshsplats.rendering import Rendering, render
 CELL = 2.5
 """Side of the cells in which neighbours are sought, in spacings: measured on splats of a known surface,
 clean and noisy, where 2 to 3 give the least error (see docs/blender.md)."""
-VIEWS = 24
-GIVEN = 16
-"""Views around a scene by which is decided what is outside, and the most of given cameras."""
+VIEWS, GIVEN = 24, 16
+"""Views around a scene by which is decided what is outside, and of given cameras at most."""
 _SIDE = 160
 """Side in pixels of their images."""
 _BOTH = 0.15
@@ -57,15 +56,15 @@ def shading_normals(
     *,
     views: int = VIEWS,
     surfels: Surfels | None = None,
-    sights: Iterable[Sight] | None = None,
+    depth_images: Iterable[DepthImage] | None = None,
     threads: int | None = None,
 ) -> np.ndarray:
     """(v, 3) float32 unit normals of the surface that the splats of ``mesh`` form, pointing outwards.
 
     All vertices of a splat share one. A mesh with normals keeps them. Without ``face_splat``, each triangle
     counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` see the scene, besides
-    ``views`` around it: a room is visible from inside only. ``surfels``: those of the mesh, and ``sights``:
-    what is seen of it, where they are known.
+    ``views`` around it: a room is visible from inside only. ``surfels`` and
+    ``depth_images``: those of the mesh, where they are known.
     """
     if mesh.normals is not None:
         return mesh.normals
@@ -87,9 +86,9 @@ def shading_normals(
         # Both have trace 1: along the normal the discs' tensor is large, the scatter of the centres small.
         both = discs - np.divide(scatter, size, out=np.zeros_like(scatter), where=size > 0)
         normals[part] = np.linalg.eigh(both)[1][:, :, 2]
-    if sights is None:
-        sights = _sights(mesh, views, cameras, threads)
-    side = _seen_side(mesh, centers, normals, cell, sights)
+    if depth_images is None:
+        depth_images = _depth_images(mesh, views, cameras, threads)
+    side = _seen_side(mesh, centers, normals, cell, depth_images)
     normals *= np.where(side < 0, -1.0, 1.0)[:, None]
     # Splats that no camera sees have no weight here and take the side of their neighbours.
     trust = np.where(side == 0, 1e-3, 1.0) * weights
@@ -172,12 +171,15 @@ class _Neighbours:
         self._middles = self._cell_sums(points) / sizes[:, None]
 
     def _cell_sums(self, values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(self._cell_of, column, self._count) for column in values.T], axis=1)
+        sums = np.empty((self._count, values.shape[1]))
+        for k, column in enumerate(values.T):
+            sums[:, k] = np.bincount(self._cell_of, column, self._count)
+        return sums
 
     def sums(self, values: np.ndarray, width: float) -> Iterator[tuple[slice, np.ndarray]]:
         """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the
         distance to each cell's centre with standard deviation ``width`` cells."""
-        totals = np.ascontiguousarray(self._cell_sums(values))
+        totals = self._cell_sums(values)
         for begin in range(0, len(self._points), _CHUNK):
             part = slice(begin, begin + _CHUNK)
             yield (
@@ -194,7 +196,7 @@ class _Neighbours:
             )
 
 
-class Sight(NamedTuple):
+class DepthImage(NamedTuple):
     """What a camera sees of a mesh."""
 
     camera: Camera
@@ -204,33 +206,37 @@ class Sight(NamedTuple):
     """Whether it is one of the cameras around the scene, which may look at it from below."""
 
 
-def sight_of(camera: Camera, image: Rendering, is_around: bool) -> Sight:
+def depth_image_of(camera: Camera, image: Rendering, is_around: bool) -> DepthImage:
     """By an ``image`` with depth."""
-    return Sight(camera, image.mean_depth(min_alpha=_SOLID), is_around)
+    return DepthImage(camera, image.mean_depth(min_alpha=_SOLID), is_around)
 
 
-def views_around(
-    mesh: SplatMesh, count: int, side: int, cameras: Sequence[Camera] = (), most: int = GIVEN
-) -> list[Camera]:
-    """``count`` square cameras all around ``mesh``, and ``most`` of ``cameras`` at most, evenly chosen; their
-    images have at most ``side`` pixels a side."""
+def views_around(mesh: SplatMesh, count: int, side: int, cameras: Sequence[Camera] = ()) -> list[Camera]:
+    """``count`` square cameras all around ``mesh``, and ``GIVEN`` of ``cameras`` at most, evenly chosen;
+    their images have at most ``side`` pixels a side."""
     views = dome(mesh, count, whole=True, up=guess_up(mesh), width=side, height=side)
-    return views + [camera.within(side) for camera in subsample(cameras or (), most)]
+    return views + [camera.within(side) for camera in subsample(cameras or (), GIVEN)]
 
 
-def _sights(mesh: SplatMesh, views: int, cameras: Sequence[Camera], threads: int | None) -> Iterator[Sight]:
+def _depth_images(
+    mesh: SplatMesh, views: int, cameras: Sequence[Camera], threads: int | None
+) -> Iterator[DepthImage]:
     for i, camera in enumerate(views_around(mesh, views, _SIDE, cameras)):
-        yield sight_of(camera, render(mesh, camera, depth=True, threads=threads), i < views)
+        yield depth_image_of(camera, render(mesh, camera, depth=True, threads=threads), i < views)
 
 
 def _seen_side(
-    mesh: SplatMesh, centers: np.ndarray, normals: np.ndarray, tolerance: float, sights: Iterable[Sight]
+    mesh: SplatMesh,
+    centers: np.ndarray,
+    normals: np.ndarray,
+    tolerance: float,
+    depth_images: Iterable[DepthImage],
 ) -> np.ndarray:
     """(n,) positive where the cameras that see a centre are on the side of its normal, negative on the other
     one; 0 where none sees it."""
     front, back, upper = np.zeros((3, len(centers)))
     up, middle = guess_up(mesh), scene_bounds(mesh).center
-    for camera, depth, is_around in sights:
+    for camera, depth, is_around in depth_images:
         shown, column, row, z = camera.pixels_of(centers)
         visible = shown[z < depth[row, column] + tolerance]
         away = camera.center - centers[visible]

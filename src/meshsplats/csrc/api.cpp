@@ -407,8 +407,8 @@ MS_EXPORT int ms_count_views(const MsCarving *carving, char *message, int messag
     return guarded(message, message_size, [&] { ms::count_views(*carving); });
 }
 
-MS_EXPORT int ms_find_feet(const MsFeet *feet, char *message, int message_size) {
-    return guarded(message, message_size, [&] { ms::find_feet(*feet); });
+MS_EXPORT int ms_nearest_vertices(const MsNearestVertices *places, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::nearest_vertices(*places); });
 }
 
 MS_EXPORT int ms_sum_cells(const MsCellSums *sums, char *message, int message_size) {

@@ -11,7 +11,7 @@
 
 extern "C" {
 
-struct MsFeet {
+struct MsNearestVertices {
     const double *places, *normals;  // (count, 3)
     const int32_t *ids;              // (size) the vertex of each cell, negative where there is none
     const float *vertices;           // (..., 3) of the surface
@@ -42,7 +42,7 @@ struct MsCellSums {
 
 namespace ms {
 
-inline void find_feet(const MsFeet &in) {
+inline void nearest_vertices(const MsNearestVertices &in) {
     parallel_blocks(in.threads, in.count, 1 << 10, [&](int64_t begin, int64_t end, int) {
         for (int64_t i = begin; i < end; ++i) {
             const double *place = in.places + 3 * i, *normal = in.normals + 3 * i;
