@@ -96,7 +96,7 @@ def clean_file(
     check_outputs([preview] if preview_only else [output, preview], force, inputs=[source])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StraysWarning)  # which names this command
-        scene = (reading or SceneReading()).load_scene(source)
+        scene = (reading or SceneReading()).load_scene(source, threads=threads)
     if isinstance(scene, GaussianCloud):
         check_splat_endings(written_ending(output.name))
     else:
@@ -169,7 +169,7 @@ def simplify_file(
     check_outputs([output, config, *([] if options.no_preview else [preview])], force, inputs=[source])
     if identify(source) != "splats":
         raise FileFormatError(f"{source}: not splats; simplify needs a splat file or a model folder")
-    cloud = (reading or SceneReading()).load(source)
+    cloud = (reading or SceneReading()).load(source, threads=threads)
     cameras = cameras_named(options.cameras, options.data, options.missing, cloud.origin)
     if cameras is None:
         cameras = cameras_beside(source, cloud.origin)

@@ -72,7 +72,9 @@ class Scoring:
         self.check_outputs(force)
         meshes = {name: self._load_mesh(path) for name, path in mesh_names(files).items()}
         before = None if chosen.before is None else self._load_mesh(chosen.before)
-        splats = None if chosen.splats is None else chosen.reading.load(chosen.splats)
+        splats = None
+        if chosen.splats is not None:
+            splats = chosen.reading.load(chosen.splats, threads=self.threads)
         known = [each for each in (splats, *meshes.values(), before) if each is not None]
         origin = shared_origin(each.origin for each in known)
         splats = None if splats is None else splats.relative_to(origin)

@@ -339,7 +339,7 @@ def test_a_wall_that_fills_more_of_the_images_than_the_floor_is_no_floor(monkeyp
     sample = Sample(hall, np.array([0.0, -1, 0]), 2)
     places = find_places(sample, (12, 8, 6))
     wall, floor = np.array([0.0, -1, 0]), np.array([0.0, 0, 1])
-    for shares, up, sure in (((0.14, 0.12), floor, 0.5), ((0.3, 0.05), wall, 1)):
+    for shares, up, sure in (((0.14, 0.12), floor, 0.8), ((0.3, 0.05), wall, 1)):
         planes = list(zip(shares, (wall, floor), strict=True))
         monkeypatch.setattr("meshsplats.viewpoints.upright._planes", lambda *a, planes=planes: planes)
         found = find_upright(sample, places, np.array([0.0, -1, 0]))

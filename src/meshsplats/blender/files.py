@@ -263,7 +263,8 @@ class PictureRun:
         """The scene, or those of the levels of a chain, relative to the origin of the finest."""
         files = [level.path for level in chain.levels] if chain else [self.source]
         part, reading, up = self.options.part, self.options.reading, self.options.views.up
-        first, *others = (cropped(reading.load_scene(file, up=up), part.crop) for file in files)
+        scenes = (reading.load_scene(file, up=up, threads=self.options.threads) for file in files)
+        first, *others = (cropped(scene, part.crop) for scene in scenes)
         return [first, *(level.relative_to(first.origin) for level in others)]
 
     def _chain(self, suffix: str) -> Chain | None:

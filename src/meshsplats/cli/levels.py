@@ -85,7 +85,7 @@ class Levels(Command):
         config = self.tuning.config()
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
-        cloud = self.reading.load(self.input, up=self.up)
+        cloud = self.reading.load(self.input, up=self.up, threads=self.threads)
         say_origin(cloud.origin, self.origin)
         level_now = 0
 

@@ -57,7 +57,7 @@ class Tiles(Command):
         check_outputs([config], self.force or self.resume)
         start = time.perf_counter()
         origin = None if isinstance(self.origin, str) else self.origin
-        source = self.reading.stream(self.input, origin, up=self.tiles.up)
+        source = self.reading.stream(self.input, origin, up=self.tiles.up, threads=self.threads)
         try:
             with self.cluster.workers(self.threads) as workers, terminal_bar() as bar:
                 found = build_tiles(

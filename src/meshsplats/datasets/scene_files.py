@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from meshsplats.formats.streaming import SplatStream
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.mesh import SplatMesh
+    from meshsplats.viewpoints.finding import UnusualUp
 
 Mesh = TypeVar("Mesh", bound="SplatMesh | BaseMesh")
 _AXES = Help(
@@ -52,11 +53,13 @@ class SceneReading:
         *,
         up: str | None = None,
         find_up: bool = True,
+        threads: int | None = None,
     ) -> GaussianCloud:
         """The splats of a file, relative to ``origin`` (3,). Tells what its header names; ``up``: the option
         that counts in its place. An object that would tip over the usual way up gets the one in which it
-        stands, unless ``find_up`` is False, or the folder has cameras, which know. FileFormatError for a
-        mesh, and what ``load_gaussians`` raises."""
+        stands, and a place that in which its floors are level, unless ``find_up`` is False, or the folder has
+        cameras, which know. ``threads``: at most this many. FileFormatError for a mesh, and what
+        ``load_gaussians`` raises."""
         from meshsplats.cameras.files import model_folder
         from meshsplats.cameras.framing import warn_of_strays_in, warn_of_unseen
         from meshsplats.formats.gaussians import load_gaussians
@@ -75,17 +78,23 @@ class SceneReading:
         if up is None and cloud.up is not None:
             self.tell(f"up: {direction_in_words(cloud.up)}, from the file's header")
         looked_at = up is None and find_up and cloud.up is None and model_folder(path) is None
-        if looked_at and (found := unusual_up(thinned([cloud]))) is not None:
-            cloud = replace(cloud, up=found)
+        if looked_at and (found := unusual_up(thinned([cloud]), threads)) is not None:
+            cloud = replace(cloud, up=found.up)
             self._tell_found(found)
         if self.kernel == "auto" and cloud.kernel != "3dgs":
             self.tell(f"kernel: {cloud.kernel}, from the file")
         return cloud
 
     def stream(
-        self, path: Path | Sequence[Path], origin: Sequence[float] | None = None, *, up: str | None = None
+        self,
+        path: Path | Sequence[Path],
+        origin: Sequence[float] | None = None,
+        *,
+        up: str | None = None,
+        threads: int | None = None,
     ) -> SplatStream:
-        """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
+        """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` and
+        ``threads`` as for ``load``."""
         from meshsplats.formats.streaming import stream_gaussians
         from meshsplats.viewpoints.finding import unusual_up
         from meshsplats.viewpoints.standing import thinned
@@ -93,27 +102,29 @@ class SceneReading:
         stream = stream_gaussians(path, origin=origin, **self.arguments)
         if up is None and (told := stream.up) is not None:
             self.tell(f"up: {direction_in_words(told)}, from the files' headers")
-        elif up is None and (found := unusual_up(thinned(stream))) is not None:
-            stream.found_to_stand(found)
+        elif up is None and (found := unusual_up(thinned(stream), threads)) is not None:
+            stream.use_found(found.up)
             self._tell_found(found)
         return stream
 
-    def _tell_found(self, up: np.ndarray) -> None:
+    def _tell_found(self, found: UnusualUp) -> None:
         self.tell(
-            f"up: {direction_in_words(up)}, as the object stands (likely): with the usual -y it would tip"
-            " over; if that is wrong, name it by ``up``, which 'meshsplats convert' can write into a file"
+            f"up: {direction_in_words(found.up)}, {found.reason}; if that is wrong, name it by ``up``, which"
+            " 'meshsplats convert' can write into a file"
         )
 
     def load_scene(
-        self, path: Path, *, up: str | None = None, find_up: bool = True
+        self, path: Path, *, up: str | None = None, find_up: bool = True, threads: int | None = None
     ) -> GaussianCloud | SplatMesh:
-        """The splats or the mesh at ``path``, textures as colours of vertices; ``up`` and ``find_up`` as for
-        ``load``. FileFormatError for cameras, and OptionsError as by ``refuse_for``."""
+        """The splats or the mesh at ``path``, textures as colours of vertices; ``up``, ``find_up`` and
+        ``threads`` as for ``load``. FileFormatError for cameras, and OptionsError as by ``refuse_for``."""
         from meshsplats.formats.base_meshes import load_vertex_colored
 
-        return self._load(path, load_vertex_colored, up, find_up)
+        return self._load(path, load_vertex_colored, up, find_up, threads)
 
-    def load_shown(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh | BaseMesh:
+    def load_shown(
+        self, path: Path, *, up: str | None = None, threads: int | None = None
+    ) -> GaussianCloud | SplatMesh | BaseMesh:
         """``load_scene``, but a surface with one texture on all faces as it is."""
         from meshsplats.base_mesh import BaseMesh
         from meshsplats.formats.base_meshes import load_textured, vertex_colored
@@ -124,10 +135,15 @@ class SceneReading:
             whole = isinstance(found, BaseMesh) and has_whole_texture(found)
             return found if whole else vertex_colored(found, path)
 
-        return self._load(path, load, up, True)
+        return self._load(path, load, up, True, threads)
 
     def _load(
-        self, path: Path, load_mesh: Callable[[Path], Mesh], up: str | None, find_up: bool
+        self,
+        path: Path,
+        load_mesh: Callable[[Path], Mesh],
+        up: str | None,
+        find_up: bool,
+        threads: int | None,
     ) -> GaussianCloud | Mesh:
         from meshsplats.base_mesh import BaseMesh
         from meshsplats.cameras.framing import warn_of_strays_in
@@ -139,7 +155,7 @@ class SceneReading:
                 f"{path}: a JSON file; expected splats or a mesh (``cameras`` takes cameras)"
             )
         if kind == "splats":
-            return self.load(path, up=up, find_up=find_up)
+            return self.load(path, up=up, find_up=find_up, threads=threads)
         self.refuse_for(path)
         mesh = load_mesh(path)
         if not isinstance(mesh, BaseMesh):

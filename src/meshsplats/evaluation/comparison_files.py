@@ -63,7 +63,8 @@ def save_comparison(
     """
     splats, folder = as_path("splats", splats), as_path("folder", folder)
     options.check()
-    cloud = cropped(options.reading.load(splats, up=options.views.up), options.part.crop)
+    cloud = options.reading.load(splats, up=options.views.up, threads=options.draw.threads)
+    cloud = cropped(cloud, options.part.crop)
     photographs = options.views.photographs(cloud.origin)
     cameras = options.views.make(cloud, splats, count=8, side=400, photographs=photographs, say=say)
     strips = view_names(len(cameras))

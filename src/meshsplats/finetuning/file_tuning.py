@@ -106,7 +106,7 @@ class FileTuning:
 
     def scene(self) -> Scene:
         """The splats or the mesh; of splats the part that is asked for."""
-        scene, crop = self.reading.load_scene(self.source), self.begin.conversion.crop
+        scene, crop = self.reading.load_scene(self.source, threads=self.threads), self.begin.conversion.crop
         if isinstance(scene, GaussianCloud) and crop is not None:
             # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
             scene = choose_splats(scene, crop=crop)

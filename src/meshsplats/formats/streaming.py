@@ -125,7 +125,7 @@ class SplatStream:
         """(3,) unit direction that points up, where all of the files say so, and the same."""
         return shared_up([self._up(path) for path in self.paths])
 
-    def found_to_stand(self, up: np.ndarray) -> None:
+    def use_found(self, up: np.ndarray) -> None:
         """Gives ``up``, a (3,) unit direction, to all blocks: the files name none, and the splats show it."""
         self.up = self._found_up = up
 

@@ -97,7 +97,7 @@ class PriorTraining:
         background = config.behind_splats
         if self.splats is None:
             return self.target.make(_grey_mesh(base), self.source, background, self.threads)
-        cloud = self.reading.load(self.splats, base.origin)
+        cloud = self.reading.load(self.splats, base.origin, threads=self.threads)
         views = worthwhile_views(as_begun(config, earlier))
         return self.target.make(cloud, self.splats, background, self.threads, views)
 

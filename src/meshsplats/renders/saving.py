@@ -139,7 +139,9 @@ class ImageRun:
 
     def _read(self) -> GaussianCloud | SplatMesh:
         chosen = self.options
-        return cropped(chosen.reading.load_scene(self.source, up=chosen.views.up), chosen.part.crop)
+        threads = chosen.draw.threads
+        scene = chosen.reading.load_scene(self.source, up=chosen.views.up, threads=threads)
+        return cropped(scene, chosen.part.crop)
 
     def _check_scene(self, scene: GaussianCloud | SplatMesh) -> None:
         if isinstance(scene, SplatMesh) and self.options.as_splats:

@@ -132,7 +132,7 @@ class SurfaceRun:
         chosen, options = self.options, self.check(force)
         said = progress or (lambda *_: None)
         said("reading", 0, 1)
-        scene = self.reading.load_scene(self.source)
+        scene = self.reading.load_scene(self.source, threads=self.threads)
         data = None
         if chosen.data is not None:
             how: dict[str, Any] = {"missing": chosen.missing, "masks": chosen.masks}

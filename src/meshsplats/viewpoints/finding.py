@@ -24,7 +24,14 @@ from meshsplats.choices import MAX_SIDE
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import FRAGMENTS, preview_camera
-from meshsplats.viewpoints.kind import FEWEST, Kind, kind_from_inside, kind_from_outside, usual_depth
+from meshsplats.viewpoints.kind import (
+    FEWEST,
+    Kind,
+    kind_from_inside,
+    kind_from_outside,
+    surely_object,
+    usual_depth,
+)
 from meshsplats.viewpoints.relief import Relief, find_relief
 from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
@@ -47,6 +54,10 @@ WIDE = 85.0
 WIDER = 1.5
 """...and how much more it shows, at most, than the view that it is a variation of: a narrow view is one
 because there is noise around it."""
+
+
+STANDS = "as the object stands (likely): with the usual -y it would tip over"
+LEVEL = "as floors or ground are level (likely)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,15 +225,35 @@ def first_impression(
     return _within(sample, places, outside.kind, outside.confidence, given)
 
 
-def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> np.ndarray | None:
-    """(3,) unit direction that is up for an object whose file names none, where it would tip over the usual
-    way up and stands well another way; None for any other scene, of most of which it says so at once."""
-    if cloud.up is not None or len(cloud) < FEWEST or not (worth_a_look(cloud) and tips_over(cloud)):
+class UnusualUp(NamedTuple):
+    """A way up that is not that of the format."""
+
+    up: np.ndarray
+    """(3,) unit direction."""
+    reason: str
+    """What shows it."""
+
+
+def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> UnusualUp | None:
+    """Another way up than the usual one of a scene whose file names none: that in which an object stands well
+    that would tip over, or along which the floors or the ground of a place are level; else None."""
+    if cloud.up is not None or len(cloud) < FEWEST or not worth_a_look(cloud):
         return None
-    given, first_up = _told_up(cloud, None)
-    outside = _from_outside(cloud, _key(cloud, given), first_up, threads)
-    stands = outside.kind == "object" and outside.up_confidence > 0
-    return outside.up if stands and not np.array_equal(outside.up, first_up) else None
+    given, usual = _told_up(cloud, None)
+    if surely_object(cloud, usual, threads) and not tips_over(cloud):
+        return None
+    outside = _from_outside(cloud, _key(cloud, given), usual, threads)
+    if outside.kind == "object":
+        stands = outside.up_confidence > 0 and not np.array_equal(outside.up, usual)
+        return UnusualUp(outside.up, STANDS) if stands else None
+    if outside.relief is not None or not cloud.opacities.any():
+        return None
+    sample = Sample(cloud, usual, threads, SMALL_SAMPLE)
+    places = find_places(sample, FEW)
+    if not places.worth.any():
+        return None
+    upright = find_upright(sample, places, usual)
+    return UnusualUp(upright.up, LEVEL) if upright.level and not np.array_equal(upright.up, usual) else None
 
 
 def _key(cloud: GaussianCloud, given: np.ndarray | None) -> _Key:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import weighted_quantile
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.gaussians import GaussianCloud
@@ -27,6 +30,8 @@ OUTSIDE_SPLATS = 400_000
 """Number of splats, at most, that the dome is judged by."""
 FINE = 0.908
 """Share of opaque pixels with fine splats, seen from the dome, from which on a scene is an object."""
+SURELY_FINE, FEW_SPLATS = 0.95, 80_000
+"""That share from which on a scene surely is one, by so many splats."""
 FLAT = 0.2
 """Height of a landscape, as a share of its width..."""
 LANDSCAPE = 50_000
@@ -41,13 +46,41 @@ MOST_SURE = 0.45
 
 def fineness_outside(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> float:
     """Share of fine splats in what the dome around the scene shows, 0 to 1."""
-    coarse = COARSE * (min(max(len(cloud), USUAL), MANY) / len(cloud)) ** 0.5
-    splats = AllSplats(subsample_of(cloud), threads)
-    fine = []
-    for camera in outside_cameras(cloud, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE):
+    return _fineness(subsample_of(cloud), _coarse(len(cloud)), _dome(cloud, up), threads)
+
+
+def _coarse(count: int) -> float:
+    """The angle of a coarse splat, radians, in a scene of ``count``."""
+    return float(COARSE * (min(max(count, USUAL), MANY) / count) ** 0.5)
+
+
+def _dome(cloud: GaussianCloud, up: np.ndarray) -> list[Camera]:
+    return outside_cameras(cloud, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE)
+
+
+def _fineness(cloud: GaussianCloud, coarse: float, cameras: Sequence[Camera], threads: int | None) -> float:
+    """``fineness_outside`` of these splats, where an angle is ``coarse``."""
+    splats, fine = AllSplats(cloud, threads), []
+    for camera in cameras:
         log_angle, alpha, _ = splats.look(camera, OUTSIDE_SIDE)
         fine.append((alpha / (1 + (np.exp(log_angle) / coarse) ** 2)).sum() / max(alpha.sum(), 1e-3))
     return float(np.mean(fine))
+
+
+def surely_object(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> bool:
+    """Whether a glance at few splats, each wider as it stands for others, says that a scene is an object."""
+    if len(cloud) < FEWEST:
+        return True
+    if _is_landscape(cloud, up):
+        return False
+    step = -(-len(cloud) // FEW_SPLATS)
+    few, wider = cloud.take(np.arange(0, len(cloud), step)), float(step) ** 0.5
+    few = replace(few, scales=few.scales * np.float32(wider))
+    return _fineness(few, wider * _coarse(len(cloud)), _dome(cloud, up), threads) >= SURELY_FINE
+
+
+def _is_landscape(cloud: GaussianCloud, up: np.ndarray) -> bool:
+    return len(cloud) >= LANDSCAPE and flatness(subsample_of(cloud), up) < FLAT
 
 
 def subsample_of(cloud: GaussianCloud) -> GaussianCloud:
@@ -66,7 +99,7 @@ def kind_from_outside(
     if fine < FINE:
         return None, float(np.clip(0.3 + 2 * (FINE - fine), 0, 1))
     sure = float(np.clip(0.3 + (fine - FINE) / (1 - FINE), 0, 1))
-    if len(cloud) >= LANDSCAPE and flatness(subsample_of(cloud), up) < FLAT:
+    if _is_landscape(cloud, up):
         return "aerial", sure
     return "object", sure
 

@@ -34,7 +34,7 @@ FIRM, WIDE = 0.2, 0.6
 share of its outline from above that the base fills, where it stands firmly."""
 TALL = 0.7
 """Height of it, in widths of its base: a mask and a relief lie firmly on their backs, too."""
-MOST = 800_000
+MOST = 4_000_000
 """Number of splats, at most, that are looked at."""
 VIEWS, SIDE, SHARP_SIDE, FOV = 48, 48, 300, 50.0
 """Images from all around in which splats are measured: number, pixels, those of their filter, degrees."""
@@ -67,8 +67,8 @@ class Base:
 
 
 def thinned(blocks: Iterable[GaussianCloud]) -> GaussianCloud:
-    """Every so many of the splats in ``blocks``, at most ``MOST``, the same ones however they are cut. A
-    single block keeps its harmonics."""
+    """Every so many of the splats in ``blocks``, at most ``MOST``, the same ones however they are cut; each
+    wider, as it stands for others. A single block of no more is given as it is."""
     kept: list[GaussianCloud] = []
     step, start, count = 1, 0, 0
     for block in blocks:
@@ -81,7 +81,8 @@ def thinned(blocks: Iterable[GaussianCloud]) -> GaussianCloud:
         while count > MOST:
             kept = [_every_other(kept)]
             step, count = 2 * step, len(kept[0])
-    return kept[0] if len(kept) == 1 else _together(kept)
+    few = kept[0] if len(kept) == 1 else _together(kept)
+    return few if step == 1 else replace(few, scales=few.scales * np.float32(step**0.5))
 
 
 def _together(clouds: Sequence[GaussianCloud]) -> GaussianCloud:

@@ -22,12 +22,25 @@ LYING = 0.4
 """Greatest height of what is seen, as a share of its width, above a plane that is a floor and not a wall."""
 LEVEL = 0.3
 """Greatest ratio of the two smaller second moments of the directions of gaze that tells what is level."""
-KNOWN = 0.5
-"""How sure it is at least which way is up where another direction than the default is believed."""
+KNOWN, MEASURED = 0.5, 0.8
+"""How sure it is at least which way is up where another direction than the default is believed, and where
+floors or ground are level."""
+LIKELY = 0.7
+"""Cosine to the default of what is believed with less, at least, where nothing is level."""
 LEANS = 0.8
 """Least cosine between the normal of a plane and the axis of those directions that it makes exact."""
 SEEN_FROM = 24
 """Number of the best places from which planes are looked at."""
+FACING = 0.85
+"""Cosine between up and the normals of splats, at least, whose heights are looked at."""
+TILTS = ((12.0, 1.0, 0.02), (2.0, 0.25, 0.01), (0.5, 0.1, 0.005))
+"""Rounds in which up is made exact: how far it is tilted and in which steps, degrees, and the size of a step
+of height, as a share of the radius of the scene."""
+LEVEL_GROUND = 2.1
+"""Floors and ground are level where heights gather so many times as much as along the usual tilt. Lawns and
+slopes have 1.4 to 2.2, floors, streets and fields 3 to 6."""
+ALIGNED = 3.0
+"""Degrees from an axis within which it was meant to be up: few scenes that nobody has turned lie so close."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +53,8 @@ class Upright:
     """Height of the ground along ``up``."""
     confidence: float
     """0: the format's default, as the splats do not tell; 1: a large floor was found."""
+    level: bool
+    """Whether floors or ground are level, by which up is exact."""
 
 
 def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright:
@@ -73,9 +88,66 @@ def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright
         agrees = float(up @ default)
         if agrees < -0.2 or (agrees < 0.3 and confidence < KNOWN):  # a wall, likely
             up, confidence = default, 0.0
+    exact, level = _measured(sample, area * flat, up)
+    if not level and confidence < KNOWN and up @ default < LIKELY:
+        up, confidence = default, 0.0
+        exact, level = _measured(sample, area * flat, up)
+    if level:
+        up, confidence = aligned(exact), max(confidence, MEASURED)
     height = sample.means @ up
     facing = area * (np.abs(sample.normals @ up) > 0.9)
-    return Upright(up, _ground(height, facing if facing.any() else area), confidence)
+    return Upright(up, _ground(height, facing if facing.any() else area), confidence, level)
+
+
+def _measured(sample: Sample, area: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, bool]:
+    """``levelled`` of the splats with ``area`` (n,) in pictures that face ``up`` or down, and whether they
+    gather enough for floors or ground."""
+    rows = np.flatnonzero((area > 0) & (np.abs(sample.normals @ up) > FACING))
+    exact, gathered = levelled(sample.means[rows], area[rows], up, sample.radius)
+    return exact, gathered >= LEVEL_GROUND
+
+
+def levelled(
+    points: np.ndarray, weights: np.ndarray, up: np.ndarray, radius: float
+) -> tuple[np.ndarray, float]:
+    """The direction near ``up`` (3,) along which most of ``points`` (n, 3) lie at few heights: that of
+    floors, tables and fields, which are level. And how much more they gather there than along the median of
+    the directions around, as the sum of the squares of their ``weights`` (n,) at each height.
+
+    Normals of splats tell it within some 5 degrees, heights within one.
+    """
+    if not weights.any():
+        return up, 0.0
+    points = points - np.average(points, axis=0, weights=weights)
+    gathered = 0.0
+    for reach, step, height in TILTS:
+        offsets = np.radians(np.arange(-reach, reach + step / 2, step))
+        x, y = (axis.ravel() for axis in np.meshgrid(offsets, offsets))
+        inside = np.hypot(x, y) <= np.radians(reach) * (1 + 1e-9)
+        first, second = level_axes(up)
+        tilted = up + np.tan(x[inside])[:, None] * first + np.tan(y[inside])[:, None] * second
+        tilted /= np.linalg.norm(tilted, axis=1)[:, None]
+        sharp = np.array([_sharpness(points @ axis / (height * radius), weights) for axis in tilted])
+        k = int(sharp.argmax())
+        up, gathered = tilted[k], gathered or float(sharp[k] / np.median(sharp))
+    return up, gathered
+
+
+def _sharpness(heights: np.ndarray, weights: np.ndarray) -> float:
+    """The sum of the squares of the ``weights`` (n,) at each height, each shared by its two neighbours."""
+    heights = heights - heights.min()
+    below = np.floor(heights).astype(int)
+    above = weights * (heights - below)
+    count = int(below.max()) + 2
+    mass = np.bincount(below, weights - above, count) + np.bincount(below + 1, above, count)
+    return float((mass**2).sum())
+
+
+def aligned(up: np.ndarray) -> np.ndarray:
+    """The axis of the frame that ``up`` (3,) is close to, or ``up`` itself."""
+    k = int(np.abs(up).argmax())
+    axis = np.sign(up[k]) * np.eye(3)[k]
+    return axis if up @ axis > np.cos(np.radians(ALIGNED)) else up
 
 
 def height_over_width(points: np.ndarray, up: np.ndarray) -> float:

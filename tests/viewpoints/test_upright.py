@@ -1,0 +1,128 @@
+"""Which way is up in a place: heights at which floors and tables lie, and files that are read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_finding_cameras import moved, room
+
+from meshsplats.conversion.streaming import convert_blocks
+from meshsplats.datasets.scene_files import SceneReading
+from meshsplats.demo_scene.room import make_room
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.viewpoints import standing
+from meshsplats.viewpoints.finding import LEVEL, find_cameras, first_impression, unusual_up
+from meshsplats.viewpoints.standing import thinned
+from meshsplats.viewpoints.upright import LEVEL_GROUND, aligned, levelled
+
+USUAL = np.array([0.0, -1, 0])
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def turn(axis: int, angle: float) -> np.ndarray:
+    """(3, 3) rotation by ``angle`` degrees about a coordinate axis."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    x, y = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[[x, x, y, y], [x, y, x, y]] = c, -s, s, c
+    return matrix
+
+
+def storeys(count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
+    """Points on a floor, a table and a ceiling, 1 % thick, z up; and a third of points all around."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1, 1, (count, 3))
+    level = np.arange(count) % 3 < 2
+    heights = rng.choice([-0.5, -0.2, 0.6], count, p=[0.6, 0.1, 0.3])
+    points[level, 2] = (heights + rng.normal(size=count) * 0.005)[level]
+    return points, rng.uniform(0.5, 1, count)
+
+
+@given(st.floats(-8, 8), st.floats(-8, 8), st.floats(-180, 180))
+def test_heights_tell_up_exactly(first, second, around):
+    points, weights = storeys()
+    moved_by = turn(1, around) @ turn(0, around) @ turn(2, 30)
+    up = moved_by[:, 2]
+    start = moved_by @ (turn(0, first) @ turn(1, second))[:, 2]
+    found, gathered = levelled(points @ moved_by.T + [5, -3, 2], weights, start, 1.0)
+    assert degrees(found, up) < 0.4
+    assert gathered > LEVEL_GROUND
+
+
+def test_of_a_cloud_no_direction_is_level():
+    rng = np.random.default_rng(2)
+    _, gathered = levelled(rng.normal(size=(3000, 3)), np.ones(3000), USUAL, 1.0)
+    assert gathered < 1.2
+    assert levelled(np.empty((0, 3)), np.empty(0), USUAL, 1.0) == (USUAL, 0.0)
+
+
+def test_an_axis_that_is_close_was_meant():
+    assert aligned((turn(0, 2.5))[:, 2]).tolist() == [0, 0, 1]
+    assert aligned((turn(0, 2.5))[:, 1] * -1).tolist() == [0, -1, 0]
+    off = turn(0, 4)[:, 2]
+    assert aligned(off) is off
+
+
+@pytest.fixture(scope="module")
+def furnished():
+    return make_room(12_000)
+
+
+def test_a_room_that_leans_is_put_upright(furnished):
+    lean = turn(2, 9) @ turn(0, -7)
+    found = unusual_up(moved(furnished, 1, lean, np.zeros(3)))
+    assert found is not None
+    assert found.reason == LEVEL
+    assert degrees(found.up, lean @ USUAL) < 0.7
+
+
+def test_a_room_that_was_turned_before_stands_exactly(furnished):
+    z_up = moved(furnished, 1, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
+    found = unusual_up(z_up)
+    assert found is not None
+    assert found.up.tolist() == [0, 0, 1]
+    scene = first_impression(z_up)
+    assert scene is not None
+    assert scene.up.tolist() == [0, 0, 1]
+    assert scene.up_confidence >= 0.8
+
+
+def test_the_usual_way_up_is_nothing_to_tell(furnished):
+    assert unusual_up(furnished) is None
+    assert unusual_up(room()) is None
+
+
+@pytest.mark.slow
+def test_all_that_reads_a_file_agrees(furnished, tmp_path):
+    lean = turn(2, 9)
+    save_gaussians(moved(furnished, 1, lean, np.zeros(3)), tmp_path / "room.ply")
+
+    class Telling(SceneReading):
+        def tell(self, text: str) -> None:
+            said.append(text)
+
+    said: list[str] = []
+    cloud, stream = Telling().load(tmp_path / "room.ply"), Telling().stream(tmp_path / "room.ply")
+    assert degrees(cloud.up.astype(float), lean @ USUAL) < 0.7
+    assert np.array_equal(cloud.up, stream.up.astype(np.float32))
+    assert [part.up.tolist() for part in convert_blocks(stream)] == [cloud.up.tolist()]
+    assert len(said) == 2
+    assert said[0] == said[1]
+    assert "as floors or ground are level (likely); if that is wrong" in said[0]
+    upright = find_cameras(cloud, 4)
+    assert upright.up_confidence == 1
+    right = np.array([camera.world_to_camera[0, :3] for camera in upright.cameras])
+    assert np.abs(right @ upright.up).max() < 1e-6
+
+
+def test_what_stands_for_others_is_wider(monkeypatch):
+    cloud = room(3000, 100)
+    monkeypatch.setattr(standing, "MOST", 1000)
+    few = thinned([cloud])
+    assert len(few) == -(-len(cloud) // 4)
+    assert few.scales == pytest.approx(2 * cloud.scales[::4])
