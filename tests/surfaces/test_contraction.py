@@ -41,6 +41,25 @@ def test_contraction_keeps_directions_order_and_the_ball(points, radius):
     np.testing.assert_allclose(grid.in_scene(contracted)[known], scene[known], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("sides", "depth", "longest"),
+    [
+        ((40, 30, 8), 3, 512),  # a flat
+        ((40, 30, 8), 5, 400),
+        ((40, 30, 8), 20, 256),  # a field
+        ((40, 40, 40), 1, 368),  # 512 would take 134 million points
+        ((40, 30, 8), 0, 256),  # nothing is known
+    ],
+)
+def test_voxels_of_a_place_follow_how_far_one_sees(sides, depth, longest):
+    points = (np.random.default_rng(0).uniform(-0.5, 0.5, (20_000, 3))) * sides
+    cameras = [look_at((x, 0, 0), (x, 1, 0), up=(0, 0, 1), **LENS) for x in (-18, 0, 18)]
+    shape = grid_of(points, cameras, None, depth).shape
+    assert max(shape) == pytest.approx(longest, rel=0.02)
+    assert np.prod(shape) < 1.1 * 5e7
+    assert max(grid_of(points, cameras, 64, depth).shape) == pytest.approx(64, abs=2)
+
+
 def test_without_a_radius_points_stay():
     points = np.random.default_rng(0).normal(0, 100, (50, 3))
     assert grid_with(0).contracted(points) is points

@@ -15,7 +15,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.core_arguments import camera_struct
-from meshsplats.surfaces.options import LEVEL_FACTOR
+from meshsplats.surfaces.options import LEVEL_FACTOR, MAX_RESOLUTION, USUAL_RESOLUTION
 
 TRUNCATION = 3.0
 """Truncation of signed distances, in voxels."""
@@ -34,6 +34,10 @@ _MOST, _AROUND = 0.95, 1.5
 """The grid of a place is even as far around as most of its cameras are, and this much farther."""
 _FAR = 2.0
 """Nearly all of a place must reach so many times farther for that."""
+_FINE = 0.02
+"""Greatest side of the voxels of a place, as a share of the usual depth of its views..."""
+_POINTS = 5e7
+"""...but for grids of so many points, which take 1.5 GB."""
 _CLOSE = 0.9
 """Distance before a surface, in units of the truncation, from which there must be something behind."""
 _GAP = 3
@@ -207,10 +211,13 @@ def grid_around(scene: GaussianCloud | SplatMesh, resolution: int) -> Grid:
     return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1))
 
 
-def grid_of(points: np.ndarray, cameras: Sequence[Camera], resolution: int) -> Grid:
+def grid_of(
+    points: np.ndarray, cameras: Sequence[Camera], resolution: int | None, usual_depth: float = 0.0
+) -> Grid:
     """The grid around what ``cameras`` see of a place, ``points`` (n, 3), about ``resolution`` voxels along
     its longest side: around all of it but strays, unless these lie far beyond nearly all. Where some of it is
-    far away, it is contracted beyond half of the distances that they see.
+    far away, it is contracted beyond half of the distances that they see. Without a resolution, voxels have a
+    share of the ``usual_depth`` of what is seen, as far as memory allows.
 
     Raises ValueError for points without extent.
     """
@@ -225,9 +232,14 @@ def grid_of(points: np.ndarray, cameras: Sequence[Camera], resolution: int) -> G
     lowest, low, high, highest = np.quantile(points, [_ALL, _NEARLY, 1 - _NEARLY, 1 - _ALL], axis=0)
     reach = _REACH * float((high - low).max())
     low, high = np.maximum(lowest, low - reach), np.minimum(highest, high + reach)
-    voxel = float((high - low).max()) / (resolution - 4)
-    if not voxel > 0:
+    longest = float((high - low).max())
+    if not longest > 0:
         raise ValueError("the scene has no extent")
+    if resolution is None:
+        most = (_POINTS * longest**3 / float(np.prod(np.maximum(high - low, 1e-3 * longest)))) ** (1 / 3)
+        wanted = min(longest / (_FINE * usual_depth), most) if usual_depth > 0 else 0.0
+        resolution = int(np.clip(wanted, USUAL_RESOLUTION, MAX_RESOLUTION))
+    voxel = longest / (resolution - 4)
     low = low - 2 * voxel
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel) + 3)
     return ball._replace(low=low, voxel=voxel, shape=shape)

@@ -37,7 +37,13 @@ from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
 from meshsplats.surfaces.manifold import split_pinches
 from meshsplats.surfaces.normal_maps import Relief, normal_map, relief_of
-from meshsplats.surfaces.options import CLOSED, SizedOptions, SurfaceOptions, level_options
+from meshsplats.surfaces.options import (
+    CLOSED,
+    USUAL_RESOLUTION,
+    SizedOptions,
+    SurfaceOptions,
+    level_options,
+)
 from meshsplats.surfaces.views import Sources, reduced, smaller, sources_of
 
 if TYPE_CHECKING:
@@ -222,7 +228,7 @@ def _fused(
         # As wide as viewers draw splats: gaps between them would be holes in the surface.
         mesh = convert(mesh, cameras=sources.depth, look="splats", colors="base", threads=threads)
     grid = (
-        grid_around(scene, options.resolution)
+        grid_around(scene, options.resolution or USUAL_RESOLUTION)
         if sources.closed
         else _grid_seen(mesh, sources.depth, options.resolution, threads)
     )
@@ -271,9 +277,11 @@ def _floored(
     return np.concatenate([vertices, points]), np.concatenate([faces, ground + np.int32(len(vertices))])
 
 
-def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, threads: int | None) -> Grid:
+def _grid_seen(
+    mesh: SplatMesh, cameras: Sequence[Camera], resolution: int | None, threads: int | None
+) -> Grid:
     """The grid around what the cameras see."""
-    points = []
+    points, depths = [], []
     for camera in cameras:
         small = camera.scaled(_BOX_SIDE / max(camera.width, camera.height)).with_near_plane(mesh.vertices)
         depth = render(mesh, small, median_depth=True, threads=threads).median_depth
@@ -282,6 +290,7 @@ def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, thre
         away = depth[rows, columns].astype(np.float64)
         x = (columns + 0.5 - small.cx) / small.fx * away
         y = (rows + 0.5 - small.cy) / small.fy * away
+        depths.append(away)
         matrix = small.world_to_camera
         points.append((np.stack([x, y, away], axis=1) - matrix[:3, 3]) @ matrix[:3, :3])
     every = np.concatenate(points)
@@ -289,7 +298,7 @@ def _grid_seen(mesh: SplatMesh, cameras: Sequence[Camera], resolution: int, thre
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
-    return grid_of(every, cameras, resolution)
+    return grid_of(every, cameras, resolution, float(np.median(np.concatenate(depths))))
 
 
 def _fitted(

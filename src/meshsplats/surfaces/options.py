@@ -18,6 +18,8 @@ MAX_TEXTURE = 8192
 """Largest side of a texture."""
 CLOSED, OPEN = (20_000, 2048), (60_000, 4096)
 """Default numbers of triangles, and sides of the texture, of closed surfaces and of open ones."""
+USUAL_RESOLUTION = 256
+"""Default number of voxels along the longest side of closed surfaces, and the least of open ones."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,10 @@ class SurfaceOptions:
     """closed: a solid that can be seen from all sides; what no image sees becomes interior. open: only what
     images see, for rooms, streets and gardens. floor: open, but for the ground below and between the views,
     for walking. auto: closed for objects, open for places."""
-    resolution: Annotated[int, Range(8, MAX_RESOLUTION)] = 256
-    """Voxels along the longest side, from whose surface triangles are made. Memory grows with its
-    cube."""
+    resolution: Annotated[int | None, Range(8, MAX_RESOLUTION)] = None
+    """Voxels along the longest side, from whose surface triangles are made. Memory grows with its cube. None:
+    256; of open surfaces up to 512, where one sees much less far than they reach, as in the rooms of a
+    flat."""
     views: Annotated[int, Range(4, 1000)] = 64
     """Images that are made of the scene, from all around or, of a place, from within."""
     size: Annotated[int, Range(16, 4096)] = 800
@@ -82,6 +85,8 @@ class SizedOptions(SurfaceOptions):
 
 def default_in_words(name: str) -> str:
     """The default of an option, and that of open surfaces, where it is another."""
+    if name == "resolution":
+        return f"(default: {USUAL_RESOLUTION}; open surfaces: to {MAX_RESOLUTION})"
     closed, place = (getattr(SurfaceOptions().sized(kind), name) for kind in (True, False))
     return f"(default: {closed})" if closed == place else f"(default: {closed}; open surfaces: {place})"
 
@@ -118,7 +123,7 @@ class SurfaceChanges(TypedDict, total=False):
     texture: int | None
     normal_map: bool
     shape: Shape
-    resolution: int
+    resolution: int | None
     views: int
     size: int
     rounds: int
