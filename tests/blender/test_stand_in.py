@@ -40,20 +40,25 @@ def test_lit_scenes_have_plain_colours():
 def test_places_are_lit_by_what_is_seen_from_within(monkeypatch):
     """Colours, normals and stand-in also have the views that are found in a place; objects and meshes that
     know no splats have none."""
-    seen = []
+    seen, colored = [], []
 
     def shape(mesh, cameras, *options):
         seen.append(list(cameras))
         return {"n": len(cameras)}, {}, None
 
+    def colors(mesh, cameras, **options):
+        colored.append(list(cameras))
+        return mesh.colors
+
     mesh = convert(ball_splats(300)[0])
     given, found = orbit(mesh, 3)[:1], orbit(mesh, 2)
     views = iter([(found, "a place"), None])
     monkeypatch.setattr(subject, "shape_for_light", shape)
+    monkeypatch.setattr(subject, "linear_colors", colors)
     monkeypatch.setattr(subject, "default_views", lambda cloud, *_, **__: next(views))
     counts = [subject.lit_subject(part, given)[0]["n"] for part in (mesh, mesh)]
     assert counts == [3, 1]
-    assert seen[0] == [*given, *found]
+    assert seen[0] == colored[0] == [*given, *found]
     assert subject.lit_subject(replace(mesh, face_splat=None, filter_px2=0), given)[0]["n"] == 1
     options = SceneOptions(light=LightOptions(), within=tuple(orbit(mesh, 5)))
     assert prepare(mesh, given, options, 8)[0]["n"] == 6, "views are not looked for where they are known"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,10 +12,12 @@ from test_finding_cameras import moved, room
 
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.datasets.scene_files import SceneReading
+from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.room import make_room
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.viewpoints import standing
+from meshsplats.viewpoints import kind, standing
 from meshsplats.viewpoints.finding import LEVEL, find_cameras, first_impression, unusual_up
+from meshsplats.viewpoints.kind import surely_object
 from meshsplats.viewpoints.standing import thinned
 from meshsplats.viewpoints.upright import LEVEL_GROUND, aligned, levelled
 
@@ -73,6 +77,7 @@ def furnished():
     return make_room(12_000)
 
 
+@pytest.mark.slow
 def test_a_room_that_leans_is_put_upright(furnished):
     lean = turn(2, 9) @ turn(0, -7)
     found = unusual_up(moved(furnished, 1, lean, np.zeros(3)))
@@ -86,15 +91,38 @@ def test_a_room_that_was_turned_before_stands_exactly(furnished):
     found = unusual_up(z_up)
     assert found is not None
     assert found.up.tolist() == [0, 0, 1]
-    scene = first_impression(z_up)
+
+
+@pytest.mark.slow
+def test_a_first_impression_is_upright(furnished):
+    scene = first_impression(moved(furnished, 1, turn(0, 90), np.zeros(3)))
     assert scene is not None
-    assert scene.up.tolist() == [0, 0, 1]
+    assert scene.up == pytest.approx(turn(0, 90) @ USUAL, abs=1e-12)
     assert scene.up_confidence >= 0.8
 
 
+@pytest.mark.slow
 def test_the_usual_way_up_is_nothing_to_tell(furnished):
     assert unusual_up(furnished) is None
     assert unusual_up(room()) is None
+
+
+def test_a_glance_tells_objects(furnished, monkeypatch):
+    """At some of the splats, each as much wider, and at all of them."""
+    ball = make_scene(12_000)
+    for some in (80_000, 4000):
+        monkeypatch.setattr(kind, "FEW_SPLATS", some)
+        assert surely_object(ball, USUAL)
+        assert not surely_object(furnished, USUAL)
+    field = replace(ball, means=ball.means * np.float32([30, 0.1, 30]))
+    monkeypatch.setattr(kind, "LANDSCAPE", 10_000)
+    assert not surely_object(field, USUAL)
+
+
+def test_in_few_splats_no_floor_is_looked_for(furnished, monkeypatch):
+    monkeypatch.setattr("meshsplats.viewpoints.finding.find_places", None)
+    few = furnished.take(np.arange(0, len(furnished), 2))
+    assert unusual_up(moved(few, 1, turn(2, 9), np.zeros(3))) is None
 
 
 @pytest.mark.slow

@@ -41,6 +41,8 @@ from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, Checked, choose_view
 
 MOST = 96
 """Views that are looked for, each checked with all splats; more are variations of these."""
+FEWEST_OF_PLACE = 10_000
+"""Number of splats, at least, in which level floors are looked for."""
 FINGERPRINT = 20_000
 """Number of splats, at most, by which a scene is known again."""
 AS_HELD = 0.5
@@ -240,13 +242,14 @@ def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> UnusualUp | 
     if cloud.up is not None or len(cloud) < FEWEST or not worth_a_look(cloud):
         return None
     given, usual = _told_up(cloud, None)
-    if surely_object(cloud, usual, threads) and not tips_over(cloud):
+    few = len(cloud) < FEWEST_OF_PLACE
+    if not tips_over(cloud) and (few or surely_object(cloud, usual, threads)):
         return None
     outside = _from_outside(cloud, _key(cloud, given), usual, threads)
     if outside.kind == "object":
         stands = outside.up_confidence > 0 and not np.array_equal(outside.up, usual)
         return UnusualUp(outside.up, STANDS) if stands else None
-    if outside.relief is not None or not cloud.opacities.any():
+    if outside.relief is not None or few or not cloud.opacities.any():
         return None
     sample = Sample(cloud, usual, threads, SMALL_SAMPLE)
     places = find_places(sample, FEW)
