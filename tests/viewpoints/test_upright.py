@@ -119,6 +119,16 @@ def test_a_glance_tells_objects(furnished, monkeypatch):
     assert not surely_object(field, USUAL)
 
 
+def test_that_ground_slopes_does_not_turn_a_landscape(monkeypatch):
+    still = make_scene(12_000)
+    field = replace(still, means=still.means * np.float32([30, 0.1, 30]))
+    monkeypatch.setattr(kind, "LANDSCAPE", 10_000)
+    monkeypatch.setattr("meshsplats.viewpoints.finding.find_places", None)
+    slope = moved(field, 1, turn(2, 6), np.zeros(3))
+    assert kind.kind_from_outside(slope, USUAL)[0] == "aerial"
+    assert unusual_up(slope) is None
+
+
 def test_in_few_splats_no_floor_is_looked_for(furnished, monkeypatch):
     monkeypatch.setattr("meshsplats.viewpoints.finding.find_places", None)
     few = furnished.take(np.arange(0, len(furnished), 2))

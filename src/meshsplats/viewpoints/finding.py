@@ -249,7 +249,8 @@ def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> UnusualUp | 
     if outside.kind == "object":
         stands = outside.up_confidence > 0 and not np.array_equal(outside.up, usual)
         return UnusualUp(outside.up, STANDS) if stands else None
-    if outside.relief is not None or few or not cloud.opacities.any():
+    # A landscape is flat the usual way up, and its ground may slope.
+    if outside.kind in ("relief", "aerial") or few or not cloud.opacities.any():
         return None
     sample = Sample(cloud, usual, threads, SMALL_SAMPLE)
     places = find_places(sample, FEW)
