@@ -16,7 +16,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.room import make_room
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.viewpoints import kind, standing
-from meshsplats.viewpoints.finding import LEVEL, find_cameras, first_impression, unusual_up
+from meshsplats.viewpoints.finding import BY_FLOORS, find_cameras, first_impression, unusual_up
 from meshsplats.viewpoints.kind import surely_object
 from meshsplats.viewpoints.standing import thinned
 from meshsplats.viewpoints.upright import LEVEL_GROUND, aligned, levelled
@@ -82,7 +82,7 @@ def test_a_room_that_leans_is_put_upright(furnished):
     lean = turn(2, 9) @ turn(0, -7)
     found = unusual_up(moved(furnished, 1, lean, np.zeros(3)))
     assert found is not None
-    assert found.reason == LEVEL
+    assert found.reason == BY_FLOORS
     assert degrees(found.up, lean @ USUAL) < 0.7
 
 

@@ -170,7 +170,9 @@ def _content(scene: Shown, options: ViewingOptions, cameras: Sequence[Camera]) -
         advice = "fine-tune it with ``max_triangles``, or make 'meshsplats tiles'"
         splats = None
         if options.splats is not None:
-            splats = cropped(options.reading.load(options.splats, scene.origin), options.part.crop)
+            # The page has the up of the mesh.
+            drawn = options.reading.load(options.splats, scene.origin, find_up=False)
+            splats = cropped(drawn, options.part.crop)
         if isinstance(scene, BaseMesh):
             return Content(None, splats, surface=scene)
         return replace(content_of_mesh(scene, splats), surface=beside)

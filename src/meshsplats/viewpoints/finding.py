@@ -56,10 +56,9 @@ WIDE = 85.0
 WIDER = 1.5
 """...and how much more it shows, at most, than the view that it is a variation of: a narrow view is one
 because there is noise around it."""
-
-
-STANDS = "as the object stands (likely): with the usual -y it would tip over"
-LEVEL = "as floors or ground are level (likely)"
+BY_STANCE = "as the object stands (likely): with the usual -y it would tip over"
+BY_FLOORS = "as floors or ground are level (likely)"
+"""What shows another way up than the usual one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +219,17 @@ def first_impression(
         return replace(_before(cloud, outside.relief, given, 1, 400, 400), cameras=())
     if outside.kind == "object":
         return replace(_around(cloud, outside, 1, 400, 400), cameras=())
-    sample = Sample(cloud, first_up, threads, SMALL_SAMPLE)
-    places = find_places(sample, FEW)
-    if not places.worth.any():
+    seen = _glimpse(cloud, first_up, threads)
+    if seen is None:
         return replace(_around(cloud, outside._replace(confidence=0.0), 1, 400, 400), cameras=())
-    return _within(sample, places, outside.kind, outside.confidence, given)
+    return _within(*seen, outside.kind, outside.confidence, given)
+
+
+def _glimpse(cloud: GaussianCloud, up: np.ndarray, threads: int | None) -> tuple[Sample, Places] | None:
+    """A small sample of a scene, and few places in it; None where nothing can be seen from any of them."""
+    sample = Sample(cloud, up, threads, SMALL_SAMPLE)
+    places = find_places(sample, FEW)
+    return (sample, places) if places.worth.any() else None
 
 
 class UnusualUp(NamedTuple):
@@ -248,16 +253,16 @@ def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> UnusualUp | 
     outside = _from_outside(cloud, _key(cloud, given), usual, threads)
     if outside.kind == "object":
         stands = outside.up_confidence > 0 and not np.array_equal(outside.up, usual)
-        return UnusualUp(outside.up, STANDS) if stands else None
+        return UnusualUp(outside.up, BY_STANCE) if stands else None
     # A landscape is flat the usual way up, and its ground may slope.
     if outside.kind in ("relief", "aerial") or few or not cloud.opacities.any():
         return None
-    sample = Sample(cloud, usual, threads, SMALL_SAMPLE)
-    places = find_places(sample, FEW)
-    if not places.worth.any():
+    seen = _glimpse(cloud, usual, threads)
+    if seen is None:
         return None
-    upright = find_upright(sample, places, usual)
-    return UnusualUp(upright.up, LEVEL) if upright.level and not np.array_equal(upright.up, usual) else None
+    upright = find_upright(*seen, usual)
+    leans = upright.level and not np.array_equal(upright.up, usual)
+    return UnusualUp(upright.up, BY_FLOORS) if leans else None
 
 
 def _key(cloud: GaussianCloud, given: np.ndarray | None) -> _Key:

@@ -69,12 +69,10 @@ def _fineness(cloud: GaussianCloud, coarse: float, cameras: Sequence[Camera], th
 
 def surely_object(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> bool:
     """Whether a glance at few splats, each wider as it stands for others, says that a scene is an object."""
-    if len(cloud) < FEWEST:
-        return True
     if _is_landscape(cloud, up):
         return False
-    step = -(-len(cloud) // FEW_SPLATS)
-    few, wider = cloud.take(np.arange(0, len(cloud), step)), float(step) ** 0.5
+    few = subsample_of(cloud, FEW_SPLATS)
+    wider = (len(cloud) / len(few)) ** 0.5
     few = replace(few, scales=few.scales * np.float32(wider))
     return _fineness(few, wider * _coarse(len(cloud)), _dome(cloud, up), threads) >= SURELY_FINE
 
@@ -83,9 +81,9 @@ def _is_landscape(cloud: GaussianCloud, up: np.ndarray) -> bool:
     return len(cloud) >= LANDSCAPE and flatness(subsample_of(cloud), up) < FLAT
 
 
-def subsample_of(cloud: GaussianCloud) -> GaussianCloud:
-    """The splats, or every so many of them, evenly spread, at most ``OUTSIDE_SPLATS``."""
-    step = -(-len(cloud) // OUTSIDE_SPLATS)
+def subsample_of(cloud: GaussianCloud, most: int = OUTSIDE_SPLATS) -> GaussianCloud:
+    """The splats, or every so many of them, evenly spread, at most ``most``."""
+    step = -(-len(cloud) // most)
     return cloud if step == 1 else cloud.take(np.arange(0, len(cloud), step))
 
 

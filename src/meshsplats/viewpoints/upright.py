@@ -63,6 +63,7 @@ def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright
     area = _area_in_pictures(sample, best)
     scales = np.sort(sample.thin.scales, axis=1)
     flat = (scales[:, 0] < 0.5 * scales[:, 1]) & (area > 0)
+    flat_area = area * flat
     good = np.maximum(best.worth - 0.6 * best.worth.max(), 0)
     gaze = np.einsum("kd,dj->j", good, sample.gaze, optimize=False) / good.sum()
     peaks = _planes(sample.normals[flat], area[flat], sample.axes)
@@ -88,10 +89,10 @@ def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright
         agrees = float(up @ default)
         if agrees < -0.2 or (agrees < 0.3 and confidence < KNOWN):  # a wall, likely
             up, confidence = default, 0.0
-    exact, level = _measured(sample, area * flat, up)
+    exact, level = _measured(sample, flat_area, up)
     if not level and confidence < KNOWN and up @ default < LIKELY:
         up, confidence = default, 0.0
-        exact, level = _measured(sample, area * flat, up)
+        exact, level = _measured(sample, flat_area, up)
     if level:
         up, confidence = aligned(exact), max(confidence, MEASURED)
     height = sample.means @ up
@@ -114,7 +115,8 @@ def levelled(
     floors, tables and fields, which are level. And how much more they gather there than along the median of
     the directions around, as the sum of the squares of their ``weights`` (n,) at each height.
 
-    Normals of splats tell it within some 5 degrees, heights within one.
+    So the projection profiles of a scanned page tell its skew (Postl, ICPR 1986). Normals of splats tell up
+    within some 5 degrees, heights within one.
     """
     if not weights.any():
         return up, 0.0
@@ -127,14 +129,15 @@ def levelled(
         first, second = level_axes(up)
         tilted = up + np.tan(x[inside])[:, None] * first + np.tan(y[inside])[:, None] * second
         tilted /= np.linalg.norm(tilted, axis=1)[:, None]
-        sharp = np.array([_sharpness(points @ axis / (height * radius), weights) for axis in tilted])
+        sharp = np.array([_profile_energy(points @ axis / (height * radius), weights) for axis in tilted])
         k = int(sharp.argmax())
         up, gathered = tilted[k], gathered or float(sharp[k] / np.median(sharp))
     return up, gathered
 
 
-def _sharpness(heights: np.ndarray, weights: np.ndarray) -> float:
-    """The sum of the squares of the ``weights`` (n,) at each height, each shared by its two neighbours."""
+def _profile_energy(heights: np.ndarray, weights: np.ndarray) -> float:
+    """The sum of the squares of the ``weights`` (n,) at each of the ``heights`` (n,), in steps of 1; a weight
+    is shared by the two steps around it."""
     heights = heights - heights.min()
     below = np.floor(heights).astype(int)
     above = weights * (heights - below)
