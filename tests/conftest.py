@@ -23,6 +23,12 @@ from hypothesis import settings
 if TYPE_CHECKING:
     from _browser import Browser
 
+# There are as many workers of pytest-xdist as processors. Threads of BLAS and of PyTorch for each of them,
+# which wait for work in loops, would take a seventh of the time of all.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("repeatable")
 

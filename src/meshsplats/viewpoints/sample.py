@@ -6,11 +6,13 @@ splats look small; the noise behind walls, which no photograph shows, looks coar
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
+from meshsplats._core.library import processors
 from meshsplats._geometry import level_axes, rotation_rows
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
@@ -153,6 +155,7 @@ class Sample:
         self.axes = _frame(self.means - self.center, guess_up(cloud) if up is None else up, self.radius)
         self.gaze = fibonacci(DIRECTIONS) @ self.axes
         self.cube = np.concatenate([np.eye(3), -np.eye(3)]) @ self.axes
+        self.turns = np.stack([self._turn(k) for k in range(6)])
         self.rays = np.concatenate([self._rays(k) for k in range(6)])
         length = np.linalg.norm(self.rays, axis=1)
         self.rays /= length[:, None]
@@ -165,24 +168,37 @@ class Sample:
         """All splats, against which views are checked."""
         return AllSplats(self.cloud, self.threads)
 
+    def _turn(self, k: int) -> np.ndarray:
+        """(3, 3) rotation from the scene to the camera of face ``k`` of a panorama."""
+        up = self.axes[1] if k % 3 != 1 else self.axes[2]
+        return look_at(np.zeros(3), self.cube[k], up=up).world_to_camera[:3, :3]
+
     def _rays(self, k: int) -> np.ndarray:
         c = (np.arange(SIDE) + 0.5) / SIDE * 2 - 1
         x, y = np.meshgrid(c, c)
         grid = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-        rays: np.ndarray = grid @ self._face(np.zeros(3), k, 1).world_to_camera[:3, :3]
+        rays: np.ndarray = grid @ self.turns[k]
         return rays
 
-    def _face(self, place: np.ndarray, k: int, near: float) -> Camera:
-        gaze, up = self.cube[k], self.axes[1] if k % 3 != 1 else self.axes[2]
-        return look_at(place, place + gaze * self.radius, up=up, width=SIDE, height=SIDE, fov=90, near=near)
+    def _face(self, place: np.ndarray, k: int) -> Camera:
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.turns[k]
+        matrix[:3, 3] = -self.turns[k] @ place
+        return Camera(matrix, SIDE / 2, SIDE / 2, SIDE / 2, SIDE / 2, SIDE, SIDE, self.near)
 
     @property
     def near(self) -> float:
         """Depth of the near plane of panoramas."""
         return 0.003 * self.radius
 
+    def panoramas(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """What is seen from each of the ``places`` (k, 3), as ``panorama`` tells it."""
+        with ThreadPoolExecutor(self.threads or processors()) as pool:
+            return list(pool.map(self.panorama, places))
+
     def panorama(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What is seen from ``place`` (3,).
+        """What is seen from ``place`` (3,), found by one thread: images as small as its faces gain nothing
+        from more.
 
         Returns:
             (DIRECTIONS, bins) shares of the view that opaque pixels of an angle take, (DIRECTIONS,) mean
@@ -240,9 +256,9 @@ class Sample:
         )
         return render_splats(
             cloud,
-            self._face(place, k, self.near),
+            self._face(place, k),
             background=(0, 0, 0),
-            threads=self.threads,
+            threads=1,
             dilation=0.3 * (SIDE / SHARP_SIDE) ** 2,
         )
 
@@ -262,8 +278,7 @@ class Sample:
         along = toward @ self.cube.T
         face = along.argmax(axis=1)
         ahead = along[np.arange(len(rows)), face]
-        rotations = np.stack([self._face(np.zeros(3), k, 1).world_to_camera[:3, :3] for k in range(6)])
-        x, y = (np.einsum("kj,kj->k", rotations[face, axis], toward) / ahead for axis in (0, 1))
+        x, y = (np.einsum("kj,kj->k", self.turns[face, axis], toward) / ahead for axis in (0, 1))
         column, row = (np.clip(((v + 1) / 2 * SIDE).astype(int), 0, SIDE - 1) for v in (x, y))
         return away <= 1.2 * depth[face * SIDE * SIDE + row * SIDE + column] + 2 * self.size[rows], toward
 

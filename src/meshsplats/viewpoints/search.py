@@ -97,8 +97,7 @@ def find_places(sample: Sample, rounds: Sequence[int] = ROUNDS) -> Places:
             pick = rng.integers(len(top), size=count)
             new = top[pick] + 0.5 * apart[pick, None] * (rng.normal(size=(count, 3)) @ sample.axes)
         places = np.concatenate([places, new])
-        for place in new:
-            seen = sample.panorama(place)
+        for seen in sample.panoramas(new):
             for values, value in zip((shares, alpha, depth), seen, strict=True):
                 values.append(value)
     natural = natural_angle(np.array(shares))
