@@ -210,7 +210,7 @@ def _kernels(groups: bool, order: Order) -> dict[str, object]:
         },
         "digits": kernels.DIGITS,
         "lists": kernels.list_steps(order),
-        "raster": kernels.raster_steps(),
+        "raster": kernels.first_walk_steps(),
         "again": kernels.again_steps(),
         "sources": {
             "lists": kernels.lists_source(),

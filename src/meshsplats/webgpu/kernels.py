@@ -173,6 +173,11 @@ def tile_steps(order: Order) -> list[dict[str, Any]]:
 def raster_steps() -> list[dict[str, Any]]:
     """The steps from sorted pairs to samples: the first walk through all lists, and two more of those that
     need them."""
+    return [*first_walk_steps(), *again_steps()]
+
+
+def first_walk_steps() -> list[dict[str, Any]]:
+    """The steps from sorted pairs to the samples of all tiles whose lists need one walk."""
     return [
         *({"clear": "counters", "from": 8}, {"clear": "lists", "from": 0}, {"clear": "again", "from": 0}),
         {
@@ -181,7 +186,6 @@ def raster_steps() -> list[dict[str, Any]]:
             "indirect": ["plan", 24],
         },
         _raster("raster", "lists", "again", count=["tiles", 1]),
-        *again_steps(),
     ]
 
 

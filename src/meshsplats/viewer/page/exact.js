@@ -98,14 +98,16 @@ export class ExactRenderer {
         throw new Error(`a shader does not compile: ${name}, line ${wrong.lineNum}: ${wrong.message}`);
     }
     const steps = [...kernels.lists, ...kernels.raster].filter(step => step.kernel);
-    const entries = new Map(steps.map(({ kernel }) =>
-      [kernel, kernel === "raster" ? "raster" : kernel === "raster_again" ? "again" : "lists"]));
+    const entries = new Map(steps.map(({ kernel }) => [kernel, kernel === "raster" ? "raster" : "lists"]));
     entries.set("collect", "present");
     this.pipelines = {};
-    await Promise.all([...entries].map(async ([kernel, module]) => {
-      const compute = { module: modules[module], entryPoint: kernel === "raster_again" ? "raster" : kernel };
+    const compile = async (kernel, module, entryPoint) => {
+      const compute = { module: modules[module], entryPoint };
       this.pipelines[kernel] = await device.createComputePipelineAsync({ layout: "auto", compute });
-    }));
+    };
+    // Not all meshes have tiles with so many fragments, and this shader is one of the two that take longest.
+    this.compileAgain = () => compile("raster_again", "again", "raster");
+    await Promise.all([...entries].map(([kernel, module]) => compile(kernel, module, kernel)));
     this.painter = await device.createRenderPipelineAsync({
       layout: "auto", vertex: { module: modules.present, entryPoint: "corner" },
       fragment: { module: modules.present, entryPoint: "paint", targets: [{ format: this.format }] },
@@ -242,8 +244,9 @@ export class ExactRenderer {
     // finished. Software drivers cut loops after 65,535 iterations; walks are counted high, so the first is
     // safe, and the second mostly.
     const { budgets, pairs, rounds } = this.kernels.limits;
-    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1,
-      at = budgets.indexOf(this.budget);
+    const all = () => [...this.kernels.lists, ...this.kernels.raster,
+      ...this.pipelines.raster_again ? this.kernels.again : []];
+    let steps = all(), walks = -1, at = budgets.indexOf(this.budget);
     for (let round = 0; ; round++) {
       const counters = await this.#run(level, steps);
       if (this.problem) throw new Error(this.problem);
@@ -259,13 +262,14 @@ export class ExactRenderer {
         if (++at === budgets.length) throw new Error("the graphics device did not finish the image");
         this.budget = budgets[at];
         this.#prepare(level, strip, filterScale);
-        steps = [...this.kernels.lists, ...this.kernels.raster];
+        steps = all();
         walks = -1;
         round = 0;
         continue;
       }
       walks = counters[3];
       steps = this.kernels.again;
+      if (!this.pipelines.raster_again) await this.compileAgain();
     }
   }
 
