@@ -52,6 +52,8 @@ MOST = 4_000_000
 MOST_IN_VIEW = 400_000
 """...and of those in one view: over a hundred for each of its pixels, which hide no hole. Of more, every so
 many stand for all, wider."""
+AT_A_TIME = 16
+"""Panoramas that are drawn side by side, at most: of a large scene each takes 30 MB."""
 LEVELS = 255
 """Shares are rounded to this many parts: sums of whole numbers have the same bits in any order."""
 
@@ -193,7 +195,7 @@ class Sample:
 
     def panoramas(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """What is seen from each of the ``places`` (k, 3), as ``panorama`` tells it."""
-        with ThreadPoolExecutor(self.threads or processors()) as pool:
+        with ThreadPoolExecutor(min(self.threads or processors(), AT_A_TIME)) as pool:
             return list(pool.map(self.panorama, places))
 
     def panorama(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -89,7 +89,7 @@ export class ExactRenderer {
   }
 
   async #compile() {
-    const { device, kernels } = this, modules = {};
+    const { device, kernels } = this, modules = this.modules = {};
     for (const [name, code] of Object.entries({ ...kernels.sources, present: PRESENT })) {
       modules[name] = device.createShaderModule({ code });
       const wrong = (await modules[name].getCompilationInfo()).messages.find(
@@ -101,17 +101,16 @@ export class ExactRenderer {
     const entries = new Map(steps.map(({ kernel }) => [kernel, kernel === "raster" ? "raster" : "lists"]));
     entries.set("collect", "present");
     this.pipelines = {};
-    const compile = async (kernel, module, entryPoint) => {
-      const compute = { module: modules[module], entryPoint };
-      this.pipelines[kernel] = await device.createComputePipelineAsync({ layout: "auto", compute });
-    };
-    // Not all meshes have tiles with so many fragments, and this shader is one of the two that take longest.
-    this.compileAgain = () => compile("raster_again", "again", "raster");
-    await Promise.all([...entries].map(([kernel, module]) => compile(kernel, module, kernel)));
+    await Promise.all([...entries].map(([kernel, module]) => this.#compileKernel(kernel, module)));
     this.painter = await device.createRenderPipelineAsync({
       layout: "auto", vertex: { module: modules.present, entryPoint: "corner" },
       fragment: { module: modules.present, entryPoint: "paint", targets: [{ format: this.format }] },
     });
+  }
+
+  async #compileKernel(kernel, module, entryPoint = kernel) {
+    const compute = { module: this.modules[module], entryPoint };
+    this.pipelines[kernel] = await this.device.createComputePipelineAsync({ layout: "auto", compute });
   }
 
   // ---- The mesh
@@ -244,9 +243,9 @@ export class ExactRenderer {
     // finished. Software drivers cut loops after 65,535 iterations; walks are counted high, so the first is
     // safe, and the second mostly.
     const { budgets, pairs, rounds } = this.kernels.limits;
-    const all = () => [...this.kernels.lists, ...this.kernels.raster,
+    const fromTheStart = () => [...this.kernels.lists, ...this.kernels.raster,
       ...this.pipelines.raster_again ? this.kernels.again : []];
-    let steps = all(), walks = -1, at = budgets.indexOf(this.budget);
+    let steps = fromTheStart(), walks = -1, at = budgets.indexOf(this.budget);
     for (let round = 0; ; round++) {
       const counters = await this.#run(level, steps);
       if (this.problem) throw new Error(this.problem);
@@ -262,14 +261,15 @@ export class ExactRenderer {
         if (++at === budgets.length) throw new Error("the graphics device did not finish the image");
         this.budget = budgets[at];
         this.#prepare(level, strip, filterScale);
-        steps = all();
+        steps = fromTheStart();
         walks = -1;
         round = 0;
         continue;
       }
       walks = counters[3];
       steps = this.kernels.again;
-      if (!this.pipelines.raster_again) await this.compileAgain();
+      // Not all meshes have tiles that need it, and this shader is one of the two that take longest.
+      if (!this.pipelines.raster_again) await this.#compileKernel("raster_again", "again", "raster");
     }
   }
 
