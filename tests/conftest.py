@@ -29,7 +29,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
+examples = int(os.environ.get("MESHSPLATS_EXAMPLES", 25))
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=examples)
 settings.load_profile("repeatable")
 
 SHARED = Path(os.environ.get("MESHSPLATS_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -37,16 +37,32 @@ from meshsplats.tiles.building import build_tiles
 
 
 @pytest.fixture(scope="module")
-def scheduler():
-    """The address of a scheduler with two workers of one thread each."""
+def cluster():
+    """Two workers of one thread each."""
     distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=ANY_PORT) as cluster:
-        yield cluster.scheduler_address
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def scheduler(cluster):
+    """Their address."""
+    return cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")
 def splats(tmp_path_factory):
     return write_city(tmp_path_factory.mktemp("city"))
+
+
+@pytest.fixture(scope="module")
+def made_here(splats, tmp_path_factory):
+    """The folder of the tiles that one process makes."""
+    folder = tmp_path_factory.mktemp("here") / "tiles"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "BUCKET", 3000)
+        build_tiles(stream_gaussians(splats), folder, SMALL)
+    return folder
 
 
 @pytest.fixture(autouse=True)
@@ -199,7 +215,8 @@ def test_the_tasks_of_a_killed_worker_run_again(scheduler, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_a_task_that_kills_every_worker_ends_the_run(scheduler):
+def test_a_task_that_kills_every_worker_ends_the_run(cluster, scheduler, monkeypatch):
+    monkeypatch.setattr(cluster.scheduler, "allowed_failures", 1)  # three, usually: each start takes seconds
     with open_workers(scheduler) as workers:
         with pytest.raises(ClusterError, match="a task ended its workers, one after the other"):
             dict(workers.run(deadly, [0]))
@@ -239,12 +256,11 @@ def test_without_dask_the_extra_is_named(monkeypatch):
 
 
 @pytest.mark.slow
-def test_tiles_of_a_cluster_have_the_same_bits(splats, scheduler, tmp_path, capsys):
-    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
+def test_tiles_of_a_cluster_have_the_same_bits(splats, made_here, scheduler, tmp_path, capsys):
     words = ["tiles", str(splats), "-o", str(tmp_path / "there"), "--max-triangles", "4096"]
     assert main([*words, "--cluster", scheduler]) == 0
     assert "cluster: 2 workers of tcp://" in capsys.readouterr().err
-    assert results(tmp_path / "there") == results(tmp_path / "here")
+    assert results(tmp_path / "there") == results(made_here)
     assert not (tmp_path / "there.partial").exists()
 
 
@@ -264,8 +280,7 @@ def build_and_die(folder, build, cell):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_tiles_outlive_a_killed_worker(splats, scheduler, tmp_path, monkeypatch):
-    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
+def test_tiles_outlive_a_killed_worker(splats, made_here, scheduler, tmp_path, monkeypatch):
     build = building.build_cell
 
     def deadly_build(tiles, cell):
@@ -275,19 +290,18 @@ def test_tiles_outlive_a_killed_worker(splats, scheduler, tmp_path, monkeypatch)
     with open_workers(scheduler) as workers:
         build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, workers=workers)
     assert (tmp_path / "died").exists()
-    assert results(tmp_path / "there") == results(tmp_path / "here")
+    assert results(tmp_path / "there") == results(made_here)
 
 
 @pytest.mark.slow
-def test_images_of_a_cluster_have_the_same_bits(splats, scheduler, tmp_path):
+def test_images_of_a_cluster_have_the_same_bits(splats, made_here, scheduler, tmp_path):
     words = ["render", str(splats), "--orbit", "3", "--width", "64", "--depth", "png", "--animation", "none"]
     assert main([*words, "-o", str(tmp_path / "here")]) == 0
     assert main([*words, "-o", str(tmp_path / "there"), "--cluster", scheduler]) == 0
     found = results(tmp_path / "there")
     assert found == results(tmp_path / "here")
     assert len([name for name in found if name.endswith(".png")]) == 6
-    build_tiles(stream_gaussians(splats), tmp_path / "tiles", SMALL)
-    words[1] = str(tmp_path / "tiles")
+    words[1] = str(made_here)
     assert main([*words, "-o", str(tmp_path / "here2")]) == 0
     assert main([*words, "-o", str(tmp_path / "there2"), "--cluster", scheduler]) == 0
     assert results(tmp_path / "there2") == results(tmp_path / "here2")
@@ -334,19 +348,17 @@ def test_a_configuration_file_names_no_cluster(splats, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_a_killed_command_with_workers_is_resumed(splats, tmp_path):
-    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
-    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
-    words = [sys.executable, "-c", TILES, str(splats), str(tmp_path / "there")]
-    process = subprocess.Popen([*words, "new"])
+def test_a_killed_command_with_workers_is_resumed(splats, made_here, scheduler, tmp_path):
+    process = subprocess.Popen([sys.executable, "-c", TILES, str(splats), str(tmp_path / "there")])
     made = tmp_path / "there.partial" / "tileset"
     while len(list(made.rglob("*.glb"))) < 4 and process.poll() is None:
         time.sleep(0.002)
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (tmp_path / "there").exists()
-    subprocess.run([*words, "resume"], check=True)
-    assert results(tmp_path / "there") == results(tmp_path / "here")
+    with open_workers(scheduler) as workers:
+        build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, workers=workers, resume=True)
+    assert results(tmp_path / "there") == results(made_here)
 
 
 # ---- Full disks, lost schedulers
@@ -361,7 +373,7 @@ if __name__ == "__main__":
     with open_workers("local") as workers:
         building.build_tiles(
             stream_gaussians(sys.argv[1]), sys.argv[2], building.TileOptions(max_triangles=4096),
-            resume=sys.argv[3] == "resume", workers=workers,
+            workers=workers,
         )
 """
 
@@ -386,11 +398,10 @@ except FileNotFoundError:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
-def test_tiles_go_on_after_files_that_could_not_be_written(splats, tmp_path):
+def test_tiles_go_on_after_files_that_could_not_be_written(splats, made_here, tmp_path):
     """Files of a limited size, as on a disk with little room: whole tiles only; all after a resumption."""
-    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
     # The splats on their way into tiles fit, tiles do not.
-    largest = max(path.stat().st_size for path in (tmp_path / "here").rglob("*.glb"))
+    largest = max(path.stat().st_size for path in made_here.rglob("*.glb"))
     words = [sys.executable, "-c", LIMITED, str(splats), str(tmp_path / "there")]
     found = subprocess.run([*words, str(largest - 1)], capture_output=True, text=True)
     assert found.returncode == 1
@@ -399,7 +410,7 @@ def test_tiles_go_on_after_files_that_could_not_be_written(splats, tmp_path):
     for path in (tmp_path / "there.partial" / "tileset").rglob("*.glb"):
         load_mesh(path)
     build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, resume=True)
-    assert results(tmp_path / "there") == results(tmp_path / "here")
+    assert results(tmp_path / "there") == results(made_here)
 
 
 @pytest.fixture
@@ -416,18 +427,16 @@ def small_disk(tmp_path):
 
 
 @pytest.mark.slow
-def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, small_disk, tmp_path):
-    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
-    with open_workers("local") as workers, pytest.raises(OSError, match="no space left") as caught:
+def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, made_here, scheduler, small_disk):
+    with open_workers(scheduler) as workers, pytest.raises(OSError, match="no space left") as caught:
         build_tiles(stream_gaussians(splats), small_disk / "tiles", SMALL, workers=workers)
     assert caught.value.errno == errno.ENOSPC
     for path in (small_disk / "tiles.partial" / "tileset").rglob("*.glb"):
         load_mesh(path)
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
-    with open_workers("local") as workers:
+    with open_workers(scheduler) as workers:
         build_tiles(stream_gaussians(splats), small_disk / "tiles", SMALL, workers=workers, resume=True)
-    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
-    assert results(small_disk / "tiles") == results(tmp_path / "here")
+    assert results(small_disk / "tiles") == results(made_here)
 
 
 def test_tiles_say_that_the_disk_is_full_after_the_tiles_of_a_cell(splats, small_disk, monkeypatch):
@@ -458,7 +467,10 @@ def test_a_lost_scheduler_ends_the_run(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
     import dask
 
-    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=ANY_PORT)
+    # Its worker is a thread, which starts sooner than a process.
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=ANY_PORT, processes=False, protocol="tcp://"
+    )
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         open_workers(cluster.scheduler_address) as workers,

@@ -5,15 +5,31 @@ from __future__ import annotations
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from meshsplats import demo_scene
+import meshsplats
+from meshsplats import BaseMesh, GaussianCloud, demo_scene, surfaces
 from meshsplats.errors import MissingDependencyError
+from meshsplats.surfaces import make_surface
 
-ARGUMENTS = {"08_photographs": ["12", "64", "20"], "10_surface": ["64"]}
+ARGUMENTS = {
+    "06_mesh_prior": ["2"],
+    "08_photographs": ["12", "64", "20"],
+    "09_own_loop": ["6"],
+    "10_surface": ["64"],
+}
 """Fewer and smaller images, and fewer steps, run the same lines."""
+SURFACES = {"views": 8, "size": 64, "resolution": 48, "texture": 512, "rounds": 1}
+"""At most, of the surfaces that examples make."""
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
+
+
+def small_surface(splats: GaussianCloud, **options: Any) -> BaseMesh:
+    """That of ``make_surface``, which takes what the example says, but for the sizes."""
+    sizes = {name: min(options.get(name, most), most) for name, most in SURFACES.items()}
+    return make_surface(splats, **options | sizes)
 
 
 @pytest.mark.slow(keep=1)
@@ -22,6 +38,8 @@ def test_example_runs(example, tmp_path, monkeypatch, capsys):
     # A smaller scene takes less time and runs the same lines.
     small = demo_scene.make_scene(2_000)
     monkeypatch.setattr(demo_scene, "make_scene", lambda: small)
+    for module in (meshsplats, surfaces):
+        monkeypatch.setattr(module, "make_surface", small_surface)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(example), *ARGUMENTS.get(example.stem, [])])
     try:

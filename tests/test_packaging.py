@@ -198,6 +198,8 @@ def test_commands_of_the_documents_work(page, scene_file, tmp_path, monkeypatch,
         if command[1] == "train":
             at = command.index("--minutes")
             command[at : at + 2] = ["--steps", "2"]
+        if command[1] == "evaluate":
+            small = ["--strips", "1"]
         if command[1] == "levels":
             small = ["--no-tune", "--width", "48", "--levels", "2"]
         if command[1] == "surface":

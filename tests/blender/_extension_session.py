@@ -305,6 +305,7 @@ def event(kind):
 
 
 choices = {name: getattr(obj.meshsplats, name) for name in sys.modules[addon + ".settings"].CHOICES}
+choices["fast"] = True
 window, operator = Window(), Operator()
 answers = [operator.begin(window, work.Work([str(folder / "ball.ply")], choices))]
 answers.append(operator.modal(window, event("MOUSEMOVE")))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from meshsplats.blender.inside import cutting, objects, stand_ins
 from meshsplats.conversion.cleaning_rules import FLOATERS
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.viewpoints import finding
+from meshsplats.viewpoints.search import FEW, find_places
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -131,16 +134,20 @@ def test_splats_of_a_colour_and_floaters():
 
 
 @pytest.mark.slow
-def test_a_room_keeps_its_walls():
-    """By the rules alone, as they are when one is changed, almost twice as many splats are floaters."""
+def test_a_room_keeps_its_walls(monkeypatch):
+    """By the rules alone, as they are when one is changed, more splats are floaters. A quarter of the splats,
+    which have as much of a room; all of them: tests/conversion/test_surroundings.py."""
     path = DATA / "splats/trained/miku_59k_sh2.ply"
     if not path.exists():
         pytest.skip(f"needs {path}")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    mesh = convert(load_gaussians(path), mode="flat")
+    # Places to look around from are found as for a first impression, in half of the time.
+    monkeypatch.setattr(finding, "find_places", partial(find_places, rounds=FEW))
+    cloud = load_gaussians(path)
+    mesh = convert(cloud.take(np.arange(0, len(cloud), 4)), mode="flat")
     obj = objects.add(objects.prepare(mesh, False), "room", bpy.context.collection)
     removed = []
     for rules in (FLOATERS, replace(FLOATERS, min_part=0.0101)):
         found, faces = cutting.floaters(obj, rules)
         removed.append(len(np.unique(found.face_splat[faces])))
-    assert 500 < removed[0] < 0.8 * removed[1]
+    assert 300 < removed[0] < 0.9 * removed[1]

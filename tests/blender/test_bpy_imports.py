@@ -14,6 +14,7 @@ from _blender_scenes import ball_splats, cameras, random_mesh
 
 from meshsplats import convert, render, save_mesh
 from meshsplats.blender.inside import foreign, frame, meshes, objects, rendering, stage, versions
+from meshsplats.blender.options import FAST
 from meshsplats.colors import srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
 
@@ -118,7 +119,8 @@ def test_a_glb_needs_no_click(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".ply", ".usda"])
-def test_lit_click_gives_linear_colours_and_smoothed_normals(tmp_path, suffix):
+def test_lit_click_gives_linear_colours_and_smoothed_normals(tmp_path, suffix, monkeypatch):
+    monkeypatch.setattr(objects, "CAREFUL", FAST)  # how well light is made is tested elsewhere
     cloud, _ = ball_splats(300)
     mesh = convert(cloud, mode="flat")
     obj = opened(mesh, suffix, tmp_path)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import pytest
 
@@ -13,16 +15,28 @@ from _blender_scenes import ball_splats
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import baking, materials, meshes, objects, rendering, scene, stage
+from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb
+from meshsplats.mesh import SplatMesh
 
 SIDE = 48
 
 
-def built(mesh, view, light, samples=4):
-    options = SceneOptions(light=light, samples=samples)
-    layers, limit = subject.count(mesh, [view], options)
-    arrays, facts = subject.prepare(mesh, [view], options, layers)
-    return scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
+class Ball(NamedTuple):
+    """What every test begins with. What no light changes is made once, which takes most of the time."""
+
+    mesh: SplatMesh
+    view: Camera
+    subject: scene.Subject
+    limit: int
+    """That of transparent bounces."""
+    prepared: dict[str, Any]
+    """For a preview in a file of the user's."""
+
+
+def built(ball, light):
+    options = SceneOptions(light=light, samples=4)
+    return scene.build(ball.subject, [ball.view], options, ball.limit, edges=False)
 
 
 def shot(made, path):
@@ -34,7 +48,12 @@ def shot(made, path):
 def ball():
     cloud, _ = ball_splats(1500, noise=0.1)
     mesh = convert(cloud, mode="flat")
-    return mesh, orbit(mesh, 1, elevation=20, azimuth=30, width=SIDE, height=SIDE)[0]
+    view = orbit(mesh, 1, elevation=20, azimuth=30, width=SIDE, height=SIDE)[0]
+    options = SceneOptions(light=LightOptions(), within=())  # a ball is no place
+    layers, limit = subject.count(mesh, [view], options)
+    arrays, facts = subject.prepare(mesh, [view], options, layers)
+    made = scene.Subject(**arrays, **facts)
+    return Ball(mesh, view, made, limit, objects.prepare(mesh, True, fast=True, views=()))
 
 
 def light_of(obj):
@@ -45,8 +64,8 @@ def light_of(obj):
 
 
 def test_even_light_shows_the_unlit_image(ball, tmp_path):
-    mesh, view = ball
-    made = built(mesh, view, LightOptions(sun_strength=0, sky=1, ground="none", exposure=0))
+    mesh, view = ball.mesh, ball.view
+    made = built(ball, LightOptions(sun_strength=0, sky=1, ground="none", exposure=0))
     lit = linear_to_srgb(np.clip(shot(made, tmp_path / "lit.exr"), 0, 1))
     unlit = render(mesh, view, samples=2)
     inside = unlit.alpha > 0.02
@@ -56,8 +75,8 @@ def test_even_light_shows_the_unlit_image(ball, tmp_path):
 
 @pytest.mark.slow
 def test_the_image_of_the_splats_has_no_noise(ball, tmp_path):
-    mesh, view = ball
-    made = built(mesh, view, LightOptions(ground="none"))
+    mesh, view = ball.mesh, ball.view
+    made = built(ball, LightOptions(ground="none"))
     images = []
     for seed in (0, 1):
         made.scene.cycles.seed = seed
@@ -77,8 +96,8 @@ def test_the_image_of_the_splats_has_no_noise(ball, tmp_path):
 
 @pytest.mark.slow
 def test_lamps_and_other_objects_light_and_shade_the_splats(ball):
-    mesh, view = ball
-    made = built(mesh, view, LightOptions(sun=(0, 89), sky=0, ground="none"))
+    mesh = ball.mesh
+    made = built(ball, LightOptions(sun=(0, 89), sky=0, ground="none"))
     before = light_of(made.obj)
     top = -mesh.vertices[:, 1]  # y points down in the file
     cap = top > 0.9
@@ -98,8 +117,8 @@ def test_lamps_and_other_objects_light_and_shade_the_splats(ball):
 
 
 def test_the_unlit_mesh_comes_back_unchanged(ball):
-    mesh, _ = ball
-    obj = lit_ball(mesh)
+    mesh = ball.mesh
+    obj = lit_ball(ball)
     assert baking.points_of(obj) is not None
     assert not obj.visible_shadow
     again = objects.as_splat_mesh(obj)
@@ -111,14 +130,14 @@ def test_the_unlit_mesh_comes_back_unchanged(ball):
     assert baking.bake(bpy.context.scene, [obj]) == 0
 
 
-def lit_ball(mesh):
+def lit_ball(ball):
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    return objects.add(objects.prepare(mesh, True, fast=True), "ball", bpy.context.collection)
+    return objects.add(ball.prepared, "ball", bpy.context.collection)
 
 
 def test_painted_colours_of_a_lit_mesh_are_kept(ball):
-    mesh, _ = ball
-    obj = lit_ball(mesh)
+    mesh = ball.mesh
+    obj = lit_ball(ball)
     painted = meshes.read_colors(obj.data, meshes.COLOR)
     painted[:10, :3] = (1.0, 0.5, 0.0)
     painted[5:20, 3] = 0.25
@@ -131,7 +150,7 @@ def test_painted_colours_of_a_lit_mesh_are_kept(ball):
 
 
 def test_light_points_may_be_renamed_and_deleted(ball):
-    obj = lit_ball(ball[0])
+    obj = lit_ball(ball)
     points = baking.points_of(obj)
     points.name = "points"
     assert baking.points_of(obj) == points
@@ -145,8 +164,8 @@ def test_light_points_may_be_renamed_and_deleted(ball):
 
 def test_the_stand_in_is_seen_by_light_alone(ball, tmp_path):
     """A mirror shows the splats, the ground their shadow, and no camera the surface itself."""
-    mesh, view = ball
-    made = built(mesh, view, LightOptions(ground="none"))
+    mesh, view = ball.mesh, ball.view
+    made = built(ball, LightOptions(ground="none"))
     made.obj.hide_render = True
     seen = shot(made, tmp_path / "a.exr")
     made.obj.hide_render = False

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -43,8 +41,9 @@ def ball(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ball")
     cloud, _ = ball_splats(3000)
     mesh = convert(cloud, mode="flat")
-    view = orbit(mesh, 1, elevation=35, azimuth=20, width=128, height=96, distance=2.2)[0]
-    options = SceneOptions(light=LightOptions(sun=(100, 40), bounces=1), samples=24)
+    view = orbit(mesh, 1, elevation=35, azimuth=20, width=96, height=72, distance=2.2)[0]
+    # A ball is no place: no views from within are looked for.
+    options = SceneOptions(light=LightOptions(sun=(100, 40), bounces=1), samples=16, within=())
     made = built(mesh, view, options)
     splats = shot(made, view, folder / "splats.exr")
     for obj in (made.obj, *made.obj.children):
@@ -128,23 +127,19 @@ def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):
 
 
 @pytest.mark.slow
-def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
-    """Slow without a graphics card: one small scene for both."""
+def test_eevee_casts_a_shadow(tmp_path):
+    """Slow without a graphics card: one small image, in which all light on the ground is the sun's."""
     pytest.importorskip("ctypes").CDLL("libEGL.so.1")
     cloud, _ = ball_splats(400)
     mesh = convert(cloud, mode="flat")
     view = orbit(mesh, 1, elevation=35, azimuth=20, width=64, height=48, distance=2.2)[0]
-    draw_by_eevee(mesh, [view], images=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
-    plain = rendering.read_pixels(tmp_path / "plain.exr")[..., :3]
-    assert psnr(np.clip(plain, 0, 1), render(mesh, view).color) > 30
-    light = LightOptions(sun=(100, 40), sky=0.2)
-    options = SceneOptions(light=light, engine="eevee", samples=2)
+    options = SceneOptions(
+        light=LightOptions(sun=(100, 40), sky=0), engine="eevee", samples=2, background=(0, 0, 0), fast=True
+    )
     draw_by_eevee(mesh, [view], images=[tmp_path / "lit.exr"], options=options)
-    bare = replace(options, light=replace(light, sun_strength=0.0))
-    lit = rendering.read_pixels(tmp_path / "lit.exr").mean(axis=2)
-    draw_by_eevee(mesh, [view], images=[tmp_path / "bare.exr"], options=bare)
-    dark = rendering.read_pixels(tmp_path / "bare.exr").mean(axis=2)
-    floor = (render(mesh, view).alpha < 0.01) & (np.arange(48) > 30)[:, None]
-    sun = (lit - dark)[floor]
+    lit = rendering.read_pixels(tmp_path / "lit.exr")[..., :3].mean(axis=2)
+    alpha = render(mesh, view).alpha
+    floor = (alpha < 0.01) & (np.arange(48) > 30)[:, None]
+    sun = lit[floor]
     assert sun.max() > 0.2, "the sun shines on the ground"
     assert (sun < 0.1 * sun.max()).sum() > 20, "but not in the shadow"

@@ -189,24 +189,26 @@ def test_meshes_without_splats_are_sorted_by_the_triangle(scene):
 
 
 def test_eevee_draws_by_the_splat_from_all_sides(tmp_path):
-    """The command line, and the saved file, whose cameras are markers of the timeline: more than 60 dB."""
+    """The command line, and the saved file, whose cameras are markers of the timeline: more than 60 dB.
+    Without a graphics card each image takes seconds, however small it is."""
     try:
         ctypes.CDLL("libEGL.so.1")
     except OSError:
         pytest.skip("EEVEE needs libEGL")
     mesh = convert(ball_splats(200)[0])
     views = [view.with_near_plane(mesh.vertices) for view in orbit(mesh, 3, width=40, height=40)]
-    paths = [tmp_path / f"{i}.exr" for i in range(3)]
-    draw_by_eevee(mesh, views, images=paths, blend=tmp_path / "s.blend", options=SceneOptions(engine="eevee"))
+    paths, saved = [tmp_path / f"{i}.exr" for i in range(2)], tmp_path / "s.blend"
+    draw_by_eevee(mesh, views[:2], images=paths, blend=saved, options=SceneOptions(engine="eevee"))
     expected = [render(mesh, view, order="splat").color for view in views]
-    for path, image in zip(paths, expected, strict=True):
+    for path, image in zip(paths, expected[:2], strict=True):
         assert psnr(rendering.read_pixels(path)[..., :3], image) > 60
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(saved))
     scene = bpy.context.scene
-    # The same camera moves, too.
-    camera = scene.timeline_markers[2].camera
+    scene.eevee.use_shadows = False  # no lamp throws any, and each image takes a third of the time
+    # The second camera moves, too.
+    camera = scene.timeline_markers[1].camera
+    scene.frame_end = 2
     for at in (1, 2):
-        scene.timeline_markers[at].camera = camera
         from mathutils import Matrix
 
         rotation = frame.to_blender(mesh.up)

@@ -17,7 +17,7 @@ COMMANDS = {
     "converted/level_1.glb": ("levels", "--levels", "2", "--no-tune", "--width", "32"),
     "chain/level_1.glb": ("levels", "--levels", "2", *SMALL),
     "tiles/root.glb": ("tiles",),
-    "base.glb": ("surface", "--texture", "0", "--rounds", "0", "--resolution", "24"),
+    "base.glb": ("surface", "--texture", "0", "--rounds", "0", "--resolution", "24", "--views", "8"),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import subprocess
 import sys
 import warnings
@@ -325,3 +326,25 @@ def test_colors():
     for text in ("", "mauve", "#ff80", "#gg0000", "1,2,3", "0,0"):
         with pytest.raises(ValueError, match=r"^background must be white"):
             parse_color(text)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted by Linux")
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one processor: BLAS has no threads")
+@pytest.mark.parametrize(("variable", "more"), [(None, 0), ("2", 1)])
+def test_the_command_leaves_the_processors_to_the_core(variable, more):
+    """BLAS has no threads of its own, unless its variable says so."""
+    program = (
+        "import os\n"
+        "from meshsplats.cli import main\n"
+        "main(['doctor', '--help'])\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "import numpy\n"
+        "print('threads', len(os.listdir('/proc/self/task')) - before)\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    if variable is not None:
+        environment["OPENBLAS_NUM_THREADS"] = variable
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == f"threads {more}"

@@ -232,7 +232,7 @@ def test_a_batch_is_the_mean_of_its_images():
 
 def digest(threads: int | None) -> str:
     total = hashlib.sha256()
-    for shape in ((2, 300, 290, 3), (1, 17, 19, 1)):
+    for shape in ((2, 120, 110, 3), (1, 17, 19, 1)):
         image, target = pair(8, *shape)
         mask = torch.rand(shape[:3], generator=torch.Generator().manual_seed(4)) < 0.9
         for given_mask in (None, mask):

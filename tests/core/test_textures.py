@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshsplats._core.surfaces import Samples, coordinate_gradients, texel_sums, texture_samples
+from meshsplats._core.surfaces import (
+    Samples,
+    coordinate_gradients,
+    relax_texels,
+    texel_sums,
+    texture_samples,
+)
 
 EMPTY = np.array([0.25, 0.5, 0.75], np.float32)
 
@@ -72,12 +78,31 @@ def test_gradients_of_coordinates_are_those_of_the_colours():
         np.testing.assert_allclose(gradient[..., axis], slope, atol=2e-3)
 
 
+def relaxed(
+    samples: Samples, texels: np.ndarray, values: np.ndarray, threads: int | None = None
+) -> np.ndarray:
+    texels, sums = texels.copy(), np.full((*texels.shape[:2], 4), np.nan, np.float32)
+    relax_texels(samples, texels, values, sums, share=0.5, doubt=0.25, threads=threads)
+    return texels
+
+
+def test_relaxed_texels_take_a_share_of_their_mean_off_within_the_range_of_colours():
+    samples, texels, values = some(4)
+    values[..., :3] = 3 * values[..., :3] - 1
+    sums = texel_sums(samples, texels, values)
+    expected = texels + sums[..., :3] * (np.float32(-0.5) / (sums[..., 3:] + np.float32(0.25)))
+    assert expected.min() < 0
+    assert expected.max() > 1
+    np.testing.assert_array_equal(relaxed(samples, texels, values), np.clip(expected, 0, 1))
+
+
 def test_threads_do_not_change_a_bit():
     samples, texels, values = some(3)
     for one, four in (
         [texture_samples(samples, texels, EMPTY, threads=n) for n in (1, 4)],
         [texel_sums(samples, texels, values, threads=n) for n in (1, 4)],
         [coordinate_gradients(samples, texels, values, threads=n) for n in (1, 4)],
+        [relaxed(samples, texels, values, n) for n in (1, 4)],
     ):
         np.testing.assert_array_equal(one, four)
 

@@ -118,7 +118,6 @@ def test_no_triangles():
 @pytest.mark.parametrize(
     ("name", "limit", "alpha"),
     [
-        ("splats/playcanvas_logo_307k_sh0.ply", 50_000, "mask"),
         ("splats/guitar_sh0.ply", 50_000, "mask"),
         ("splats/tt_truck_sh0.ply", 50_000, "blend"),
     ],

@@ -27,7 +27,7 @@ from meshsplats import (
     splat_dataset,
 )
 from meshsplats.cli import main
-from meshsplats.cluster import Shared, Workers, open_workers
+from meshsplats.cluster import ANY_PORT, Shared, Workers, open_workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.datasets.views import Dataset, ImageCache, View, ViewImage
 from meshsplats.datasets.windows import window_of
@@ -48,6 +48,14 @@ CONFIG = make_config(steps=40)
 def scene():
     cloud = GaussianCloud.joined(list(city_blocks(COUNT, degree=0)))
     return CellScene(cloud, splat_dataset(cloud, train=20, test=4, width=56, zooms=(1,), threads=1))
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """The address of a scheduler with two workers of one thread each."""
+    distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=ANY_PORT) as cluster:
+        yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")
@@ -209,14 +217,6 @@ def test_cells_are_almost_as_good_as_the_whole(held, whole_run):
     assert found > best - 0.25 * (best - before)
 
 
-@pytest.mark.slow
-def test_a_cluster_gives_the_same_bits(held, whole_run, tmp_path):
-    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
-    with open_workers("local") as workers:
-        run = tuned(tmp_path / "run", held, workers=workers)
-    assert digests(run) == digests(whole_run)
-
-
 class Deadly(Workers):
     """Ends a worker once, when the checkpoint of a cell is there."""
 
@@ -245,9 +245,9 @@ def end_once(folder, function, task):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_cells_outlive_a_killed_worker(held, whole_run, tmp_path):
-    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
-    with open_workers("local") as workers:
+def test_cells_outlive_a_killed_worker(held, whole_run, scheduler, tmp_path):
+    """And have the same bits as in one process."""
+    with open_workers(scheduler) as workers:
         run = tuned(tmp_path / "run", held, workers=Deadly(workers, tmp_path))
     assert (tmp_path / "ended").exists()
     assert digests(run) == digests(whole_run)
@@ -308,29 +308,26 @@ import sys
 sys.path[:0] = {path!r}
 from pathlib import Path
 import test_cells
-resume = sys.argv[2] == "resume"
-test_cells.tuned(Path(sys.argv[1]), test_cells.scene(), resume=resume, checkpoint_seconds=0.2)
+test_cells.tuned(Path(sys.argv[1]), test_cells.scene(), checkpoint_seconds=0.2)
 """
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_a_killed_run_is_resumed(whole_run, tmp_path):
+def test_a_killed_run_is_resumed(held, whole_run, tmp_path):
+    """Killed in a cell, after another one."""
     program = RUN.format(path=[p for p in sys.path if p])
     folder = tmp_path / "run"
-    for done, mode in ((0, "new"), (1, "resume")):
-        process = subprocess.Popen([sys.executable, "-c", program, str(folder), mode])
-        until = time.monotonic() + 120
-        while process.poll() is None and time.monotonic() < until:
-            begun = len(list(folder.glob("cells/*/checkpoint.safetensors")))
-            if len(list(folder.glob("cells/*.npz"))) >= done and begun:
-                break
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    subprocess.run([sys.executable, "-c", program, str(folder), "resume"], check=True)
-    found = in_cells.TunedCells(sorted(folder.glob("cells/cell-*.npz")))
-    assert digests(found) == digests(whole_run)
+    process = subprocess.Popen([sys.executable, "-c", program, str(folder)])
+    until = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < until:
+        begun = len(list(folder.glob("cells/*/checkpoint.safetensors")))
+        if list(folder.glob("cells/*.npz")) and begun:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert digests(tuned(folder, held, resume=True)) == digests(whole_run)
 
 
 def test_what_is_for_a_whole_scene_is_refused(held, tmp_path):
@@ -389,8 +386,7 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["splats", "photographs"])
-def test_the_command_has_the_same_bits_on_a_cluster(kind, tmp_path):
-    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+def test_the_command_has_the_same_bits_on_a_cluster(kind, scheduler, tmp_path):
     splats = tmp_path / "city.ply"
     save_gaussian_blocks(city_blocks(1000, degree=0), splats, 1000)
     words = ["finetune", str(splats), "--steps", "12", "--cell-splats", "500", "--threads", "1"]
@@ -403,7 +399,7 @@ def test_the_command_has_the_same_bits_on_a_cluster(kind, tmp_path):
     else:
         words += ["--views", "6", "--width", "40", "--held-out", "0"]
     assert main([*words, "-o", str(tmp_path / "here.npz")]) == 0
-    assert main([*words, "-o", str(tmp_path / "there.npz"), "--cluster", "local"]) == 0
+    assert main([*words, "-o", str(tmp_path / "there.npz"), "--cluster", scheduler]) == 0
     here, there = (load_mesh(tmp_path / f"{name}.npz") for name in ("here", "there"))
     for name in ("vertices", "colors", "faces", "face_splat"):
         np.testing.assert_array_equal(getattr(there, name), getattr(here, name))

@@ -36,17 +36,15 @@ COMPILE = """(async (source, entries) => {
 @pytest.mark.parametrize(
     ("source", "entries"),
     [
-        (kernels.gradients_source(4), ("raster", *kernels.GRADIENT_KERNELS)),
-        (kernels.gradients_source(4, groups=True), ("raster",)),
-        (kernels.gradients_source(order="splat"), ("raster", *kernels.GRADIENT_KERNELS)),
-        (kernels.raster_source(order="splat"), ("raster",)),
-        (kernels.lists_source(), ("find_depths", "plan_runs", "order_runs")),
-        (kernels.filter_source(), ("widen", "widen_backward")),
+        (kernels.gradients_source(4, groups=True), ("raster", *kernels.GRADIENT_KERNELS)),
+        (kernels.gradients_source(order="splat"), ("raster", "add_samples")),
+        (kernels.filter_source(), ("widen_backward",)),
         (kernels.training_source(), kernels.TRAINING_KERNELS),
     ],
-    ids=["gradients", "groups", "by splat", "images by splat", "order of splats", "filter", "training"],
+    ids=["gradients", "by splat", "filter", "training"],
 )
 def test_kernels_of_gradients_and_training_compile(browser, tmp_path, source, entries):
+    """Those of images compile in pages, in test_exact.py; test_dawn.py has every kernel of every text."""
     (tmp_path / "empty.html").write_text("<!doctype html><title>empty</title>")
     page = browser.page((tmp_path / "empty.html").as_uri())
     problems = page.run(f"{COMPILE}({json.dumps(source)}, {json.dumps(entries)})")

@@ -5,19 +5,21 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from _browser import Browser, Page
+from _browser import Page
 from _needs import lacking
 from _pages import HEIGHT, WIDTH, cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa: F401
+from _shared_device import SharedDevice, shared_device
 
 import meshsplats as ms
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.demo_scene import make_scene
 from meshsplats.rendering.looks import image_of
-from meshsplats.viewer.page import _read
+from meshsplats.viewer.page import _read, make_page
 from meshsplats.viewer.quantise import quantise_mesh
 from meshsplats.webgpu.settings import DrawSettings, frame_uniform
 
@@ -25,8 +27,8 @@ PATIENCE = 400
 """Seconds for shaders that a busy processor compiles."""
 
 
-def open_page(browser: Browser, url: str, before: str = "") -> Page:
-    page = browser.page(url, WIDTH, HEIGHT, before=before)
+def open_page(device: SharedDevice, name: str, before: str = "") -> Page:
+    page = device.page(name, WIDTH, HEIGHT, before)
     page.wait("document.body.dataset.state !== 'loading'", PATIENCE)
     page.run("document.body.classList.add('plain')")
     page.choose("#samples", "1")
@@ -41,8 +43,21 @@ def open_page(browser: Browser, url: str, before: str = "") -> Page:
 
 
 @pytest.fixture(scope="module")
-def page(browser, write_page, mesh, cloud, cameras):
-    opened = open_page(browser, write_page(mesh, splats=cloud, cameras=cameras))
+def shown(browser, tmp_path_factory):
+    """Opens the page of a mesh. test_surface_in_page.py has one with a device of its own, from a file."""
+    folder = tmp_path_factory.mktemp("exact")
+
+    def show(mesh: ms.SplatMesh, name: str, before: str = "", **arguments: Any) -> Page:
+        (folder / f"{name}.html").write_text(make_page(mesh, **arguments).html, encoding="utf-8")
+        return open_page(device, f"{name}.html", before)
+
+    with shared_device(browser, folder) as device:
+        yield show
+
+
+@pytest.fixture(scope="module")
+def page(shown, mesh, cloud, cameras):
+    opened = shown(mesh, "scene", splats=cloud, cameras=cameras)
     yield opened
     assert opened.problems() == []
     opened.close()
@@ -168,7 +183,7 @@ def layered(cloud: ms.GaussianCloud, camera: ms.Camera) -> ms.SplatMesh:
 
 
 @pytest.mark.slow
-def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud, cameras):
+def test_linear_meshes_with_depth_groups_and_a_filter(shown, cloud, cameras):
     odd = replace(layered(cloud, cameras[0]), blending="linear", filter_px2=0.5)
     expected = levels(image_of(odd, cameras[0], (1, 1, 1))[0])
     for plain in (
@@ -178,7 +193,7 @@ def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud
     ):
         other = levels(image_of(plain, cameras[0], (1, 1, 1))[0])
         assert (np.abs(other - expected) > 1).any(axis=-1).mean() > 0.1
-    page = open_page(browser, write_page(odd, "odd", cameras=cameras))
+    page = shown(odd, "odd", cameras=cameras)
     difference = np.abs(page.screenshot().astype(int) - expected)
     assert (difference > 1).any(axis=-1).mean() < 0.002
     assert page.problems() == []
@@ -186,7 +201,7 @@ def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud
 
 
 @pytest.mark.slow
-def test_meshes_in_the_order_of_their_splats(browser, write_page, cloud, cameras):
+def test_meshes_in_the_order_of_their_splats(shown, cloud, cameras):
     """With thick splats, whose planes cross, and with depth groups, which have no effect."""
     splats = cloud.take(np.arange(0, len(cloud), 2))
     mesh = replace(ms.convert(splats, mode="3d"), order="splat")
@@ -194,7 +209,7 @@ def test_meshes_in_the_order_of_their_splats(browser, write_page, cloud, cameras
     image = ms.render(mesh, cameras[0])
     exact = levels(ms.render(mesh, cameras[0], order="fragment").color)
     assert (np.abs(exact - levels(image.color)) > 2).any(axis=-1).mean() > 0.1
-    page = open_page(browser, write_page(mesh, "by splat", cameras=cameras))
+    page = shown(mesh, "by splat", cameras=cameras)
     assert_within_one_level(page, image.color)
     page.choose("#crop-x0", "90")
     page.still(PATIENCE)
@@ -207,7 +222,7 @@ def test_meshes_in_the_order_of_their_splats(browser, write_page, cloud, cameras
 
 
 @pytest.mark.slow
-def test_strays_cost_the_others_nothing(browser, write_page, cloud, cameras):
+def test_strays_cost_the_others_nothing(shown, cloud, cameras):
     """One splat far away, one of a giant's size that cuts the scene, and the splats beside them."""
     wild = ms.GaussianCloud(
         np.concatenate([cloud.means, [[1e8, 0, 0], cloud.means.mean(axis=0)]]),
@@ -219,7 +234,7 @@ def test_strays_cost_the_others_nothing(browser, write_page, cloud, cameras):
     mesh = ms.convert(wild)
     image = ms.render(mesh, cameras[0]).color
     assert np.abs(image - ms.render(ms.convert(cloud), cameras[0]).color).mean() > 0.02
-    page = open_page(browser, write_page(mesh, "strays", splats=wild, cameras=cameras))
+    page = shown(mesh, "strays", splats=wild, cameras=cameras)
     difference = np.abs(page.screenshot().astype(int) - levels(image))
     assert (difference > 1).any(axis=-1).mean() < 0.005
     assert page.problems() == []
@@ -237,23 +252,18 @@ def limited(most: int) -> str:
     }} }});
     const request = GPUAdapter.prototype.requestDevice;
     GPUAdapter.prototype.requestDevice = function () {{ return request.call(this); }};
-    const create = GPUDevice.prototype.createBuffer;
-    GPUDevice.prototype.createBuffer = function (what) {{
+    owner.onbuffer = what => {{
       if (what.usage & GPUBufferUsage.STORAGE) window.largest = Math.max(window.largest, what.size);
-      return create.call(this, what);
     }};
     """
 
 
 @pytest.mark.slow
-def test_bindings_never_exceed_the_limit_of_the_device_and_the_image_is_the_same(
-    browser, write_page, mesh, cloud, cameras
-):
+def test_bindings_never_exceed_the_limit_of_the_device_and_the_image_is_the_same(shown, mesh, cloud, cameras):
     """The image is drawn in strips where samples and tile lists do not fit."""
-    address = write_page(mesh, "strips", cameras=cameras)
     most = 16 * WIDTH * HEIGHT  # half of what the samples of the image take
     assert 16 * len(mesh.vertices) < most
-    page = open_page(browser, address, before=limited(most))
+    page = shown(mesh, "strips", limited(most), cameras=cameras)
     assert page.run("document.querySelector('#message').hidden")
     assert 0.5 * most < page.run("largest") <= most
     assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
@@ -262,13 +272,12 @@ def test_bindings_never_exceed_the_limit_of_the_device_and_the_image_is_the_same
 
 
 @pytest.mark.slow
-def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(browser, write_page, cameras):
+def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(shown, cameras):
     many = ms.convert(make_scene(3000).of_degree(2))
-    address = write_page(many, "parts", cameras=cameras)
     most = 16 * WIDTH * HEIGHT
     share = most / 16 / len(many.vertices)
     assert share < 0.7
-    page = open_page(browser, address, before=limited(most))
+    page = shown(many, "parts", limited(most), cameras=cameras)
     said = re.search(
         r"the exact image lacks the (\d+) % of the triangles that show least", page.text("#messageText")
     )
@@ -301,9 +310,9 @@ def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(
 
 
 @pytest.mark.slow
-def test_levels_in_the_exact_image(browser, write_page, mesh, cloud, cameras):
+def test_levels_in_the_exact_image(shown, mesh, cloud, cameras):
     coarse = ms.convert(ms.simplify(cloud, 60))
-    page = open_page(browser, write_page(mesh, "exact-levels", coarse=coarse, cameras=cameras))
+    page = shown(mesh, "exact-levels", coarse=coarse, cameras=cameras)
     assert page.run("document.body.dataset.level") == "fine"
     assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
     page.choose("#detail", "coarse")
@@ -329,10 +338,10 @@ def glowing(cloud: ms.GaussianCloud, terms: int) -> ms.SplatMesh:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("terms", [3, 8, 15])
-def test_colours_depend_on_the_view(browser, write_page, cloud, cameras, terms):
+def test_colours_depend_on_the_view(shown, cloud, cameras, terms):
     """In the order of the splats, WebGL draws all but the exact image, too."""
     mesh = replace(glowing(cloud, terms), order="splat")
-    page = open_page(browser, write_page(mesh, f"glowing{terms}", cameras=cameras))
+    page = shown(mesh, f"glowing{terms}", cameras=cameras)
     decoded = quantise_mesh(mesh).decoded
     for renderer in ("exact", "sorted"):
         page.choose("#renderer", renderer)

@@ -224,7 +224,6 @@ def test_a_mesh_stands_in_its_file(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("name", "up"),
     [
-        ("trained/lego_60k_sh0.ply", [0, 0, 1]),
         ("trained/lego_60k_sh3.ply", [0, 0, 1]),
         ("guitar.compressed.ply", None),
         ("truck.splat", None),

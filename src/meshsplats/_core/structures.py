@@ -147,6 +147,8 @@ class TextureStruct(CoreStruct):
     _fields_ = [
         *int32("rows", "columns", "samples", "threads", "height", "width"),
         *pointers("uv", "covered", "texels", "color", "gradient", "texel_sums", "uv_gradient"),
+        *floats("share", "doubt"),
+        *pointers("relaxed"),
     ]
 
 

@@ -104,7 +104,8 @@ def texture_samples(
     """(rows, columns, 3) float32 colours of the samples: of the texture (th, tw, 3) float32, bilinear between
     the centres of texels and repeated beyond its border, and ``empty`` (3,) where nothing is covered."""
     color = np.empty((*samples.covered.shape, 3), np.float32)
-    color[:] = empty
+    # A row of them: NumPy spreads three values over an image pixel by pixel.
+    color[:] = np.tile(empty, (color.shape[1], 1)) if empty.ndim == 1 else empty
     struct = _struct(samples, texels, threads)
     struct.color = pointer(color)
     run("ms_texture", struct)
@@ -134,6 +135,27 @@ def texel_sums(
     struct.gradient, struct.texel_sums = pointer(values), pointer(result)
     run("ms_texture_backward", struct)
     return result
+
+
+def relax_texels(
+    samples: Samples,
+    texels: np.ndarray,
+    values: np.ndarray,
+    sums: np.ndarray,
+    *,
+    share: float,
+    doubt: float,
+    threads: int | None = None,
+) -> None:
+    """Moves each of the texels (th, tw, 3) float32 down the mean of ``values``, in place.
+
+    With the sums s and w of ``texel_sums`` of ``values`` (h, w, 4), a texel t becomes
+    t - share * s / (w + doubt), within 0 and 1. ``sums`` (th, tw, 4) float32 is memory, overwritten.
+    """
+    struct = _struct(samples, texels, threads)
+    struct.gradient, struct.texel_sums, struct.relaxed = pointer(values), pointer(sums), pointer(texels)
+    struct.share, struct.doubt = share, doubt
+    run("ms_texture_backward", struct)
 
 
 def _struct(samples: Samples, texels: np.ndarray, threads: int | None) -> TextureStruct:

@@ -110,7 +110,7 @@ constexpr MsField FIELDS[] = {
     MS_STRUCT(MsFusing, camera, size, low, voxel, center, radius, truncation, behind, depth, sum, weight,
               threads),
     MS_STRUCT(MsTexture, rows, columns, samples, threads, height, width, uv, covered, texels, color, gradient,
-              texel_sums, uv_gradient),
+              texel_sums, uv_gradient, share, doubt, relaxed),
     MS_STRUCT(MsNearest, count, neighbours, threads, points, order, nearest),
     MS_STRUCT(MsMerging, count, wanted, neighbours, threads, means, covariances, masses, colors, nearest,
               color_weight, group, remaining),

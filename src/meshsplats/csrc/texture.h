@@ -22,6 +22,10 @@ struct MsTexture {
                             // the samples of each pixel, and the weight that these samples have
     float *texel_sums;      // (height, width, 4): gradient, and sum of the weights, of each texel
     float *uv_gradient;     // (rows, columns, 2)
+    // Where `relaxed` is given, texel_sums is cleared before, and each texel t becomes t - share * s / (w +
+    // doubt), within 0 and 1, with the sums s of its colour and w of its weights. It may be `texels` itself.
+    float share, doubt;
+    float *relaxed;  // (height, width, 3)
 };
 
 }  // extern "C"
@@ -32,7 +36,8 @@ namespace ms {
 class TexturePass {
   public:
     explicit TexturePass(const MsTexture &texture) : in(texture) {
-        MS_ASSERT(in.rows >= 0 && in.columns >= 0 && in.samples >= 1 && in.height >= 1 && in.width >= 1);
+        MS_ASSERT(in.rows >= 0 && in.columns >= 0 && in.samples >= 1 && in.columns % in.samples == 0);
+        MS_ASSERT(in.height >= 1 && in.width >= 1);
     }
 
     void forward() {
@@ -52,12 +57,13 @@ class TexturePass {
         const int64_t band = (in.height + in.threads - 1) / std::max(1, in.threads);
         parallel_blocks(in.threads, in.height, std::max<int64_t>(band, 1),
                         [&](int64_t begin, int64_t end, int) {
+                            float *sums = in.texel_sums + 4 * begin * in.width;
+                            if (in.relaxed) std::fill(sums, sums + 4 * (end - begin) * in.width, 0.0f);
                             for (int64_t row = 0; row < in.rows; ++row)
-                                for (int64_t column = 0; column < in.columns; ++column) {
-                                    const int64_t at = row * in.columns + column;
-                                    if (in.covered[at])
-                                        add_texels(at, in.gradient + 4 * pixel_of(row, column), begin, end);
-                                }
+                                each_of(row, [&](int64_t at, int64_t pixel) {
+                                    add_texels(at, in.gradient + 4 * pixel, begin, end);
+                                });
+                            if (in.relaxed) relax(begin * in.width, end * in.width);
                         });
     }
 
@@ -67,18 +73,21 @@ class TexturePass {
         float fx, fy;
     };
 
+    // Calls body(sample, its pixel) for all covered samples, by rows.
     template <class Body>
     void each_sample(Body body) {
         parallel_blocks(in.threads, in.rows, 8, [&](int64_t begin, int64_t end, int) {
-            for (int64_t row = begin; row < end; ++row)
-                for (int64_t column = 0; column < in.columns; ++column)
-                    if (in.covered[row * in.columns + column])
-                        body(row * in.columns + column, pixel_of(row, column));
+            for (int64_t row = begin; row < end; ++row) each_of(row, body);
         });
     }
 
-    int64_t pixel_of(int64_t row, int64_t column) const {
-        return row / in.samples * (in.columns / in.samples) + column / in.samples;
+    // The same for one row. Divisions would take as long as the rest: pixels are counted.
+    template <class Body>
+    void each_of(int64_t row, Body body) const {
+        int64_t at = row * in.columns, pixel = row / in.samples * (in.columns / in.samples);
+        for (int32_t column = 0; column < in.columns; column += in.samples, ++pixel)
+            for (int32_t i = 0; i < in.samples; ++i, ++at)
+                if (in.covered[at]) body(at, pixel);
     }
 
     static float mix(float share, float a, float b) { return a + share * (b - a); }
@@ -116,7 +125,10 @@ class TexturePass {
     }
 
     void add_texels(int64_t at, const float *gradient, int64_t begin, int64_t end) const {
-        const Place p = place(at);
+        Place p;
+        p.fy = between(in.uv[2 * at + 1], in.height, p.y0, p.y1);
+        if ((p.y0 < begin || p.y0 >= end) && (p.y1 < begin || p.y1 >= end)) return;
+        p.fx = between(in.uv[2 * at], in.width, p.x0, p.x1);
         const int32_t y[2] = {p.y0, p.y1}, x[2] = {p.x0, p.x1};
         for (int j = 0; j < 2; ++j) {
             if (y[j] < begin || y[j] >= end) continue;
@@ -125,6 +137,16 @@ class TexturePass {
                 float *sums = in.texel_sums + 4 * ((int64_t)y[j] * in.width + x[i]);
                 for (int k = 0; k < 4; ++k) sums[k] += share * gradient[k];
             }
+        }
+    }
+
+    void relax(int64_t begin, int64_t end) const {
+        for (int64_t i = begin; i < end; ++i) {
+            const float *sums = in.texel_sums + 4 * i;
+            const float factor = -in.share / (sums[3] + in.doubt);
+            for (int k = 0; k < 3; ++k)
+                in.relaxed[3 * i + k] =
+                    std::max(0.0f, std::min(sums[k] * factor + in.texels[3 * i + k], 1.0f));
         }
     }
 

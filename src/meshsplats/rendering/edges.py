@@ -67,8 +67,10 @@ def index_digits(count: int) -> np.ndarray:
 def indices_of(digits: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """(h, w) int32 index of the triangle at each sample of an image of ``index_digits`` (h, w, 2), -1 where
     it is not ``covered`` (h, w)."""
-    whole = np.rint(digits).astype(np.int32)
-    return np.where(covered, whole[..., 0] + _ROOT * whole[..., 1], np.int32(-1))
+    indices = np.full(covered.shape, -1, np.int32)
+    whole = np.rint(digits[covered]).astype(np.int32)
+    indices[covered] = whole[:, 0] + _ROOT * whole[:, 1]
+    return indices
 
 
 def faces_across(faces: np.ndarray) -> np.ndarray:

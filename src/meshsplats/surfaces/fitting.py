@@ -117,7 +117,9 @@ def fit(
     steps = SmoothSteps(surface.vertices, surface.faces, stiffness)
     corners = surface.vertices[surface.faces]
     edge = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-    surface = surface._replace(across=faces_across(surface.faces))
+    texels = surface.texels.copy()
+    sums = np.empty((*texels.shape[:2], 4), np.float32)
+    surface = surface._replace(across=faces_across(surface.faces), texels=texels)
     total = rounds * len(views)
     for number, index in enumerate(np.concatenate([rng.permutation(len(views)) for _ in range(rounds)])):
         target, background, counts, solid = target_of(views[index], number)
@@ -127,18 +129,11 @@ def fit(
         if move:
             slope = image.vertex_gradients(error * np.float32(2 / error.size))
             vertices = steps.step(slope, move * edge * 0.1 ** (number / total))
-        weight = (
-            counts
-            * solid
-            * (image.coverage > _WHOLE)
-            * np.minimum(1, ROBUST / np.maximum(np.abs(error).max(2), ROBUST))
-        )
-        sums = image.texel_sums(error, weight)
-        part = RELAXATION[0] + (RELAXATION[1] - RELAXATION[0]) * number / total
-        texels = sums[..., :3]
-        texels *= np.float32(-part) / (sums[..., 3:] + np.float32(DOUBT))
-        texels += surface.texels
-        surface = surface._replace(vertices=vertices, texels=np.clip(texels, 0, 1))
+        size = np.maximum.reduce([np.abs(error[..., k]) for k in range(3)])
+        weight = counts * solid * (image.coverage > _WHOLE) * np.minimum(1, ROBUST / np.maximum(size, ROBUST))
+        share = RELAXATION[0] + (RELAXATION[1] - RELAXATION[0]) * number / total
+        image.relax(error, weight, share, DOUBT, sums)
+        surface = surface._replace(vertices=vertices)
         if progress is not None:
             progress()
     return surface._replace(across=None)

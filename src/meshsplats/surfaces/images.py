@@ -8,7 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import block_means
-from meshsplats._core.surfaces import Samples, coordinate_gradients, texel_sums, texture_samples
+from meshsplats._core.surfaces import (
+    Samples,
+    coordinate_gradients,
+    relax_texels,
+    texel_sums,
+    texture_samples,
+)
 from meshsplats._kinds import need
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
@@ -114,8 +120,18 @@ class SurfaceImage:
     def texel_sums(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """(th, tw, 4) float32 sums of ``values`` (h, w, 3) times ``weight`` (h, w), and of the weights, of
         the pixels that show each texel, in samples."""
-        each = np.concatenate([values * weight[..., None], weight[..., None]], axis=2, dtype=np.float32)
+        each = _weighted(values, weight)
         return texel_sums(self._samples, self._surface.texels, each, threads=self._threads)
+
+    def relax(
+        self, error: np.ndarray, weight: np.ndarray, share: float, doubt: float, sums: np.ndarray
+    ) -> None:
+        """Takes off each texel, of the surface itself, ``share`` of the mean ``error`` (h, w, 3) of the
+        samples that show it: a mean weighted by ``weight`` (h, w), with ``doubt`` more of a weight that has
+        no error. ``sums`` (th, tw, 4) float32 is memory, overwritten."""
+        each = _weighted(error, weight)
+        texels = self._surface.texels
+        relax_texels(self._samples, texels, each, sums, share=share, doubt=doubt, threads=self._threads)
 
     def _edges(self, gradient: np.ndarray) -> np.ndarray:
         """(v, 3) float64 gradient by the motion of visible edges."""
@@ -131,6 +147,14 @@ class SurfaceImage:
             0.5,
             threads=self._threads,
         )
+
+
+def _weighted(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(h, w, 4) float32: ``values`` (h, w, 3) times ``weight`` (h, w), and the weights."""
+    each = np.empty((*weight.shape, 4), np.float32)
+    np.multiply(values, weight[..., None], out=each[..., :3])
+    each[..., 3] = weight
+    return each
 
 
 def draw_surface(

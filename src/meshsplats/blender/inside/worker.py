@@ -115,6 +115,9 @@ def main(job_path: str) -> None:
             written.check_blend(path)
         report(saved=blend)
     factor = options.samples if light is None else 1
+    if light is None:
+        # Unlit splats throw no shadows, for which EEVEE would take most of the time of an image.
+        versions.set_if_there(built.scene.eevee, use_shadows=False)
     bpy.app.handlers.render_stats.append(report_stage)
     for i, target in enumerate(targets):
         camera, obj = cameras[i], built.cameras[i]
