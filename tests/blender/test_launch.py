@@ -78,6 +78,43 @@ def test_what_blender_said_last_is_in_the_error(program, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blender"]
 
 
+@pytest.mark.parametrize(
+    ("engine", "writes", "runs"), [("eevee", "", 2), ("cycles", "", 1), ("eevee", "echo half > {}; ", 1)]
+)
+def test_after_a_crash_eevee_gets_another_try(engine, writes, runs, program, tmp_path, monkeypatch):
+    """Unless there is an output already, which stays."""
+    monkeypatch.setattr(launch, "_check_graphics", lambda: None)
+    target, log = tmp_path / "a.png", tmp_path / "log"
+    line = f"echo run >> {log}; [ $(wc -l < {log}) = 1 ] || exit 3; {writes.format(target)}kill -SEGV $$"
+    crashing = program("Blender 5.3.0", line)
+    how = "exit code 3" if runs == 2 else "by signal SIGSEGV"
+    with pytest.raises(BlenderError, match=how):
+        draw(
+            random_mesh(3),
+            cameras()[:1],
+            images=[target],
+            options=SceneOptions(engine=engine),
+            executable=crashing,
+        )
+    assert log.read_text().count("run") == runs
+    names = ["a.png", "blender", "log"] if writes else ["blender", "log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+def test_crashes_of_eevee_end_with_an_error(program, tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "_check_graphics", lambda: None)
+    log = tmp_path / "log"
+    with pytest.raises(BlenderError, match=r"by signal SIGABRT.*crashes now and then"):
+        draw(
+            random_mesh(3),
+            cameras()[:1],
+            images=[tmp_path / "a.png"],
+            options=SceneOptions(engine="eevee"),
+            executable=program("Blender 5.3.0", f"echo run >> {log}; kill -ABRT $$"),
+        )
+    assert log.read_text().count("run") == launch.EEVEE_ATTEMPTS
+
+
 def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
     blender = program("Blender 5.0.1", f"touch {tmp_path}/started")
     places = [tmp_path / "nowhere"] + [Path("/proc")] * Path("/proc/self").exists()

@@ -32,6 +32,9 @@ OLDEST = (4, 2)
 JOB = "job.json"
 """For which the worker waits, in the folder of the process."""
 
+EEVEE_ATTEMPTS = 3
+"""How often Blender is started for EEVEE. Without a graphics card, 5.3.0 crashes one time in ten."""
+
 _GRAPHICS = "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
 _LIBRARIES = (
     " It needs these libraries of the system, even where there is no screen; on Debian and Ubuntu:"
@@ -179,7 +182,12 @@ def begun(
     outputs = [path for path in (*images, blend) if path is not None]
     with _scratch() as (folder, lock):
         temporary = {os.path.abspath(path): str(temporary_beside(path)) for path in outputs}
-        plan = {"command": [*start, str(folder / JOB)], "remove": [*temporary.values(), str(folder)]}
+        plan = {
+            "command": [*start, str(folder / JOB)],
+            "remove": [*temporary.values(), str(folder)],
+            "outputs": list(temporary),
+            "attempts": EEVEE_ATTEMPTS if options.engine == "eevee" else 1,
+        }
         (folder / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
         process = _start(start, folder, lock)
         try:
@@ -308,7 +316,8 @@ def _post_mortem(status: int, said: Sequence[str], options: SceneOptions) -> str
     elif options.engine == "eevee":
         advice = (
             " EEVEE needs OpenGL 4.3, with or without a screen; on Debian and Ubuntu:"
-            f" apt install {_GRAPHICS}. --engine cycles does without."
+            f" apt install {_GRAPHICS}. Without a graphics card, it also crashes now and then."
+            " --engine cycles does without."
         )
     return f"Blender ended {how} before it was done.{advice} It said: {words}"
 
