@@ -33,7 +33,7 @@ JOB = "job.json"
 """For which the worker waits, in the folder of the process."""
 
 EEVEE_ATTEMPTS = 3
-"""How often Blender is started for EEVEE. Without a graphics card, 5.3.0 crashes one time in ten."""
+"""How often Blender is started for EEVEE. Without a graphics card, 5.3.0 crashes now and then."""
 
 _GRAPHICS = "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
 _LIBRARIES = (
