@@ -135,19 +135,17 @@ def test_splats_of_a_colour_and_floaters():
 
 @pytest.mark.slow
 def test_a_room_keeps_its_walls(monkeypatch):
-    """By the rules alone, as they are when one is changed, more splats are floaters. A quarter of the splats,
-    which have as much of a room; all of them: tests/conversion/test_surroundings.py."""
+    """By the rules alone, as they are when one is changed, almost twice as many splats are floaters."""
     path = DATA / "splats/trained/miku_59k_sh2.ply"
     if not path.exists():
         pytest.skip(f"needs {path}")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     # Places to look around from are found as for a first impression, in half of the time.
     monkeypatch.setattr(finding, "find_places", partial(find_places, rounds=FEW))
-    cloud = load_gaussians(path)
-    mesh = convert(cloud.take(np.arange(0, len(cloud), 4)), mode="flat")
+    mesh = convert(load_gaussians(path), mode="flat")
     obj = objects.add(objects.prepare(mesh, False), "room", bpy.context.collection)
     removed = []
     for rules in (FLOATERS, replace(FLOATERS, min_part=0.0101)):
         found, faces = cutting.floaters(obj, rules)
         removed.append(len(np.unique(found.face_splat[faces])))
-    assert 300 < removed[0] < 0.9 * removed[1]
+    assert 500 < removed[0] < 0.8 * removed[1]

@@ -127,19 +127,21 @@ def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):
 
 
 @pytest.mark.slow
-def test_eevee_casts_a_shadow(tmp_path):
-    """Slow without a graphics card: one small image, in which all light on the ground is the sun's."""
+def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
+    """Slow without a graphics card: one small scene for both. All light on the ground is the sun's."""
     pytest.importorskip("ctypes").CDLL("libEGL.so.1")
     cloud, _ = ball_splats(400)
     mesh = convert(cloud, mode="flat")
     view = orbit(mesh, 1, elevation=35, azimuth=20, width=64, height=48, distance=2.2)[0]
+    draw_by_eevee(mesh, [view], images=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
+    plain = rendering.read_pixels(tmp_path / "plain.exr")[..., :3]
+    assert psnr(np.clip(plain, 0, 1), render(mesh, view).color) > 30
     options = SceneOptions(
         light=LightOptions(sun=(100, 40), sky=0), engine="eevee", samples=2, background=(0, 0, 0), fast=True
     )
     draw_by_eevee(mesh, [view], images=[tmp_path / "lit.exr"], options=options)
     lit = rendering.read_pixels(tmp_path / "lit.exr")[..., :3].mean(axis=2)
-    alpha = render(mesh, view).alpha
-    floor = (alpha < 0.01) & (np.arange(48) > 30)[:, None]
+    floor = (render(mesh, view).alpha < 0.01) & (np.arange(48) > 30)[:, None]
     sun = lit[floor]
     assert sun.max() > 0.2, "the sun shines on the ground"
     assert (sun < 0.1 * sun.max()).sum() > 20, "but not in the shadow"

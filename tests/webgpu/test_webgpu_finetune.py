@@ -337,7 +337,7 @@ def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch
     """Also where it stops between an image that has too many fragments and one that has not."""
     need_gpu()
     dataset, mesh = scene
-    config = make_config(steps=5, opacity_decay=0.01)
+    config = make_config(steps=8, opacity_decay=0.01)
     next_view = view_of_step(config, 3, len(dataset.train))
     views = list(dataset.train)
     camera = views[next_view].camera
