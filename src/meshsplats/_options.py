@@ -17,7 +17,7 @@ import inspect
 import math
 import sys
 import types
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
@@ -27,6 +27,14 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, 
 M = TypeVar("M")
 NUMBERS = (Real,)
 """Numbers of Python and of NumPy, which is not imported for help."""
+
+PLACEHOLDERS = {
+    **{"data": "FOLDER", "images": "FOLDER", "up": "TEXT", "background": "TEXT", "title": "TEXT"},
+    **dict.fromkeys(("before", "cameras", "collider", "executable", "hdri", "splats", "surface"), "FILE"),
+    **dict.fromkeys(("texture", "with_mesh"), "FILE"),
+    **{"crop": "X0 Y0 Z0 X1 Y1 Z1", "look_at": "X Y Z", "sun": "AZIMUTH ELEVATION"},
+}
+"""What stands in help for values of options that their types do not tell."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +132,17 @@ class Setting:
         only = self.kinds[0] if len(self.kinds) == 1 else None
         return get_args(only) if get_origin(only) is Literal else ()
 
+    @property
+    def placeholder(self) -> str:
+        """What stands for its value in help: its choices, a narrow range, or its type."""
+        if self.choices:
+            return "{" + ",".join(map(str, self.choices)) + "}"
+        limits = self.mark(Range)
+        if limits is not None and limits.high <= 100:
+            return f"{limits.low:g}..{limits.high:g}"
+        simple = {int: "N", float: "X", bool: "{True,False}"}.get(self.kinds[0])
+        return simple or PLACEHOLDERS.get(self.name, "VALUE")
+
     def check(self, value: Any, types: tuple[type, ...]) -> None:
         """ValueError for a value that the field does not allow. ``types``: those of numbers."""
         fixed, limits = self.mark(Fixed), self.mark(Range)
@@ -141,6 +160,17 @@ class Setting:
             if not number or not limits.low <= value <= limits.high or (whole and value % 1 != 0):
                 what = "a whole number" if whole else "a number"
                 raise ValueError(f"{self.name} must be {what} {limits}, got {value!r}")
+
+
+def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:
+    """Gives the values that ``presets`` have of an option, by its name, where any has one, for help."""
+
+    def values_of(name: str) -> str:
+        values = {preset: getattr(options, name) for preset, options in presets.items()}
+        known = [f"{preset}: {value}" for preset, value in values.items() if value is not None]
+        return f"({'; '.join(known)})" if known else ""
+
+    return values_of
 
 
 def settings(kind: type) -> dict[str, Setting]:

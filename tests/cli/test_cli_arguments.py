@@ -10,12 +10,21 @@ from typing import Literal, get_args, get_origin
 
 import numpy as np
 import pytest
+import tyro
 from _splats import few_splats
 
 from meshsplats import _toml as toml
 from meshsplats._options import alternatives
 from meshsplats.cli import COMMANDS, main
-from meshsplats.cli.arguments import INVOCATION, Command, _read_settings, _taken_apart, options_of
+from meshsplats.cli.arguments import (
+    _PARSED,
+    INVOCATION,
+    Command,
+    _read_settings,
+    _taken_apart,
+    options_of,
+    parse,
+)
 from meshsplats.cli.messages import flag
 from meshsplats.formats.gaussians import save_gaussians
 
@@ -45,6 +54,25 @@ def splats(tmp_path, monkeypatch):
     os.mkdir("in")
     save_gaussians(few_splats(), "in/scene.ply")
     return "in/scene.ply"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "convert a.ply b/ -o out/ --formats glb npz --max-splats 9 --force",
+        "render a.ply -o b.png --look-at 1 -2 3e-1 --up=-z --width 5",
+        "view a.ply --no-open --output b.html",
+        "evaluate a.npz b.npz -o out/ --data photos --background white",
+        "finetune a.ply -o b.glb --minutes 0.5 --opacity cutoff --json --threads 3",
+        "blender a.ply -o b.blend --sun 30 -5 --samples 4",
+        "surface a.ply -o b.usdc --unlit --collision drawn --levels 2",
+    ],
+)
+def test_options_that_are_not_given_change_nothing(line):
+    """Parsed with the given options alone, a line is the command that all options make of it."""
+    name, *words = line.split()
+    whole = tyro.cli(command(name), args=words, config=_PARSED)
+    assert parse(command(name), f"meshsplats {name}", words) == whole
 
 
 # ---- Help

@@ -19,6 +19,7 @@ from meshsplats.base_mesh import Texture
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
 from meshsplats.formats.gltf.cameras import cameras_in_mesh
 from meshsplats.formats.surfaces.convex import THICK, convex_parts
+from meshsplats.formats.usd.cameras import cameras_in_usd
 
 needs_scipy = pytest.mark.skipif(importlib.util.find_spec("scipy") is None, reason="install meshsplats[base]")
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="install meshsplats[usd]")
@@ -83,12 +84,21 @@ def some_views(far: float = 4.0):
 
 
 @pytest.mark.parametrize("origin", [(0, 0, 0), (5e5, 4.5e6, 100)])
-@pytest.mark.parametrize("collision", [None, pytest.param("convex", marks=needs_scipy)])
-def test_views_come_back(tmp_path, origin, collision):
+@pytest.mark.parametrize(
+    ("suffix", "collision"),
+    [
+        (".glb", None),
+        pytest.param(".glb", "convex", marks=needs_scipy),
+        pytest.param(".usdc", "drawn", marks=needs_usd),
+        pytest.param(".usda", None, marks=needs_usd),
+    ],
+)
+def test_views_come_back(tmp_path, origin, suffix, collision):
     base, given = tetrahedron(origin=origin), some_views()
-    save_base(base, tmp_path / "a.glb", cameras=given, collision=collision)
-    again = load_base(tmp_path / "a.glb")
-    found = [camera.relative_to(again.origin) for camera in cameras_in_mesh(tmp_path / "a.glb")]
+    file, read = tmp_path / f"a{suffix}", cameras_in_mesh if suffix == ".glb" else cameras_in_usd
+    save_base(base, file, cameras=given, collision=collision)
+    again = load_base(file)
+    found = [camera.relative_to(again.origin) for camera in read(file)]
     assert [camera.name for camera in found] == ["front", "view 2"]
     for camera, own in zip(found, given, strict=True):
         scale = np.array([own.width / camera.width, own.height / camera.height])  # square pixels now
@@ -96,10 +106,14 @@ def test_views_come_back(tmp_path, origin, collision):
         seen = camera.project(again.vertices[again.faces].reshape(-1, 3))
         assert np.abs(seen[0] * scale - places).max() < 0.02
         np.testing.assert_allclose(seen[1], depths, rtol=1e-5)
-    save_base(base, tmp_path / "b.glb", collision=collision)
-    assert cameras_in_mesh(tmp_path / "b.glb") == []
-    with pytest.raises(ValueError, match=r"cameras are for \.glb, not for \.obj"):
-        save_base(base, tmp_path / "b.obj", cameras=given)
+    save_base(base, tmp_path / f"b{suffix}", collision=collision)
+    assert read(tmp_path / f"b{suffix}") == []
+
+
+def test_views_are_not_lost_without_a_word(tmp_path):
+    with pytest.raises(ValueError, match=r"cameras are for \.glb, \.usdc, .*, not for \.obj"):
+        save_base(tetrahedron(), tmp_path / "b.obj", cameras=some_views())
+    assert not any(tmp_path.iterdir())
 
 
 def test_another_library_sees_the_surface_by_its_views(tmp_path):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import textwrap
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
@@ -17,7 +18,7 @@ import tyro
 
 from meshsplats import _toml as toml
 from meshsplats._option_values import converted, from_text, short
-from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
+from meshsplats._options import did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say, with_flags
 from meshsplats.errors import OptionsError, OptionValueError
 
@@ -28,13 +29,6 @@ INVOCATION = ("cluster", "executable", "force", "json", "resume", "skip_existing
 run programs, here or on a cluster, and --json, --resume and --skip-existing belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """Tables and keys of a configuration file. Only ``options`` is read."""
-METAVARS = {
-    **{"data": "FOLDER", "images": "FOLDER", "up": "TEXT", "background": "TEXT", "title": "TEXT"},
-    **dict.fromkeys(("before", "cameras", "collider", "executable", "hdri", "splats", "surface"), "FILE"),
-    **dict.fromkeys(("texture", "with_mesh"), "FILE"),
-    **{"crop": "X0 Y0 Z0 X1 Y1 Z1", "look_at": "X Y Z", "sun": "AZIMUTH ELEVATION"},
-}
-"""Placeholders for the values of options that their types do not tell."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed, tyro.conf.FlagCreatePairsOff)
 # Without the docstrings of fields, whose reading takes half of the time of parsing; --help has them from
 # ``_described``.
@@ -82,6 +76,16 @@ class Option:
     has_flag: bool
     """Whether it has a flag of its own. Fields that are ``tyro.conf.Fixed`` have none: --set or a
     configuration file sets them."""
+    part: tuple[str, Any, Any]
+    """Name, type with its marks, and default, as ``make_dataclass`` takes them."""
+
+    @property
+    def without_flag(self) -> bool:
+        """Whether it may be given without its flag: by its place, or by a short one; or has to be given."""
+        _, hint, default = self.part
+        marks = getattr(hint, "__metadata__", ())
+        short = any(getattr(mark, "aliases", None) for mark in marks)
+        return short or tyro.conf.Positional in marks or isinstance(default, Field)
 
     def value(self, command: object) -> Any:
         for name in self.path:
@@ -121,7 +125,7 @@ def _parsed(command: type[C], prog: str, line: Line) -> C:
     flags = {word.partition("=")[0] for word in line.words if word[:2] == "--"}
     _refuse_flags_of_settings(command, flags)
     if line.config is None and not line.settings:
-        return tyro.cli(command, prog=prog, args=line.words, config=_PARSED)
+        return _with_given(command, prog, line.words, flags)
     name = prog.rpartition(" ")[2]
     given = _read_settings(command, line.settings, flags, name)
     values: dict[str, Any] = {}
@@ -137,6 +141,27 @@ def _parsed(command: type[C], prog: str, line: Line) -> C:
     return tyro.cli(command, prog=prog, args=line.words, default=default, config=_FILLED)
 
 
+def _with_given(command: type[C], prog: str, words: list[str], flags: Collection[str]) -> C:
+    """``command`` as ``words`` describe it: parsed with none but the options in ``flags`` and those that need
+    none, which takes a tenth of the time, and with all of them where that fails, to say why."""
+    named = [
+        option.part
+        for name, option in options_of(command).items()
+        if option.has_flag and (flag(name) in flags or option.without_flag)
+    ]
+    given = make_dataclass(command.__name__, named, frozen=True)
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            found: Any = tyro.cli(given, prog=prog, args=words, config=_PARSED)
+    except SystemExit:
+        return tyro.cli(command, prog=prog, args=words, config=_PARSED)
+    return _filled(command, vars(found))
+
+
+def _default(part: Field[Any]) -> Any:
+    return field() if part.default is MISSING else part.default
+
+
 def _find_options(command: type) -> Mapping[str, Option]:
     found: dict[str, Option] = {}
     hints, marked = get_type_hints(command), get_type_hints(command, include_extras=True)
@@ -145,10 +170,11 @@ def _find_options(command: type) -> Mapping[str, Option]:
         if is_dataclass(hint):
             assert isinstance(hint, type)
             for name, inner in options_of(hint).items():
-                found[name] = Option((part.name, *inner.path), inner.hint, inner.has_flag)
+                found[name] = replace(inner, path=(part.name, *inner.path))
         elif hint is not object:
             has_flag = tyro.conf.Fixed not in getattr(marked[part.name], "__metadata__", ())
-            found[part.name] = Option((part.name,), hint, has_flag)
+            whole = (part.name, marked[part.name], _default(part))
+            found[part.name] = Option((part.name,), hint, has_flag, whole)
     return types.MappingProxyType(found)
 
 
@@ -191,7 +217,7 @@ def as_cli_options(
     Args:
         about: description of the group; by default the docstring of the class.
         without: names of options that the command lacks, beside those that cannot be changed.
-        metavars: placeholders for values; by default ``METAVARS``, the choices, the range, N or X.
+        metavars: placeholders for values; by default ``Setting.placeholder``.
         defaults: the end of an option's help, by its name.
         flags: booleans are flags and False by default.
         presets: options that are left out are None, as presets have their values; else they are those of the
@@ -217,7 +243,7 @@ def as_cli_options(
             elif is_dataclass(hint):
                 start = field(default_factory=hint)  # type: ignore[arg-type]
             elif presets or setting.optional:
-                metavar = metavars.get(name) or _placeholder(setting)
+                metavar = metavars.get(name) or setting.placeholder
                 hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
             parts.append((name, hint, start))
         names: dict[str, Any] = {"__doc__": about or group.__doc__, "__module__": group.__module__}
@@ -226,29 +252,6 @@ def as_cli_options(
         return make_dataclass(group.__name__, parts, bases=(group,), namespace=names, frozen=True)
 
     return made
-
-
-def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:
-    """``defaults`` of ``as_cli_options``: the values that the presets have, where any has one."""
-
-    def defaults(name: str) -> str:
-        values = {preset: getattr(options, name) for preset, options in presets.items()}
-        known = [f"{preset}: {value}" for preset, value in values.items() if value is not None]
-        return f"({'; '.join(known)})" if known else ""
-
-    return defaults
-
-
-def _placeholder(setting: Setting) -> str:
-    """What stands for the value of an option in the help: its choices, a narrow range, or its type."""
-    if setting.choices:
-        return "{" + ",".join(map(str, setting.choices)) + "}"
-    limits = setting.mark(Range)
-    if limits is not None and limits.high <= 100:
-        return f"{limits.low:g}..{limits.high:g}"
-    return {int: "N", float: "X", bool: "{True,False}"}.get(setting.kinds[0]) or METAVARS.get(
-        setting.name, "VALUE"
-    )
 
 
 def _taken_apart(words: Sequence[str]) -> Line:
@@ -323,7 +326,7 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
 
 
 def _described(command: type[T], shown: Collection[str], flags: Collection[str], about: str = "") -> type[T]:
-    """A class like ``command`` with help for the options ``shown``; the others are hidden. ``flags``: names
+    """A class like ``command`` with help for the options ``shown``, and without the others. ``flags``: names
     of all that have one. ``about``: its description, in place of its docstring."""
     parts, names = _described_parts(command, shown, flags), {"__doc__": about or command.__doc__}
     return make_dataclass(command.__name__, parts, namespace=names, frozen=True)
@@ -338,16 +341,13 @@ def _described_parts(
         hint, name = hints[part.name], part.name
         if Flat in getattr(hint, "__metadata__", ()):
             parts += _described_parts(hint.__origin__, shown, flags)
-            continue
-        if is_dataclass(hint):
+        elif is_dataclass(hint):
             group = _described(hint, shown, flags, known[name].help)  # type: ignore[arg-type]
             parts.append((name, group, field(default_factory=group)))
-            continue
-        if name not in shown:
-            hint = Annotated[hint, tyro.conf.Suppress]
-        elif known[name].help:  # else its type has the help, for options of several commands
-            hint = Annotated[hint, tyro.conf.arg(help=_with_flags(known[name].text, flags))]
-        parts.append((name, hint, field() if part.default is MISSING else part.default))
+        elif name in shown:
+            if known[name].help:  # else its type has the help, for options of several commands
+                hint = Annotated[hint, tyro.conf.arg(help=_with_flags(known[name].text, flags))]
+            parts.append((name, hint, _default(part)))
     return parts
 
 

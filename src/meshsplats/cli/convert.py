@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from meshsplats._options import of_presets
 from meshsplats._words import plural
 from meshsplats.cli import option
-from meshsplats.cli.arguments import Command, Flat, as_cli_options, of_presets, usage_errors
+from meshsplats.cli.arguments import Command, Flat, as_cli_options, usage_errors
 from meshsplats.cli.common import (
     SplatOptions,
     again,

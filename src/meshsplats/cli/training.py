@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 import tyro
 
 from meshsplats._files.atomic import together
+from meshsplats._options import of_presets
 from meshsplats.cli import option
-from meshsplats.cli.arguments import Command, as_cli_options, of_presets
+from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import draw_preview, written
 from meshsplats.cli.messages import UsageError, command_line, say, with_flags
 from meshsplats.cli.progress import progress_display

@@ -36,7 +36,7 @@ Collision = Literal["drawn", "only", "convex"]
 """Whether a surface that things collide with is drawn, too; or convex parts of it collide instead."""
 _BESIDE = (".obj", ".ply", ".usdc", ".usda", ".usd")
 """Formats whose texture is a file of its own."""
-_SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
+SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
 """Formats that say whether lights shade a surface."""
 PRINTED = (".stl", ".3mf")
 """Formats of shapes without colour."""
@@ -152,7 +152,7 @@ def save_base(
             and it has neither texture nor colours. ``convex``: (`.glb`) it is drawn, and at most 32 convex
             hulls of its parts are colliders, meshes that nobody draws and that are named ``UCX_surface_00``
             and so on, by which Unreal makes them the collision of the surface; needs scipy.
-        cameras: (`.glb`) views of a place, the first one to open with, relative to the surface's origin.
+        cameras: (`.glb`, USD) views of a place, the first one to open with, relative to the surface's origin.
 
     Raises:
         ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, or has
@@ -166,8 +166,8 @@ def save_base(
     suffix = target.suffix.lower()
     check_writing(target, unlit=unlit, image=image, collision=collision)
     need_all(Camera, cameras=cameras)
-    if cameras and suffix != ".glb":
-        raise ValueError(f"cameras are for .glb, not for {suffix}")
+    if cameras and suffix not in SHADED:
+        raise ValueError(f"cameras are for {', '.join(SHADED)}, not for {suffix}")
     if collision == "only":
         base = BaseMesh(base.vertices, base.faces, up=base.up, origin=base.origin)
     if image is not None and (suffix == ".npz" or suffix in PRINTED or not base.textured):
@@ -188,7 +188,7 @@ def save_base(
     }
 
     def usd(to: Path) -> None:
-        write_surface_usd(base, to, target, unlit=unlit, image=own, collision=collision)
+        write_surface_usd(base, to, target, unlit=unlit, image=own, collision=collision, cameras=cameras)
 
     with together(), atomic_path(target) as temporary:
         writers.get(suffix, usd)(temporary)
@@ -207,12 +207,12 @@ def check_writing(
     if suffix not in BASE_SUFFIXES:
         known = ", ".join(BASE_SUFFIXES)
         raise ValueError(f"{target.name!r} does not name a format; choose a name that ends in {known}")
-    if unlit and suffix not in _SHADED:
-        raise ValueError(f"unlit applies to {', '.join(_SHADED)} only, not to {suffix}")
+    if unlit and suffix not in SHADED:
+        raise ValueError(f"unlit applies to {', '.join(SHADED)} only, not to {suffix}")
     need_choice(TextureImage, optional=True, image=image)
     need_choice(Collision, optional=True, collision=collision)
-    if collision is not None and suffix not in _SHADED:
-        raise ValueError(f"collision applies to {', '.join(_SHADED)} only, not to {suffix}")
+    if collision is not None and suffix not in SHADED:
+        raise ValueError(f"collision applies to {', '.join(SHADED)} only, not to {suffix}")
     if collision == "convex" and suffix != ".glb":
         raise ValueError(f"collision 'convex' is for .glb, not for {suffix}")
 
@@ -225,7 +225,7 @@ def level_files(path: Path, count: int) -> list[Path]:
 def companions(path: Path, image: TextureImage | None = None) -> list[Path]:
     """The files that ``save_base`` may write beside ``path`` for a surface with a texture."""
     suffix = path.suffix.lower()
-    kinds = ("png",) if suffix in _SHADED else ("png", "jpg")
+    kinds = ("png",) if suffix in SHADED else ("png", "jpg")
     pictures = [path.with_suffix(f".{kind}") for kind in ((image,) if image else kinds)]
     if suffix != ".ply":
         pictures.append(path.with_name(f"{path.stem}_normal.{'webp' if image == 'webp' else 'png'}"))

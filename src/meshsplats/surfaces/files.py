@@ -156,7 +156,7 @@ class SurfaceRun:
         views = self._views(place, sources) if place is not None else []
         with together():
             for base, path in zip(bases, files, strict=True):
-                own = views if path == files[0] and path.suffix.lower() == ".glb" else ()
+                own = views if path == files[0] and path.suffix.lower() in base_meshes.SHADED else ()
                 save(self.place(scaled(base, chosen.scale)), path, cameras=own)
             self.record(beside(self.output, CONFIGURATION))
             if not chosen.no_preview:

@@ -19,6 +19,7 @@ from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.gltf.cameras import cameras_in_gltf, cameras_in_mesh
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named
+from meshsplats.formats.usd.cameras import cameras_in_usd
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewpoints.finding import find_cameras, worth_a_look
@@ -76,7 +77,7 @@ def default_views(
     threads: int | None = None,
 ) -> tuple[list[Camera], str] | None:
     """Up to ``count`` views of splats that are no object, and a line that says where they come from. None for
-    objects, which are seen from all around, and for meshes, unless their glTF file has cameras.
+    objects, which are seen from all around, and for meshes, unless their glTF or USD file has cameras.
 
     The cameras of a model folder come first, then those that ``find_cameras`` finds. A start camera
     (``opening_beside``) is the first of these, and of an object, too, where one view is asked for.
@@ -127,10 +128,10 @@ def _of_mesh(
 ) -> tuple[list[Camera], str] | None:
     """As ``default_views``, by the cameras inside the file of a mesh. A DataWarning says where they cannot be
     read."""
-    if source is None or not source.is_file() or source.suffix.lower() not in (".glb", ".gltf"):
+    if source is None or not source.is_file():
         return None
     try:
-        given = [camera.relative_to(mesh.origin) for camera in cameras_in_mesh(source)]
+        given = [camera.relative_to(mesh.origin) for camera in _cameras_inside(source)]
     except FileFormatError as error:
         warnings.warn(f"{error}; the cameras of the file are not used", DataWarning, stacklevel=3)
         return None
@@ -142,6 +143,14 @@ def _of_mesh(
     if film:
         return walk(views, count, mesh.up), f"seen on a round through {words}"
     return views, f"seen from {words}"
+
+
+def _cameras_inside(mesh: Path) -> list[Camera]:
+    """The cameras in the file of a mesh, in its world. Raises FileFormatError."""
+    suffix = mesh.suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        return cameras_in_mesh(mesh)
+    return cameras_in_usd(mesh) if suffix in (".usdc", ".usda", ".usd") else []
 
 
 def _spread(cameras: Sequence[Camera], count: int) -> list[Camera]:

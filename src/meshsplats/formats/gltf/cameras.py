@@ -7,16 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import OPENGL, Camera, to_opengl
-from meshsplats.choices import MAX_SIDE
+from meshsplats.camera import Camera, to_opengl
+from meshsplats.formats._file_cameras import near_plane, placed_camera
 from meshsplats.formats._orientation import HALF_TURN_Z, up_quaternion
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.own import grid_of, is_own_placement, our_note
 from meshsplats.formats.gltf.scene import placed_meshes, placed_nodes, rotation_matrix
 from meshsplats.formats.gltf.splats import has_own_frame, names_splats, splat_document
-
-_SIDE = 800
-"""Height of the images, pixels; the file names only their shape."""
 
 
 def cameras_in_gltf(path: Path) -> list[Camera]:
@@ -71,11 +68,10 @@ def camera_node(camera: Camera, number: int) -> dict[str, Any]:
 def lens_of(camera: Camera, points: np.ndarray) -> dict[str, Any]:
     """The camera of a file with the angle of ``camera``; its near plane, or one that is small beside the
     extent of the ``points`` (n, 3) of the scene."""
-    near = camera.near or float(np.ptp(points, axis=0).max()) / 10_000
     lens = {
         "yfov": 2 * float(np.arctan(camera.height / (2 * camera.fy))),
         "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
-        "znear": near or 1e-6,
+        "znear": near_plane(camera, points),
     }
     return {"type": "perspective", "perspective": lens}
 
@@ -83,18 +79,7 @@ def lens_of(camera: Camera, points: np.ndarray) -> dict[str, Any]:
 def _camera(document: GltfDocument, lens: dict[str, Any], matrix: np.ndarray, name: str) -> Camera:
     (angle,) = document.numbers([lens.get("yfov")], 1, "yfov of a camera")
     (shape,) = document.numbers([lens.get("aspectRatio", 1.0)], 1, "aspectRatio of a camera")
-    if not 0.01 < angle < 3.1 or not 1 / 16 <= shape <= 16:
-        raise document.error(
-            "a camera needs a yfov of 0.01 to 3.1 radians and an aspectRatio of 1/16 to 16, got"
-            f" {angle:g} and {shape:g}"
-        )
-    left, size, right = np.linalg.svd(matrix[:3, :3])
-    axes = left @ right
-    if size.min() <= 0 or np.linalg.det(axes) < 0:
-        raise document.error("the node of a camera mirrors it, or has no size")
-    rotation = (axes * OPENGL).T
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ matrix[:3, 3]
-    width = min(round(_SIDE * shape), MAX_SIDE)
-    focal = _SIDE / 2 / np.tan(angle / 2)
-    return Camera(pose, focal, focal, width / 2, _SIDE / 2, width, _SIDE, name=name)
+    try:
+        return placed_camera(matrix, angle, shape, name)
+    except ValueError as error:
+        raise document.error(str(error)) from None

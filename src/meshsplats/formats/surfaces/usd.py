@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,25 @@ import numpy as np
 
 from meshsplats._files.atomic import write_bytes
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats.surfaces.corners import normal_file, smooth_normals, texture_file
+from meshsplats.formats.usd.cameras import add_cameras
 from meshsplats.formats.usd.materials import normal_reader, preview_material, primvar_reader, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed
 from meshsplats.formats.usd.stage import make_collider, placed_mesh
 
 
 def write_surface_usd(
-    base: BaseMesh, path: Path, target: Path, *, unlit: bool, image: str | None, collision: str | None = None
+    base: BaseMesh,
+    path: Path,
+    target: Path,
+    *,
+    unlit: bool,
+    image: str | None,
+    collision: str | None = None,
+    cameras: Sequence[Camera] = (),
 ) -> None:
     """Writes ``base`` to ``path``, which will be ``target``: see ``save_base``."""
     try:
@@ -34,16 +44,18 @@ def write_surface_usd(
     if base.textured and base.normal_map is not None and not unlit:
         suffix, content = normal_file(base, image)
         pictures[f"{stem}_normal{suffix}"] = content
+    stage = _stage(base, unlit, list(pictures), collision)
+    add_cameras(stage, cameras, base.vertices)
     if target.suffix.lower() != ".usdz":
         for name, content in pictures.items():
             write_bytes(target.with_name(name), content)
-        export(_stage(base, unlit, list(pictures), collision), path)
+        export(stage, path)
         return
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".meshsplats-") as folder:
         inner = Path(folder) / "surface.usdc"
         for name, content in pictures.items():
             inner.with_name(name).write_bytes(content)
-        export(_stage(base, unlit, list(pictures), collision), inner)
+        export(stage, inner)
         packed(inner, path)
 
 

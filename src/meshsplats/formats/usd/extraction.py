@@ -104,7 +104,7 @@ def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[
     from pxr import Usd, UsdGeom
 
     stage = opened(file)
-    shapes, others = _visible(stage)
+    shapes, others = visible_meshes(stage)
     if not shapes:
         raise FileFormatError(
             "the stage holds no visible mesh" + (f", but {others:,} other shapes" if others else "")
@@ -113,12 +113,12 @@ def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[
     if others:
         report["warnings"].append(f"{others:,} shapes that are no meshes were left out")
     budget = Budget(file)
-    note = _our_note(shapes[0]) if len(shapes) == 1 else {}
+    note = our_note(shapes[0]) if len(shapes) == 1 else {}
     places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     matrices, own = [], False
     for shape in shapes:
         matrix = np.array(places.GetLocalToWorldTransform(shape.GetPrim()))
-        if note and _is_own_placement(matrix, note):
+        if note and is_own_placement(matrix, note):
             report["up"], own = note["up"], True
             matrix = np.eye(4)
         matrices.append(matrix)
@@ -160,7 +160,7 @@ def _has_clips(layer: Any, at: Any) -> bool:
     return prim is not None and prim.HasInfo("clips")
 
 
-def _visible(stage: Any) -> tuple[list[Any], int]:
+def visible_meshes(stage: Any) -> tuple[list[Any], int]:
     """The visible meshes, and the count of other visible shapes."""
     from pxr import Usd, UsdGeom
 
@@ -334,7 +334,7 @@ def _joined(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 # -- contents of our own files beyond the schemas
 
 
-def _our_note(shape: Any) -> dict[str, Any]:
+def our_note(shape: Any) -> dict[str, Any]:
     """Our custom data of a mesh if it is valid, else an empty dictionary."""
     note = shape.GetPrim().GetCustomDataByKey("meshsplats")
     if not isinstance(note, dict):
@@ -349,7 +349,7 @@ def _our_note(shape: Any) -> dict[str, Any]:
     return {**note, "up": up, "origin": origin} if good else {}
 
 
-def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
+def is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
     """Whether the node has the matrix (for row vectors) that our writer gives it."""
     from pxr import Gf
 
