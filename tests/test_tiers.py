@@ -38,6 +38,14 @@ QUICK = [
 ]
 
 
+def test_few_have_two_cases_of_a_function_at_most(pytester):
+    pytester.makeini("[pytest]\nmarkers = slow(keep)")
+    more = "\n@pytest.mark.parametrize('i', range(7))\ndef test_many_cases(i): pass\n"
+    few, others = of_tier(pytester.getitems(TESTS + more), "few")
+    assert [item.name for item in few] == [*QUICK, "test_many_cases[0]", "test_many_cases[6]"]
+    assert len(few) + len(others) == 22
+
+
 def test_each_test_is_of_one_tier_and_slow_functions_keep_some_cases(pytester):
     pytester.makeini("[pytest]\nmarkers = slow(keep)")
     items = pytester.getitems(TESTS)

@@ -121,6 +121,7 @@ def test_points_land_within_a_fiftieth_of_a_pixel(tmp_path):
         assert abs((weight * rows).sum() / weight.sum() - y) < 0.02
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["playbot_lod5_3k_sh2.ply", "guitar_sh0.ply"])
 def test_real_splats(tmp_path, name):
     cloud = load_gaussians(shared_data(f"splats/{name}"))

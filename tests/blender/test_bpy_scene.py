@@ -129,6 +129,7 @@ def test_scene_stands_upright():
         assert np.isclose(np.linalg.det(rotation), 1)
 
 
+@pytest.mark.slow
 def test_command_line_draws_the_tiles_of_a_tileset_that_the_camera_needs(tmp_path, capsys, monkeypatch):
     source = tmp_path / "city.ply"
     save_gaussians(GaussianCloud.joined(list(city_blocks(4000, degree=0))), source)

@@ -340,15 +340,15 @@ def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):
 def nested_balls(opacity: float) -> meshsplats.GaussianCloud:
     """A blue ball, and a red one inside it, which comes later in the file."""
     rng = np.random.default_rng(0)
-    directions = rng.normal(size=(1200, 3))
+    directions = rng.normal(size=(600, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    inside = np.arange(1200) >= 600
+    inside = np.arange(600) >= 300
     rgb = np.where(inside[:, None], (2.0, -1, -1), (-1, -1, 2.0))
     return meshsplats.GaussianCloud(
         directions * np.where(inside, 0.7, 1)[:, None],
-        np.tile([1.0, 0, 0, 0], (1200, 1)),
-        np.full((1200, 3), 0.09),
-        np.full(1200, opacity),
+        np.tile([1.0, 0, 0, 0], (600, 1)),
+        np.full((600, 3), 0.13),
+        np.full(600, opacity),
         rgb[:, None],
     )
 
@@ -359,7 +359,7 @@ def material(path) -> dict:
 
 def test_a_file_that_no_viewer_opens_says_so(tmp_path, capsys, monkeypatch):
     source = tmp_path / "balls.ply"
-    save_gaussians(nested_balls(0.5), source)
+    save_gaussians(few_splats(), source)
     for limit, said in ((10**6, False), (1000, True)):
         monkeypatch.setattr("meshsplats.cli.convert.LARGE_BYTES", limit)
         assert run(source, "-o", tmp_path / "m.glb", "--no-preview", "--force") == 0

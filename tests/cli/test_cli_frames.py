@@ -28,6 +28,13 @@ def splats(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def converted(splats):
+    path = splats.with_name("plain.glb")
+    assert main(["convert", str(splats), "-o", str(path), "--no-preview"]) == 0
+    return path
+
+
 def rotation(path) -> list[float]:
     document = pytest.importorskip("pygltflib").GLTF2().load(str(path))
     (node,) = (node for node in document.nodes if node.mesh is not None)
@@ -36,13 +43,12 @@ def rotation(path) -> list[float]:
 
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_root_node_is_that_of_convert(splats, tmp_path, name):
+def test_the_root_node_is_that_of_convert(splats, converted, tmp_path, name):
     pytest.importorskip("skimage") if name == "base.glb" else None
     command, *options = COMMANDS[name]
     output = tmp_path / (name.split("/")[0] if "/" in name else name)
     assert main([command, str(splats), "-o", str(output), *options]) == 0
-    assert main(["convert", str(splats), "-o", str(tmp_path / "plain.glb"), "--no-preview"]) == 0
-    assert rotation(tmp_path / "plain.glb") == [1, 0, 0, 0]
+    assert rotation(converted) == [1, 0, 0, 0]
     np.testing.assert_allclose(rotation(tmp_path / name), [1, 0, 0, 0], atol=1e-7)
 
 

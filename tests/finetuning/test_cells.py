@@ -388,10 +388,10 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
 @pytest.mark.parametrize("kind", ["splats", "photographs"])
 def test_the_command_has_the_same_bits_on_a_cluster(kind, scheduler, tmp_path):
     splats = tmp_path / "city.ply"
-    save_gaussian_blocks(city_blocks(1000, degree=0), splats, 1000)
-    words = ["finetune", str(splats), "--steps", "12", "--cell-splats", "500", "--threads", "1"]
+    save_gaussian_blocks(city_blocks(700, degree=0), splats, 700)
+    words = ["finetune", str(splats), "--steps", "6", "--cell-splats", "350", "--threads", "1"]
     if kind == "photographs":
-        cloud = GaussianCloud.joined(list(city_blocks(1000, degree=0)))
+        cloud = GaussianCloud.joined(list(city_blocks(700, degree=0)))
         cameras = orbit(cloud, 6, width=40, height=40, elevation=30)
         images = [render_splats(cloud, camera, background=(1, 1, 1)).color for camera in cameras]
         write_photographs(tmp_path / "data", cameras, images)

@@ -99,7 +99,7 @@ def test_texels_take_the_colours_of_the_images():
 @needs_scipy
 def test_a_ball_of_the_wrong_size_is_fitted_to_images():
     truth = ball()
-    views = views_of(truth, cameras(16, 64))
+    views = views_of(truth, cameras(12, 64))
     small = truth._replace(vertices=0.9 * truth.vertices)
     fitted = fit(mean_colors(small, views), views, rounds=6, move=0.5, stiffness=2.0)
     radii = [np.linalg.norm(s.vertices, axis=1) for s in (small, fitted)]

@@ -695,7 +695,7 @@ def test_training_on_the_gpu_is_that_of_the_processor(ball, monkeypatch):
     fetched = []
     plain = Trainer.fetch
     monkeypatch.setattr(Trainer, "fetch", lambda self, into: (fetched.append(1), plain(self, into)))
-    config = train_config(steps=6, **SMALL | {"growth_events": 1})
+    config = train_config(steps=4, **SMALL | {"growth_events": 1})
     found = {
         device: train(ball, config, run=RunOptions(device=device, report_every=0))
         for device in ("gpu", "cpu")

@@ -377,7 +377,7 @@ def test_a_resumed_run_has_the_same_bits(scene, tmp_path, terms):
     need_gpu()
     dataset, mesh = scene
     mesh = dark_with_harmonics(mesh, terms) if terms else mesh
-    check_resumed(dataset, mesh, make_config(steps=8), tmp_path)
+    check_resumed(dataset, mesh, make_config(steps=6), tmp_path)
 
 
 def check_resumed(dataset, mesh, config, tmp_path):

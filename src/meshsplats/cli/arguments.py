@@ -153,9 +153,9 @@ def _with_given(command: type[C], prog: str, words: list[str], flags: Collection
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             found: Any = tyro.cli(given, prog=prog, args=words, config=_PARSED)
-    except SystemExit:
+        return _filled(command, vars(found))
+    except (SystemExit, ValueError):
         return tyro.cli(command, prog=prog, args=words, config=_PARSED)
-    return _filled(command, vars(found))
 
 
 def _default(part: Field[Any]) -> Any:
