@@ -158,7 +158,7 @@ LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py cont
 
 test-lowest: $(LOWEST_VENV)/installed
 	MESHSPLATS_REQUIRE= MESHSPLATS_SHARED_DATA=left-out MESHSPLATS_EXAMPLES=10 $(LOWEST_VENV)/bin/python -m pytest \
-	  $(PARALLEL) --tier quick $(LOWEST_LEFT_OUT:%=--ignore=%)
+	  $(PARALLEL) --tier few $(LOWEST_LEFT_OUT:%=--ignore=%)
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
 $(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')
@@ -174,13 +174,13 @@ $(BLENDER_VENV)/%/installed: build/wheel/made
 	  || echo 'Mitsuba cannot be installed here: the test that compares it with Cycles is skipped'
 	@touch $@
 
-# Slow tests run in the newest of the versions alone.
+# Slow tests, and more than two cases of a quick one, run in the newest of the versions alone.
 BLENDER_TESTS := $(BPY:%=test-blender-%)
 test-blender: $(BLENDER_TESTS)
 $(BLENDER_TESTS): test-blender-%: $(BLENDER_VENV)/%/installed
 	@echo 'Blender $*'
 	@MESHSPLATS_REQUIRE= MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$*/bin/python -m pytest \
-	  --tier $(if $(filter $*,$(lastword $(BPY))),all,quick) \
+	  --tier $(if $(filter $*,$(lastword $(BPY))),all,few) \
 	  tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py
 
 $(SANITIZED)/address.so: SANITIZERS := address,undefined,float-cast-overflow \

@@ -439,6 +439,7 @@ def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, made_here, sche
     assert results(small_disk / "tiles") == results(made_here)
 
 
+@pytest.mark.slow
 def test_tiles_say_that_the_disk_is_full_after_the_tiles_of_a_cell(splats, small_disk, monkeypatch):
     keep = making.TileWriter.keep
 

@@ -90,6 +90,7 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     assert "next: meshsplats evaluate" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_preview_of_a_place_is_one_of_its_views(splats, tmp_path):
     """What is seen from given cameras is not shown from elsewhere; an object is, from before it."""
     cloud = load_gaussians(splats)
@@ -396,7 +397,7 @@ def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
     assert (tmp_path / "t.npz.run" / "checkpoint.safetensors").is_file()
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):

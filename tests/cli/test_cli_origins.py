@@ -170,7 +170,7 @@ MATCHED = ("trained",)
 TRAINED = ("trained", "tuned", "levels_glb", "prior", "cells")
 
 
-@pytest.mark.slow(keep=5)
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("output", COMMANDS)
 def test_results_stand_where_the_input_does(scenes, output):
     """All vertices and splats of the result are those of the unmoved scene, moved. Roundings to float32

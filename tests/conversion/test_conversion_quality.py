@@ -71,7 +71,7 @@ def test_each_ingredient_helps(scene):
     assert likeness(convert(cloud, footprint="none"), cloud, close, "splats") < wide - 0.3
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [300, 8000])
 def test_without_cameras(count):
     """Better than paper on coarse and fine clouds, at the distance of images of the whole and nearer."""

@@ -47,6 +47,7 @@ def test_a_room_is_seen_from_within(room):
     assert np.mean(inside) > 0.9
 
 
+@pytest.mark.slow
 def test_nothing_but_the_merging_follows_from_the_views(room):
     limit = ConversionOptions(max_splats=700)
     made = convert_within_limits(room, limit)
@@ -79,7 +80,7 @@ def test_many_splats_are_merged_in_blocks(room, monkeypatch):
     np.testing.assert_array_equal(alone.means, merging.simplify(room, 800).means)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "limits",
     [

@@ -158,6 +158,7 @@ def test_trimesh_reads_our_obj(tmp_path):
 # -- compressed .glb
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("alpha", "solid", "modes"),
     [("blend", 0, ["BLEND"]), ("opaque", 400, ["OPAQUE"]), ("hybrid", 150, ["OPAQUE", "BLEND"])],

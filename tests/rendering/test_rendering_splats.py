@@ -257,6 +257,7 @@ def test_what_lies_behind_a_wall_changes_no_bit(kernel):
 
 
 # Not 'antialiased': the opacity of splats far outside depends on the sides of the image.
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("kernel", ["3dgs", "2dgs"])
 @pytest.mark.parametrize("samples", [1, 2])
 def test_where_no_wall_is_the_rest_is_drawn(kernel, samples):

@@ -46,6 +46,7 @@ def test_no_time_is_enough_for_the_largest_photographs(photographs, monkeypatch)
     assert worthwhile_downscale(photographs, None, None) == 3
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("command", ["train", "finetune"])
 def test_a_run_says_its_size_and_keeps_it(command, scene, photographs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2 / 4)

@@ -145,7 +145,7 @@ def test_ranges_of_depth_hold_the_points(room):
     assert np.isfinite(ranges_of_points([turned, *room[1:]], few)[0]).all()
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [True, False])
 def test_the_start_has_the_scale_of_the_scene(masked):
     starts = []

@@ -37,7 +37,7 @@ def mesh():
     return ms.convert(make_scene(1500))
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_images_are_those_of_render(drawing, mesh, degree):
     mesh = mesh.of_degree(degree)

@@ -240,6 +240,7 @@ def test_info_and_cameras_and_previews_say_so(tmp_path, capsys):
     assert all(camera.world_to_camera[2, 2] > 0.98 for camera in film)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     "name",
     [

@@ -195,7 +195,7 @@ def renderer_of(mesh: SplatMesh) -> GradientRenderer:
     return GPU.gradients_of(mesh.triangles)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("queues", [(4, 4), (24, 8)])
 def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     mesh, view, _ = scene("many layers")
