@@ -37,7 +37,7 @@ Collision = Literal["drawn", "only", "convex"]
 _BESIDE = (".obj", ".ply", ".usdc", ".usda", ".usd")
 """Formats whose texture is a file of its own."""
 SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
-"""Formats that say whether lights shade a surface."""
+"""Formats that say whether lights shade a surface, and hold cameras."""
 PRINTED = (".stl", ".3mf")
 """Formats of shapes without colour."""
 BASE_SUFFIXES = (".glb", ".obj", ".ply", ".usdc", ".usda", ".usd", ".usdz", ".npz", *PRINTED)
