@@ -156,6 +156,7 @@ LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py cont
 	cli/test_cli_demo.py $(addprefix test_,benchmarks.py compare_commits.py house.py option_names.py rooms.py \
 	tutorials.py)) $(CORE_TESTS)
 
+# What MESHSPLATS_REQUIRE names is in the newcomer's environment alone, neither here nor in those of Blender.
 test-lowest: $(LOWEST_VENV)/installed
 	MESHSPLATS_REQUIRE= MESHSPLATS_SHARED_DATA=left-out MESHSPLATS_EXAMPLES=10 $(LOWEST_VENV)/bin/python -m pytest \
 	  $(PARALLEL) --tier few $(LOWEST_LEFT_OUT:%=--ignore=%)

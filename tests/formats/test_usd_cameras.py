@@ -96,6 +96,15 @@ def test_cameras_that_nobody_looks_through_are_left_out(tmp_path, changes):
     assert cameras_in_usd(write(tmp_path / "a.usda", **changes)) == []
 
 
+def test_a_mesh_without_cameras_takes_no_second_process(tmp_path, monkeypatch):
+    save_base(triangle(), tmp_path / "a.usdc")
+    save_base(triangle(), tmp_path / "b.usdc", cameras=around(1))
+    monkeypatch.setattr("meshsplats.formats.usd.cameras.extracted", lambda *_: ({"cameras": []}, 1 / 0))
+    assert cameras_in_usd(tmp_path / "a.usdc") == []
+    with pytest.raises(ZeroDivisionError):
+        cameras_in_usd(tmp_path / "b.usdc")
+
+
 @pytest.mark.parametrize("changes", [{"high": 0}, {"focal": "nan"}])
 def test_a_broken_lens_is_refused(tmp_path, changes):
     path = write(tmp_path / "a.usda", **changes)

@@ -14,8 +14,10 @@ import numpy as np
 from meshsplats.camera import Camera, to_opengl
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._file_cameras import near_plane, placed_camera
+from meshsplats.formats.usd.crate import holds_token, is_crate
 from meshsplats.formats.usd.reader import extracted
 
+_PRIM = b"Camera"
 _APERTURE = 0.36
 """Width of the film in tenths of a unit of the stage, which is a metre: 36 mm."""
 _FAR = 10.0
@@ -46,6 +48,9 @@ def cameras_in_usd(path: Path) -> list[Camera]:
 
     Raises FileFormatError for a broken file, MissingDependencyError without usd-core.
     """
+    with open(path, "rb") as file:
+        if is_crate(file) and not holds_token(file, _PRIM):
+            return []  # without a process for the library, as with most meshes
     report, _ = extracted(path, "meshsplats.formats.usd.camera_extraction")
     found = []
     for angle, shape, matrix, name in report["cameras"]:

@@ -14,6 +14,13 @@ _MOST = 4 << 20
 """Bytes of tokens that are unpacked; real files have a few kilobytes."""
 
 
+def is_crate(file: BinaryIO) -> bool:
+    """Whether a USD file, opened at its start, is binary. It is at its start again then."""
+    found = file.read(8) == b"PXR-USDC"
+    file.seek(0)
+    return found
+
+
 def holds_token(file: BinaryIO, token: bytes) -> bool:
     """Whether ``token`` is among those of an opened crate file; False for a broken one."""
     try:

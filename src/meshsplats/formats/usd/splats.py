@@ -22,7 +22,7 @@ from meshsplats.formats.content import Content
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within
-from meshsplats.formats.usd.crate import holds_token
+from meshsplats.formats.usd.crate import holds_token, is_crate
 from meshsplats.formats.usd.reader import extracted
 from meshsplats.gaussians import GaussianCloud
 
@@ -123,9 +123,7 @@ def _matches(content: Content) -> bool:
 
 
 def _holds_splats(file: BinaryIO) -> bool:
-    binary = file.read(8) == b"PXR-USDC"
-    file.seek(0)
-    return holds_token(file, _PRIM) if binary else _PRIM in file.read(_TEXT)
+    return holds_token(file, _PRIM) if is_crate(file) else _PRIM in file.read(_TEXT)
 
 
 def _open(content: Content, _file: BinaryIO, _reading: Reading) -> _UsdSplats:
