@@ -57,13 +57,13 @@ CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help dawn node-packages demo fuzz fuzz-core test test-slow test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
+.PHONY: help dawn node-packages demo fuzz fuzz-core test test-slow test-nightly test-lowest test-blender $(BPY:%=test-blender-%) test-sanitizers \
 	test-memory test-threads test-windows test-arm64 wheels release docs lint format clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo    splats to mesh, GLB, images, a comparison and a page, in $(DEMO)/'
-	@echo 'make test    the tests, but for those that take seconds each, which make test-slow runs'
+	@echo 'make test    the tests, but for those that take seconds each, which make test-slow and test-nightly run'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'
@@ -108,6 +108,11 @@ test: $(VENV)/installed-dev dawn
 
 test-slow: $(VENV)/installed-dev dawn
 	$(BIN)/python -m pytest $(PARALLEL) --tier slow
+
+# The slowest, in the newest Blender too.
+test-nightly: $(VENV)/installed-dev dawn $(BLENDER_VENV)/$(lastword $(BPY))/installed
+	$(BIN)/python -m pytest $(PARALLEL) --tier nightly
+	$(call in_blender,$(lastword $(BPY))) --tier nightly $(BLENDER_TESTS)
 
 # Chromium's compiler of WGSL, for tests/webgpu/test_dawn.py: 130 MB. Without npm, these tests are skipped.
 DAWN := build/dawn
@@ -176,13 +181,12 @@ $(BLENDER_VENV)/%/installed: build/wheel/made
 	@touch $@
 
 # Slow tests, and more than two cases of a quick one, run in the newest of the versions alone.
-BLENDER_TESTS := $(BPY:%=test-blender-%)
-test-blender: $(BLENDER_TESTS)
-$(BLENDER_TESTS): test-blender-%: $(BLENDER_VENV)/%/installed
+in_blender = MESHSPLATS_REQUIRE= MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$(1)/bin/python -m pytest
+BLENDER_TESTS := tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py
+test-blender: $(BPY:%=test-blender-%)
+$(BPY:%=test-blender-%): test-blender-%: $(BLENDER_VENV)/%/installed
 	@echo 'Blender $*'
-	@MESHSPLATS_REQUIRE= MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$*/bin/python -m pytest \
-	  --tier $(if $(filter $*,$(lastword $(BPY))),all,few) \
-	  tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py
+	@$(call in_blender,$*) --tier $(if $(filter $*,$(lastword $(BPY))),daily,few) $(BLENDER_TESTS)
 
 $(SANITIZED)/address.so: SANITIZERS := address,undefined,float-cast-overflow \
 	-fno-sanitize=null,object-size,vptr,pointer-overflow

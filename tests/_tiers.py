@@ -1,7 +1,8 @@
-"""Quick tests, which `make test` runs, and slow ones, which `make test-slow` runs.
+"""Quick tests, which `make test` runs, slow ones, which `make test-slow` runs, and the slowest, which run nightly.
 
-``@pytest.mark.slow`` marks a test as slow; of one with parameters, ``slow(keep=2)`` leaves two cases, as far
-apart as may be, among the quick tests. The tier ``few`` has at most two of the quick cases of each test.
+``@pytest.mark.slow`` marks a test as slow, ``@pytest.mark.nightly`` as one of the slowest; of one with
+parameters, ``slow(keep=2)`` and ``nightly(keep=2)`` leave two cases, as far apart as may be, among the quick
+tests. The tier ``daily`` has all but the slowest, ``few`` at most two of the quick cases of each test.
 """
 
 from __future__ import annotations
@@ -10,32 +11,34 @@ from collections.abc import Sequence
 
 import pytest
 
-TIERS = ("all", "quick", "slow", "few")
+TIERS = ("all", "daily", "quick", "slow", "nightly", "few")
 
 
 def of_tier(items: Sequence[pytest.Item], tier: str) -> tuple[list[pytest.Item], list[pytest.Item]]:
     """The tests of ``tier``, and the others, in the order of ``items``."""
-    if tier == "all":
-        return list(items), []
-    slow = slow_ones(items)
-    if tier == "few":
-        quick = cases_of([item for item in items if item not in slow])
-        few = {cases[i] for cases in quick.values() for i in far_apart(len(cases), 2)}
-        wanted = [item in few for item in items]
-    else:
-        wanted = [(item in slow) == (tier == "slow") for item in items]
-    pairs = list(zip(items, wanted, strict=True))
-    return [item for item, here in pairs if here], [item for item, here in pairs if not here]
+    slow, nightly = marked(items, "slow"), marked(items, "nightly")
+    quick = [item for item in items if item not in slow and item not in nightly]
+    cases = cases_of(quick).values()
+    tests = {
+        "all": items,
+        "daily": [item for item in items if item not in nightly],
+        "quick": quick,
+        "slow": slow,
+        "nightly": nightly,
+        "few": [same[i] for same in cases for i in far_apart(len(same), 2)],
+    }
+    wanted = set(tests[tier])
+    return [item for item in items if item in wanted], [item for item in items if item not in wanted]
 
 
-def slow_ones(items: Sequence[pytest.Item]) -> set[pytest.Item]:
-    """The slow tests among ``items``."""
-    slow: set[pytest.Item] = set()
-    for cases in cases_of([item for item in items if item.get_closest_marker("slow") is not None]).values():
-        marker = cases[0].get_closest_marker("slow")
+def marked(items: Sequence[pytest.Item], name: str) -> set[pytest.Item]:
+    """The tests with the marker ``name`` among ``items``, but for the cases that it keeps quick."""
+    found: set[pytest.Item] = set()
+    for cases in cases_of([item for item in items if item.get_closest_marker(name) is not None]).values():
+        marker = cases[0].get_closest_marker(name)
         kept = far_apart(len(cases), int(marker.kwargs.get("keep", 0)) if marker is not None else 0)
-        slow.update(case for i, case in enumerate(cases) if i not in kept)
-    return slow
+        found.update(case for i, case in enumerate(cases) if i not in kept)
+    return found
 
 
 def cases_of(items: Sequence[pytest.Item]) -> dict[str, list[pytest.Item]]:

@@ -116,11 +116,11 @@ def make_link(link: Path, target: Path) -> None:
 
 
 LEFT_OUT = pytest.StashKey[int]()
-"""Number of tests of the other tier, by worker processes if there are any, which all collect the same."""
+"""Number of tests of other tiers, by worker processes if there are any, which all collect the same."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--tier", choices=TIERS, default="all", help="the quick tests, the slow ones, or all")
+    parser.addoption("--tier", choices=TIERS, default="all", help="which tests, see tests/_tiers.py")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -149,9 +149,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Says what was left out or skipped, and how to get it."""
     config = terminalreporter.config
     if count := config.stash[LEFT_OUT]:
-        other = "slow" if config.getoption("tier") == "quick" else "quick"
-        command = {"slow": "make test-slow", "quick": "make test"}[other]
-        terminalreporter.write_line(f"{count:5} {other} tests left out: {command} runs them")
+        commands = {"quick": "make test", "slow": "make test-slow", "nightly": "make test-nightly"}
+        others = ", ".join(command for tier, command in commands.items() if tier != config.getoption("tier"))
+        terminalreporter.write_line(f"{count:5} tests of other tiers left out: {others}")
     skipped = [report.longrepr for report in terminalreporter.stats.get("skipped", [])]
     for line in skipped_lines(str(where[2]) for where in skipped if isinstance(where, tuple)):
         terminalreporter.write_line(line)

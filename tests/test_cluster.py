@@ -462,7 +462,7 @@ def slow_then(folder, task):
     return task
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_lost_scheduler_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr("meshsplats.cluster.SECONDS", 4)  # for which the client looks for it
     distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")

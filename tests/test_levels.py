@@ -308,7 +308,7 @@ def test_alpha_modes(splats, tmp_path, capsys):
     assert "--alpha mask is for .glb files, not .ply" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_levels_with_an_order(splats, tmp_path, capsys, monkeypatch):
     """Tuned through it and converted alone: what an independent viewer shows is what the table says."""
     import meshsplats.levels as module

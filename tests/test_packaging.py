@@ -170,7 +170,7 @@ def scene_file(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("page", ["docs/commands.md", "README.md"])
 def test_commands_of_the_documents_work(page, scene_file, tmp_path, monkeypatch, capsys):
     """One after the other in one folder, on a small scene and with small images."""

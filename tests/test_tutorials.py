@@ -57,7 +57,7 @@ def run_all(path: Path, capsys) -> None:
         assert main(small(command)) == 0, f"{shlex.join(command)}\n{capsys.readouterr().err}"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_from_a_splat_file(tmp_path, monkeypatch, capsys):
     cloud = make_scene(300)
     save_gaussians(cloud, tmp_path / "scene.ply")
@@ -68,7 +68,7 @@ def test_from_a_splat_file(tmp_path, monkeypatch, capsys):
     assert {"scores", "look", "tuned.npz", "tuned.glb"} <= {p.name for p in tmp_path.iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_places(tmp_path, monkeypatch, capsys):
     save_gaussians(make_room(3000), tmp_path / "room.ply")
     monkeypatch.chdir(tmp_path)
@@ -76,7 +76,7 @@ def test_places(tmp_path, monkeypatch, capsys):
     assert {"cameras.json", "round", "tuned.npz", "scores"} <= {p.name for p in tmp_path.iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_from_photographs(tmp_path, monkeypatch, capsys):
     cloud = make_scene(300)
     save_gaussians(cloud, tmp_path / "scene.ply")

@@ -133,7 +133,7 @@ def test_splats_of_a_colour_and_floaters():
         cutting.chosen_splats(obj, region((0, 0, 0), 0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_room_keeps_its_walls(monkeypatch):
     """By the rules alone, as they are when one is changed, almost twice as many splats are floaters."""
     path = DATA / "splats/trained/miku_59k_sh2.ply"

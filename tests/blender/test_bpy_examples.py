@@ -26,7 +26,7 @@ def run(name, folder, *arguments):
     return done.stdout, folder / "example-output"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_lights_give_three_images(tmp_path):
     save_gaussians(demo_scene.make_scene(600), tmp_path / "scene.ply")
     _, out = run("three_lights.py", tmp_path, "scene.ply", "--width", 48, "--samples", 2)
@@ -38,7 +38,7 @@ def test_three_lights_give_three_images(tmp_path):
         assert np.abs(images[k] - images[k - 1]).mean() > 0.05, "lights differ"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_vase_falls(tmp_path):
     printed, out = run("falling.py", tmp_path, "--width", 40, "--samples", 1, "--splats", 800)
     tilt = re.search(r"the vase lies at (\d+) degrees", printed)

@@ -70,7 +70,7 @@ def watch(scene, camera):
     return obj
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.nightly(keep=1)
 @pytest.mark.parametrize("light", [None, LightOptions(bounces=0, ground="none")], ids=["unlit", "lit"])
 def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chain, light):
     """Whatever level is shown, the file renders as if it were alone."""

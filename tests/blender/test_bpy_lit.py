@@ -126,7 +126,7 @@ def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):
             bpy.data.objects.remove(sun)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
     """Slow without a graphics card: one small scene for both. All light on the ground is the sun's."""
     pytest.importorskip("ctypes").CDLL("libEGL.so.1")

@@ -131,6 +131,7 @@ def test_what_cannot_be_drawn_comes_back_too(scene):
     assert attributes(obj) == before
 
 
+@pytest.mark.nightly
 def test_light_is_that_of_a_mesh_of_the_splats(scene):
     """The same sun on both, one after the other: each splat takes what its fan takes."""
     cloud = ball()

@@ -42,7 +42,7 @@ def coarse(image):
     return image[: 4 * height, : 4 * width].reshape(height, 4, width, 4, -1).mean(axis=(1, 3))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mitsuba_and_cycles_agree(tmp_path):
     """Same light, same ground, triangles shaded by their own normals: the same linear light."""
     mesh = convert(ball_splats(300)[0], mode="flat")

@@ -44,7 +44,7 @@ def test_cycles_draws_what_the_renderer_draws(degree, tmp_path):
         assert psnr(drawn, render(mesh.of_degree(0), view).color) < 30
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.nightly(keep=1)
 @pytest.mark.parametrize("degree", [3, 2])
 def test_eevee_takes_as_many_attributes(degree, tmp_path):
     """It draws wrong colours, or nothing, where a material reads more than 14."""

@@ -22,7 +22,7 @@ def small(monkeypatch):
     monkeypatch.setattr(demo_scene, "make_scene", lambda: make_scene(500))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_it_makes_a_scene_and_types_the_first_commands(tmp_path, quick, capfd, monkeypatch):
     opened = []
     monkeypatch.setattr(server, "open_page", lambda url: not opened.append(url))

@@ -115,7 +115,7 @@ def test_kernels():
     assert filtered > likeness(convert(surfels, preset="paper"), surfels, cameras, "splats") + 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_splats():
     """The paper's conversion has the figures that were measured independently; the default beats it."""
     cloud = one_color_each(load_gaussians(shared_data("splats/playbot_lod3_31k_sh2.ply")))

@@ -65,7 +65,7 @@ def test_a_mesh_without_splats_and_degenerate_ones_work():
     assert shading_normals(nothing).shape == (0, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
     cloud, _ = ball_splats(500)
     mesh = convert(cloud)

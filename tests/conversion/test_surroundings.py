@@ -194,7 +194,7 @@ def test_the_command_keeps_the_wall(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "surround" not in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_walls_of_a_real_room_stay(monkeypatch: pytest.MonkeyPatch):
     """Seen from where the photographs were taken: 41.7 dB; by the rules alone, which take the walls, 24.0."""
     path = DATA / "splats/trained/miku_59k_sh2.ply"

@@ -114,7 +114,7 @@ def test_no_triangles():
         choose_alpha(SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 4))))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "limit", "alpha"),
     [

@@ -253,7 +253,7 @@ def test_cells_outlive_a_killed_worker(held, whole_run, scheduler, tmp_path):
     assert digests(run) == digests(whole_run)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeypatch):
     """Finished cells are not repeated, and a cell goes on from its checkpoint."""
     real = in_cells.finetune
@@ -312,7 +312,7 @@ test_cells.tuned(Path(sys.argv[1]), test_cells.scene(), checkpoint_seconds=0.2)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_run_is_resumed(held, whole_run, tmp_path):
     """Killed in a cell, after another one."""
@@ -384,7 +384,7 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
     assert (cells / "cell-00000.npz").stat().st_mtime_ns > before
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["splats", "photographs"])
 def test_the_command_has_the_same_bits_on_a_cluster(kind, scheduler, tmp_path):
     splats = tmp_path / "city.ply"

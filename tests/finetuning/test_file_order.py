@@ -27,7 +27,7 @@ def scene_fixture():
     return mesh, drawing_order(mesh, nodes=2), dataset
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_viewers_show_the_gain_and_it_is_more_than_by_the_fragment(scene, tmp_path):
     mesh, order, dataset = scene
     tuned = finetune_ordered(mesh, order, dataset, CONFIG)

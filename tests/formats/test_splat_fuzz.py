@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("resource", reason="the fuzzer limits its memory, which this system cannot")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mutated_files_give_an_answer(tmp_path):
     command = [
         sys.executable,

@@ -95,7 +95,7 @@ def test_texels_take_the_colours_of_the_images():
     assert after > 28
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_scipy
 def test_a_ball_of_the_wrong_size_is_fitted_to_images():
     truth = ball()

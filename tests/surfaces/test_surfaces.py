@@ -427,7 +427,7 @@ def test_surfaces_of_places_have_more_triangles_and_texels_unless_a_number_is_na
 
 
 @needs_extra
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_default_size_of_an_open_surface_is_said(tmp_path):
     save_mesh(wall(), tmp_path / "wall.npz")
     cameras = [look_at((x, 0, -4), (0, 0, 0), up=(0, -1, 0), width=48, height=48) for x in (-1, 0, 1)]

@@ -504,7 +504,7 @@ def test_fusion_of_few_points():
         assert np.allclose(found.axes @ found.axes.transpose(0, 2, 1), np.eye(3), atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_matched_photographs_show_a_ball_without_known_points():
     room = [ball_view(camera, backdrop=True) for camera in cameras_around(48, side=96)]
     near, far, targets = ranges_of_cameras(room)

@@ -146,7 +146,7 @@ def test_a_ball_is_recovered_from_its_photographs(ball, start, trained):
     assert after > before + 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("start_found_once")
 def test_a_scene_without_masks_is_recovered_too(room):
     config = train_config(steps=100, start_splats=1500, max_splats=2000, growth_events=2)
@@ -156,7 +156,7 @@ def test_a_scene_without_masks_is_recovered_too(room):
     assert not mesh.attributes
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("start_found_once")
 def test_growth_is_worth_its_fans(ball, trained):
     still = train(ball, train_config(steps=120, **SMALL | {"growth_events": 0}))
@@ -203,7 +203,7 @@ def test_a_photograph_with_a_wrong_camera_is_named(scene, other, request):
     assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("start_found_once")
 def test_changing_light_is_fitted(ball):
     """Each photograph has a gain of its own; held-out views have their mean."""
@@ -218,7 +218,7 @@ def test_changing_light_is_fitted(ball):
     assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("start_found_once")
 def test_exposures_are_fitted_where_photographs_differ(ball, room):
     rng, size = np.random.default_rng(5), {"start_splats": 1500, "max_splats": 2000}
@@ -686,7 +686,7 @@ def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_training_on_the_gpu_is_that_of_the_processor(ball, monkeypatch):
     """Steps stay there: arrays come back when fans grow, and at the end."""
     need_gpu()

@@ -21,7 +21,7 @@ def drawing(tmp_path_factory, node_package):
         yield folder / "mesh.glb", draw
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("nodes", [1, 5])
 def test_three_js_draws_the_order_as_both_emulations_do(drawing, nodes):
     """An image of the file alone (stock_image) and our own are as near to the sorted mesh as three.js is.

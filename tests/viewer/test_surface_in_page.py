@@ -128,7 +128,7 @@ def test_surface_mesh_and_splats_stand_side_by_side(browser, url):
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_exact_mesh_stands_beside_a_surface(browser, url):
     page = browser.page(url, SIDE, SIDE)
     page.wait("document.body.dataset.state !== 'loading'", 400)

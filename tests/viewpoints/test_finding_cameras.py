@@ -116,7 +116,7 @@ def test_views_of_a_room_look_in_several_directions_from_the_start(found):
     assert np.linalg.norm(gazes(found.cameras).mean(axis=0)) < 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_fewer_views_by_one_thread_are_the_first_of_more_to_the_bit(found_in_sparse):
     found = found_in_sparse
     fewer = find_cameras(room(4000, 1500), 5, threads=1)  # other splats: it is searched again
@@ -410,7 +410,7 @@ def test_the_command_writes_cameras_a_sheet_and_a_line(tmp_path, capsys, monkeyp
     assert main(["cameras", str(tmp_path / "room.ply"), "-o", str(tmp_path / "c.txt")]) == 2
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.nightly(keep=1)
 @pytest.mark.parametrize(
     ("name", "kinds"),
     [

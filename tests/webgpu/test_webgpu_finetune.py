@@ -332,7 +332,7 @@ def test_the_same_bits_every_time(scene):
     assert one.colors.tobytes() == two.colors.tobytes()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch):
     """Also where it stops between an image that has too many fragments and one that has not."""
     need_gpu()

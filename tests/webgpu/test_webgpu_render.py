@@ -385,7 +385,7 @@ def test_the_plane_of_a_depth_group_is_that_of_its_largest_triangle():
 # Real scenes
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["playbot_lod5_3k_sh2.ply", "guitar_sh0.ply"])
 def test_real_scenes(name):
     mesh = convert(load_gaussians(shared_data(f"splats/{name}")))
