@@ -1,4 +1,4 @@
-"""Quick tests, which `make test` runs, slow ones, which `make test-slow` runs, and the slowest, which run nightly.
+"""Quick tests, which `make test` runs, slow ones (`make test-slow`), and the slowest (`make test-nightly`).
 
 ``@pytest.mark.slow`` marks a test as slow, ``@pytest.mark.nightly`` as one of the slowest; of one with
 parameters, ``slow(keep=2)`` and ``nightly(keep=2)`` leave two cases, as far apart as may be, among the quick
