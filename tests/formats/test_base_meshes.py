@@ -172,10 +172,10 @@ def test_an_image_given_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("text", "library", "message"),
     [
-        (OBJ.replace("m.mtl", "../m.mtl"), "", "outside its folder"),
+        (OBJ.replace("m.mtl", "../away.mtl"), "", "outside its folder"),
         (OBJ.replace("m.mtl", "/etc/passwd"), "", "outside its folder"),
-        (OBJ, "newmtl painted\nmap_Kd ../../t.png\n", "outside its folder"),
-        (OBJ, "newmtl painted\nmap_Kd C:\\t.png\n", "outside its folder"),
+        (OBJ, "newmtl painted\nmap_Kd ../../away.png\n", "outside its folder"),
+        (OBJ, "newmtl painted\nmap_Kd C:\\away.png\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd /dev/zero\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd\n", "line 2: map_Kd names no image"),
         (OBJ, "newmtl painted\nmap_Kd m.obj\n", "not an image"),
@@ -190,12 +190,24 @@ def test_obj_that_lie(tmp_path, text, library, message):
         load_base(path)
 
 
+@pytest.mark.parametrize(
+    "name", ["C:\\Users\\me\\t.png", "/home/me/t.png", "../textures/t.png", "\\\\host\\share\\t.png"]
+)
+def test_names_on_another_machine_are_looked_for_beside_the_mesh(tmp_path, name):
+    (tmp_path / "in").mkdir()
+    base = load_base(write_obj(tmp_path / "in", library=f"newmtl painted\nmap_Kd {name}\n"))
+    np.testing.assert_array_equal(base.face_texture, [0, 0])
+
+
 def test_a_link_out_of_the_folder_is_refused(tmp_path):
     (tmp_path / "in").mkdir()
     write_image(tmp_path / "t.png")
     path = write_obj(tmp_path / "in")
     (tmp_path / "in" / "t.png").unlink()
     make_link(tmp_path / "in" / "t.png", tmp_path / "t.png")
+    with pytest.raises(FileFormatError, match="outside its folder"):
+        load_base(path)
+    (tmp_path / "in" / "m.mtl").write_text("newmtl painted\nmap_Kd ../t.png\n")
     with pytest.raises(FileFormatError, match="outside its folder"):
         load_base(path)
 

@@ -17,7 +17,8 @@ from _gltf_meshes import instanced, skinned
 from _meshes import random_mesh
 from fuzz.seeds import Change, Seed
 
-from meshsplats import load_mesh, save_mesh
+from meshsplats import BaseMesh, load_base, load_mesh, save_base, save_mesh
+from meshsplats.base_mesh import Texture
 
 
 def _saved(name: str, suffix: str, origin=(0, 0, 0), compression=None, **more) -> Seed:
@@ -127,6 +128,23 @@ def _binary_polygons() -> Seed:
     return Seed("mesh-ply-polygons", {"m.ply": header + b"".join(rows)}, "m.ply", load=load_mesh)
 
 
+def _textured_usd() -> list[Seed]:
+    """A triangle with a texture, beside and in a package; in text, which has more ways to be wrong."""
+    pixels = np.full((2, 2, 4), 255, np.uint8)
+    base = BaseMesh(
+        np.eye(3), [[0, 1, 2]], uv=np.zeros((1, 3, 2)), face_texture=[0], textures=[Texture(pixels)]
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("m.usda", "p.usdz"):
+            save_base(base, Path(folder) / name)
+        files = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+    beside = {name: files[name] for name in ("m.usda", "m.png")}
+    return [
+        Seed("texture-usda", beside, "m.usda", load=load_base, slow=True),
+        Seed("texture-usdz", {"p.usdz": files["p.usdz"]}, "p.usdz", load=load_base, slow=True),
+    ]
+
+
 _INSTANCED = instanced(TRANSLATION=[[0, 0, 0], [5, 0, 0]], SCALE=[[1, 1, 1], [1, 3, 1]])
 
 _FAR = (5e5, 4.5e6, 100)
@@ -145,4 +163,5 @@ MESH_SEEDS = [
     Seed("gltf-instanced", {"m.gltf": json.dumps(_INSTANCED).encode()}, "m.gltf", load=load_mesh),
     Seed("obj", {"m.obj": _OBJ}, "m.obj", load=load_mesh),
     *([_saved(s[1:], s, slow=True) for s in (".usdc", ".usda")] if importlib.util.find_spec("pxr") else []),
+    *(_textured_usd() if importlib.util.find_spec("pxr") else []),
 ]

@@ -11,19 +11,18 @@ from meshsplats.errors import DataWarning, FileFormatError
 
 
 def file_beside(path: Path, name: bytes) -> Path:
-    """The file ``name`` in the folder of ``path`` or below. FileFormatError if it lies elsewhere."""
-    folder = Path(os.path.realpath(path)).parent
+    """The file ``name`` in the folder of ``path`` or below. Of a name that leads elsewhere, as on the machine
+    of whoever made the file, the last part counts; FileFormatError if no such file is there."""
     clean = os.fsdecode(name).replace("\\", "/")
-    parts = PurePosixPath(clean).parts
-    bad = "\0" in clean or not 0 < len(clean) <= 1000 or clean.startswith("/") or ".." in parts
-    target = (
-        folder if bad or PureWindowsPath(clean).drive else Path(os.path.realpath(folder.joinpath(*parts)))
+    if "\0" not in clean and 0 < len(clean) <= 1000:
+        folder, parts = Path(os.path.realpath(path)).parent, PurePosixPath(clean).parts
+        leads_out = clean.startswith("/") or ".." in parts or bool(PureWindowsPath(clean).drive)
+        target = Path(os.path.realpath(folder.joinpath(*(parts[-1:] if leads_out else parts))))
+        if folder in target.parents and (not leads_out or target.is_file()):
+            return target
+    raise FileFormatError(
+        f"{path}: refers to {shown_name(name)!r} outside its folder; refused. Put it beside the mesh"
     )
-    if folder not in target.parents:
-        raise FileFormatError(
-            f"{path}: refers to {shown_name(name)!r} outside its folder; refused. Put it beside the mesh"
-        )
-    return target
 
 
 def shown_name(name: bytes) -> str:

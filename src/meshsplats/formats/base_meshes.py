@@ -28,6 +28,7 @@ from meshsplats.formats.surfaces.solids import write_3mf, write_stl
 from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_ply
 from meshsplats.formats.surfaces.usd import write_surface_usd
 from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
+from meshsplats.formats.usd.textures import usd_textures
 from meshsplats.mesh import SplatMesh
 
 TextureImage = Literal["png", "jpg", "webp"]
@@ -53,15 +54,16 @@ def load_base(
 ) -> BaseMesh:
     """The mesh in a file that ``load_mesh`` reads, with its vertex colours, if it has any, and textures.
 
-    Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour), from the
-    material library beside an `.obj` (``map_Kd``), and as a `.ply` names them (comment TextureFile); image
-    files must lie in the folder of the mesh or below.
+    Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour), from USD
+    (``diffuseColor`` of UsdPreviewSurface), from the material library beside an `.obj` (``map_Kd``), and as a
+    `.ply` names them (comment TextureFile); image files must lie in the folder of the mesh or below, or in
+    the same `.usdz`.
     Faces whose texture is missing or of an unknown kind count as untextured, with a DataWarning.
 
     Args:
         path: the mesh.
         texture: an image to use for the whole mesh instead, by its texture coordinates (`.obj`, `.ply`,
-            glTF).
+            glTF, USD).
         textures: False leaves textures unread.
         origin: as for ``load_mesh``.
 
@@ -79,7 +81,7 @@ def load_base(
     if not textures:
         return _base(source, mesh, hints, None)
     override = None if texture is None else Texture(read_texture(Path(texture)))
-    base = _base(source, mesh, hints, _textured(source, override))
+    base = _base(source, mesh, hints, _textured(source, hints, override))
     if override is not None and not base.textured:
         raise ValueError(f"{source}: has no texture coordinates, so {texture} cannot be put on it")
     return base
@@ -92,7 +94,7 @@ def load_textured(path: str | os.PathLike[str]) -> SplatMesh | BaseMesh:
     source = Path(path)
     mesh, hints = _read(source, None)
     if hints and mesh.binding is None:
-        base = _base(source, mesh, hints, _textured(source, None))
+        base = _base(source, mesh, hints, _textured(source, hints, None))
         if base.textured:
             return base
     for each in hints:
@@ -285,15 +287,19 @@ def _display(mesh: SplatMesh) -> np.ndarray:
 
 
 def _textured(
-    path: Path, override: Texture | None
+    path: Path, hints: Sequence[warnings.WarningMessage], override: Texture | None
 ) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None:
-    """Coordinates (m, 3, 2), v down, texture index (m,) of each face, and textures; None without any."""
-    content = Content(path)
+    """Coordinates (m, 3, 2), v down, texture index (m,) of each face, and textures; None without any.
+    ``hints``: of ``_read``."""
+    with Content(path) as content:
+        if content.is_usd:  # another process takes a while
+            hinted = any(issubclass(each.category, NoTextureWarning) for each in hints)
+            return usd_textures(path, read_texture, override) if hinted or override is not None else None
     if content.container in ("glb", "json"):
         return gltf_textures(path, read_texture, override)
     if content.container == "ply":
         return ply_textures(path, read_texture, override)
-    if content.container == "usd" or not content.is_obj:
+    if not content.is_obj:
         return None
     found = obj_coordinates(path)
     if found is None:

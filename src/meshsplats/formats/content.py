@@ -121,6 +121,26 @@ class Content:
         """The opened file, or one in a zip archive."""
         return open(self.path, "rb") if self.member is None else self.archive.open(self.member)
 
+    @cached_property
+    def usd_layer(self) -> str | None:
+        """Name of the USD file that a .usdz package is read by, its first; None for what is no package."""
+        if not self.is_archive or self.member is not None:
+            return None
+        try:
+            first = next(iter(self.archive.names), "")
+        except FileFormatError:
+            return None
+        return first if first.lower().endswith((".usd", ".usdc", ".usda")) else None
+
+    @property
+    def is_usd(self) -> bool:
+        """Whether it is a USD file, or a package of one."""
+        return self.container == "usd" or self.usd_layer is not None
+
+    def open_usd(self) -> BinaryIO:
+        """The opened USD file, or the one that a package is read by."""
+        return self.open_raw() if self.usd_layer is None else self.archive.open(self.usd_layer)
+
     @property
     def is_text(self) -> bool:
         return b"\0" not in self.head

@@ -94,7 +94,7 @@ MESH_FORMATS: tuple[MeshFormat, ...] = (
     ),
     MeshFormat(
         "usd",
-        (".usdc", ".usda", ".usd"),
+        (".usdc", ".usda", ".usd", ".usdz"),
         "usd.mesh",
         (".usdc", ".usda", ".usd"),
         "`.usdc`, `.usda`, `.usd` (linear colours, harmonics; unlit, or lit with `--lit`)",

@@ -37,7 +37,7 @@ from meshsplats.mesh import SplatMesh, checked_cutoff
 def load_mesh(
     path: str | os.PathLike[str], *, origin: Sequence[float] | np.ndarray | None = None
 ) -> SplatMesh:
-    """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf`, `.usdc`, `.usda`, `.usd` or `.obj`.
+    """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf`, `.usdc`, `.usda`, `.usd`, `.usdz` or `.obj`.
 
     The content decides the format. A file that ``save_mesh`` wrote gives back its positions, faces and extra
     arrays exactly (`.obj` has no extra arrays); colours are exact from `.npz` and `.ply`, within 1e-6 from
@@ -77,12 +77,14 @@ def _mesh_in(content: Content, source: Path, point: np.ndarray | None) -> SplatM
     content.refuse_empty()
     if content.member is not None:
         raise FileFormatError(f"{source}: splats in a zip archive ({content.member[:200]}), no mesh")
-    if content.container == "zip":
+    if content.is_archive and not content.is_usd and source.suffix.lower() != ".npz":
+        names = content.archive.names
         if source.suffix.lower() == ".usdz":
             raise FileFormatError(
-                f"{source}: .usdz packages are not read; unpack it: usdcat in.usdz -o out.usdc"
+                f"{source}: a .usdz package begins with a .usdc, .usda or .usd file, this one with"
+                f" {names[0][:60] if names else 'nothing'!r}"
             )
-        if source.suffix.lower() != ".npz" and (what := foreign_archive(source, content.archive.names)):
+        if what := foreign_archive(source, names):
             raise FileFormatError(f"{source}: {what}")
     if (kind := mesh_format(content)) is not None:
         return kind.codec.read(source, point)

@@ -250,4 +250,4 @@ def _bytes(size: FileSize) -> int:
     return 28 * len(size.mesh.vertices) + 12 * len(size.mesh.faces) + size.held
 
 
-CODEC = MeshCodec(lambda content: content.container == "zip", read_npz, write_npz, _bytes)
+CODEC = MeshCodec(lambda content: content.is_archive and not content.is_usd, read_npz, write_npz, _bytes)

@@ -48,7 +48,7 @@ def _members(content: Content) -> list[str]:
         archive = content.archive
     except FileFormatError:  # broken: the reader says so
         return []
-    if archive.has_meta:
+    if archive.has_meta or content.name.endswith(".usdz"):
         return []
     return [name for name in archive.named(zipped_suffixes()) if _is_splats(content.inside(name))]
 
@@ -196,7 +196,7 @@ def _is_marked_mesh(content: Content) -> bool:
 
 def _holds_arrays(content: Content) -> bool:
     """Whether a zip archive is an .npz."""
-    if content.path.suffix.lower() == ".usdz":
+    if content.is_usd or content.path.suffix.lower() == ".usdz":
         return not any(kind.reader.matches(content) for kind in splat_formats.FORMATS if kind.name == "usd")
     try:
         return any(name.endswith(".npy") for name in content.archive.names)

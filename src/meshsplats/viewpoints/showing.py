@@ -150,7 +150,7 @@ def _cameras_inside(mesh: Path) -> list[Camera]:
     suffix = mesh.suffix.lower()
     if suffix in (".glb", ".gltf"):
         return cameras_in_mesh(mesh)
-    return cameras_in_usd(mesh) if suffix in (".usdc", ".usda", ".usd") else []
+    return cameras_in_usd(mesh) if suffix in (".usdc", ".usda", ".usd", ".usdz") else []
 
 
 def _spread(cameras: Sequence[Camera], count: int) -> list[Camera]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -67,6 +68,14 @@ def gltf_textures(
     return np.concatenate([c for c, _ in parts]), np.concatenate([n for _, n in parts]), textures
 
 
+def cut_out(pixels: np.ndarray, factor: float, cutoff: float) -> np.ndarray:
+    """A copy of ``pixels`` (h, w, 4) uint8 RGBA, opaque where ``factor`` times their alpha, 0 to 1, is at
+    least ``cutoff``, and transparent elsewhere."""
+    cut = pixels.copy()
+    cut[..., 3] = np.where(pixels[..., 3] * (factor / 255) >= cutoff, 255, 0)
+    return cut
+
+
 def _coordinates(
     document: GltfDocument, attributes: dict[str, Any], info: dict[str, Any], v: int
 ) -> np.ndarray | None:
@@ -129,9 +138,7 @@ class _Textures:
         if key not in self._indices:
             pixels = self._image(source)
             if mode != "BLEND":
-                pixels = pixels.copy()
-                shown = pixels[..., 3] * (factor[3] / 255) >= cutoff
-                pixels[..., 3] = 255 if mode == "OPAQUE" else np.where(shown, 255, 0)
+                pixels = cut_out(pixels, factor[3], -math.inf if mode == "OPAQUE" else cutoff)
                 factor[3] = 1
             self._indices[key] = len(self.textures)
             self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ import numpy as np
 from meshsplats.camera import Camera, to_opengl
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._file_cameras import near_plane, placed_camera
+from meshsplats.formats.content import Content
 from meshsplats.formats.usd.crate import holds_token, is_crate
 from meshsplats.formats.usd.reader import extracted
 
@@ -48,7 +49,7 @@ def cameras_in_usd(path: Path) -> list[Camera]:
 
     Raises FileFormatError for a broken file, MissingDependencyError without usd-core.
     """
-    with open(path, "rb") as file:
+    with Content(path) as content, content.open_usd() as file:
         if is_crate(file) and not holds_token(file, _PRIM):
             return []  # without a process for the library, as with most meshes
     report, _ = extracted(path, "meshsplats.formats.usd.camera_extraction")

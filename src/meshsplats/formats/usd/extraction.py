@@ -24,7 +24,8 @@ from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.ply.faces import cut_polygons
+from meshsplats.formats.usd.looks import GREY, Looks
+from meshsplats.formats.usd.polygons import Polygons, polygons_of, primvar
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.spherical_harmonics import TERMS, moved_harmonics
 
@@ -99,8 +100,8 @@ def opened(file: Path) -> Any:
 
 
 def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
-    """Writes the arrays; returns warnings, up direction, origin, blending and names of attributes. Raises
-    FileFormatError."""
+    """Writes the arrays; returns warnings, up direction, origin, blending, names of attributes and whether
+    there are textures. Raises FileFormatError."""
     from pxr import Usd, UsdGeom
 
     stage = opened(file)
@@ -122,7 +123,8 @@ def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[
             report["up"], own = note["up"], True
             matrix = np.eye(4)
         matrices.append(matrix)
-    pieces = [_piece(shape, budget) for shape in shapes]
+    looks = Looks()
+    pieces = [_piece(shape, budget, looks) for shape in shapes]
     if own:
         origin = np.array(note["origin"])
     elif origin is None:
@@ -139,6 +141,7 @@ def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[
             arrays["harmonics"] = moved_harmonics(arrays["harmonics"], matrices[0][:3, :3].T)
     if note.get("normals") == "computed":
         arrays.pop("normals", None)
+    report["textured"] = looks.textured
     np.savez(result, **arrays)  # type: ignore[arg-type]
     return report
 
@@ -219,112 +222,62 @@ def _put(piece: dict[str, np.ndarray], matrix: np.ndarray, origin: np.ndarray, *
         piece["normals"] = normals.astype(np.float32)
 
 
-def _piece(shape: Any, budget: Budget) -> dict[str, np.ndarray]:
+def _piece(shape: Any, budget: Budget, looks: Looks) -> dict[str, np.ndarray]:
     """Arrays of one mesh in its own frame."""
-    from pxr import UsdGeom
-
-    at = str(shape.GetPath())[-100:]
-    points = _array(shape.GetPointsAttr(), None, at, "points").reshape(-1, 3)
-    if points.dtype != np.float64:
-        points = points.astype(np.float32, copy=False)
-    lengths = _array(shape.GetFaceVertexCountsAttr(), np.int64, at, "faceVertexCounts")
-    corners = _array(shape.GetFaceVertexIndicesAttr(), np.int64, at, "faceVertexIndices")
-    n, v = len(lengths), len(points)
-    budget.spend(64 * len(corners) + 64 * v, f"mesh {at}")
-    if (lengths < 0).any() or lengths.sum() != len(corners):
-        raise FileFormatError(f"mesh {at}: faceVertexCounts do not add up to {len(corners):,} corners")
-    if len(corners) and (corners.min() < 0 or corners.max() >= v):
-        raise FileFormatError(f"mesh {at}: corners {corners.min()} to {corners.max()} of {v:,} points")
-    color, color_kind = _primvar(shape, "displayColor", 3, v, n, len(corners), at)
-    opacity, opacity_kind = _primvar(shape, "displayOpacity", 1, v, n, len(corners), at)
+    polygons = polygons_of(shape, budget)
+    points, corners, n = polygons.points, polygons.corners, len(polygons.lengths)
+    color, color_kind = primvar(shape, "displayColor", 3, polygons)
+    opacity, opacity_kind = primvar(shape, "displayOpacity", 1, polygons)
     if color is None and shape.GetPrim().HasAttribute(_BLENDER + "lit"):
-        color, color_kind, opacity, opacity_kind = _from_blender(shape, v, n, len(corners), at)
-    linear = np.ones((v, 4 if color is not None or opacity is not None else 0), np.float32)
-    normals, kind = _primvar(shape, "normals", 3, v, n, len(corners), at)
+        color, color_kind, opacity, opacity_kind = _from_blender(shape, polygons)
+    look = looks.of_faces(shape, n)
+    if color is None and not our_note(shape):
+        rgba, color_kind = looks.colors(look)
+        if rgba is not None:
+            color = rgba[:, :3]
+            if opacity is None:
+                opacity, opacity_kind = rgba[:, 3:], color_kind
+    linear = np.ones((len(points), 4 if color is not None or opacity is not None else 0), np.float32)
+    normals, kind = primvar(shape, "normals", 3, polygons)
     if kind not in ("vertex", "varying"):
         normals = None
-    of_corner = np.repeat(np.arange(n), lengths)
     if "uniform" in (color_kind, opacity_kind) or "faceVarying" in (color_kind, opacity_kind):
         # Colours differ between corners of a vertex: each corner becomes a vertex of its own.
-        budget.spend(64 * len(corners), f"mesh {at}")
+        budget.spend(64 * len(corners), f"mesh {polygons.at}")
         points, normals = points[corners], None if normals is None else normals[corners]
-        spread = {"uniform": of_corner, "vertex": corners, "varying": corners}
-        if color is not None and color_kind in spread:
-            color = color[spread[color_kind]]
-        if opacity is not None and opacity_kind in spread:
-            opacity = opacity[spread[opacity_kind]]
+        color = None if color is None else polygons.at_corners(color, color_kind)
+        opacity = None if opacity is None else polygons.at_corners(opacity, opacity_kind)
         linear = np.ones((len(corners), 4), np.float32)
         corners = np.arange(len(corners))
     if color is None and linear.shape[1]:
-        linear[:, :3] = 0.18  # the specification's fallback grey
+        linear[:, :3] = GREY
     for values, columns in ((color, slice(0, 3)), (opacity, slice(3, 4))):
         if values is not None:
             linear[:, columns] = values
-    faces, _ = cut_polygons(lengths, corners, {})
-    if shape.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
-        faces = faces[:, ::-1]
-    piece = {"vertices": points, "faces": faces.astype(np.int32), "linear": linear}
+    faces = polygons.triangles(corners).astype(np.int32)
+    piece = {"vertices": points, "faces": faces, "linear": linear}
     return piece if normals is None else piece | {"normals": normals}
 
 
-def _from_blender(
-    shape: Any, v: int, n: int, corners: int, at: str
-) -> tuple[np.ndarray | None, str, np.ndarray | None, str]:
+def _from_blender(shape: Any, polygons: Polygons) -> tuple[np.ndarray | None, str, np.ndarray | None, str]:
     """Linear colours and opacities, and their interpolations, of a splat mesh of ours that Blender's exporter
     wrote: as RGBA in a primvar of its attribute's name, display values unless its note says linear."""
 
     def noted(name: str) -> bool:
         return bool(shape.GetPrim().GetAttribute(_BLENDER + name).Get())
 
-    rgba, kind = _primvar(shape, "DisplayColor" if noted("lit") else "Color", 4, v, n, corners, at)
+    rgba, kind = primvar(shape, "DisplayColor" if noted("lit") else "Color", 4, polygons)
     if rgba is None:
         return None, "", None, ""
     color = rgba[:, :3] if noted("linear") else srgb_to_linear(rgba[:, :3])
     return color, kind, rgba[:, 3:], kind
 
 
-def _primvar(
-    shape: Any, name: str, columns: int, v: int, n: int, corners: int, at: str
-) -> tuple[np.ndarray | None, str]:
-    """Values (k, columns) of a primvar, own or inherited, and its interpolation; (None, '') without any."""
-    from pxr import Usd, UsdGeom
-
-    primvar = UsdGeom.PrimvarsAPI(shape).FindPrimvarWithInheritance(name)
-    time = Usd.TimeCode.EarliestTime()
-    if primvar and primvar.HasValue():
-        stored, kind = primvar.ComputeFlattened(time), str(primvar.GetInterpolation())
-    elif name == "normals" and shape.GetNormalsAttr().HasValue():
-        stored, kind = shape.GetNormalsAttr().Get(time), str(shape.GetNormalsInterpolation())
-    else:
-        return None, ""
-    if stored is None:
-        return None, ""
-    try:
-        values = np.asarray(stored, np.float32).reshape(-1, columns)
-    except (ValueError, TypeError):
-        raise FileFormatError(f"mesh {at}: {name} does not hold {columns} numbers per value") from None
-    wanted = {"constant": 1, "uniform": n, "vertex": v, "varying": v, "faceVarying": corners}.get(kind)
-    if len(values) != wanted:
-        raise FileFormatError(
-            f"mesh {at}: {name} ({kind[:20]}) has {len(values):,} values, expected {wanted}"
-        )
-    return values, kind
-
-
-def _array(attribute: Any, dtype: type | None, at: str, what: str) -> np.ndarray:
-    from pxr import Usd
-
-    stored = attribute.Get(Usd.TimeCode.EarliestTime()) if attribute else None
-    if stored is None:
-        raise FileFormatError(f"mesh {at} has no {what}")
-    return np.array(stored, dtype)
-
-
 def _joined(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     columns = max(p["linear"].shape[1] for p in pieces)
     for p in pieces:
         if p["linear"].shape[1] < columns:
-            p["linear"] = np.tile(np.array([0.18, 0.18, 0.18, 1], np.float32), (len(p["vertices"]), 1))
+            p["linear"] = np.tile(np.array([GREY, GREY, GREY, 1], np.float32), (len(p["vertices"]), 1))
     try:
         return joined_rows(pieces)
     except ValueError as error:

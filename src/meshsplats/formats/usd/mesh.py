@@ -12,4 +12,4 @@ def _bytes(size: FileSize) -> int:
     return 85 * v + 24 * f + 3 * size.held if size.suffix == ".usda" else 28 * v + 6 * f + size.held
 
 
-CODEC = MeshCodec(lambda content: content.container == "usd", read_usd, write_usd, _bytes)
+CODEC = MeshCodec(lambda content: content.is_usd, read_usd, write_usd, _bytes)

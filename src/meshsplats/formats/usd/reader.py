@@ -17,13 +17,14 @@ import sys
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from meshsplats.colors import linear_to_srgb
-from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, NoTextureWarning
 from meshsplats.formats._validation import Budget, checked, straight_colors
+from meshsplats.formats.content import Content
 from meshsplats.mesh import MAX_COLOR, SplatMesh
 
 _SECONDS = 60
@@ -32,14 +33,15 @@ _BYTES_A_SECOND = 1 << 20
 
 
 def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
-    """The mesh in a `.usdc`, `.usda` or `.usd` file.
+    """The mesh in a `.usdc`, `.usda` or `.usd` file, or in the layer that a `.usdz` package is read by.
 
     Our own files give back positions and extra arrays exactly, and colours within 1e-6. From other programs'
     files, all visible meshes are joined, in the units and the frame of the stage, at the first time that has
     values: polygons are cut into triangles around their first corner, subdivision surfaces become their
-    control cage, colours are displayColor (linear) and displayOpacity; materials and textures are ignored. A
-    DataWarning counts other shapes, which are left out. Positions are relative to ``origin``; by default to
-    that of our files, or to one that suits those of others, whose transforms are applied in float64.
+    control cage. Colours are displayColor (linear) and displayOpacity, or else the plain colours of
+    UsdPreviewSurface; textures are left out, with a NoTextureWarning (``usd_textures`` reads them). A
+    DataWarning counts other shapes, which are left out, too. Positions are relative to ``origin``; by default
+    to that of our files, or to one that suits those of others, whose transforms are applied in float64.
 
     Raises:
         MissingDependencyError: usd-core is missing.
@@ -48,6 +50,9 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     report, arrays = extracted(path, "meshsplats.formats.usd.extraction", origin)
     for message in report["warnings"]:
         warnings.warn(f"{path}: {message}", DataWarning, stacklevel=3)
+    if report["textured"]:
+        message = f"{path}: has textures, which were left out; colours may differ"
+        warnings.warn(message, NoTextureWarning, stacklevel=3)
     colors = straight_colors(arrays.pop("linear"), path)
     if report["blending"] != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
@@ -74,19 +79,20 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
 
 
 def extracted(
-    path: Path, module: str, origin: np.ndarray | None = None, *, packed: BinaryIO | None = None
+    path: Path, module: str, origin: np.ndarray | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The report and the arrays of ``module``, run as a process of its own; ``packed``: the USD file, where
-    ``path`` is a package around it. Errors as ``read_usd``."""
+    """The report and the arrays of ``module``, run as a process of its own with a USD file, or the layer of a
+    `.usdz` package. Errors as ``read_usd``."""
     if importlib.util.find_spec("pxr") is None:
         raise MissingDependencyError(f"{path}: reading USD needs the extra 'usd': pip install usd-core")
     budget = Budget(path)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         result, file = Path(folder) / "arrays.npz", path.resolve()
-        if packed is not None:
-            file = Path(folder) / "packed.usd"
-            with open(file, "wb") as copy:
-                shutil.copyfileobj(packed, copy)
+        with Content(path) as content:
+            if content.usd_layer is not None:
+                file = Path(folder) / "packed.usd"
+                with content.open_usd() as packed, open(file, "wb") as copy:
+                    shutil.copyfileobj(packed, copy)
         report = _extract(module, file, path, result, origin)
         budget.spend(result.stat().st_size, "its arrays")
         with np.load(result, allow_pickle=False) as archive:

@@ -38,11 +38,7 @@ class _UsdSplats(Splats):
 
     def __init__(self, content: Content) -> None:
         self._path = content.path
-        name = _packed_layer(content)
-        packed = None if name is None else content.archive.open(name)
-        report, self._arrays = extracted(
-            content.path, "meshsplats.formats.usd.splat_extraction", packed=packed
-        )
+        report, self._arrays = extracted(content.path, "meshsplats.formats.usd.splat_extraction")
         self._fields: list[dict[str, Any]] = report["fields"]
         self.to_y_down = _FROM_Z_UP if report["z_up"] else None
         for message in report["warnings"]:
@@ -98,27 +94,11 @@ class _UsdSplats(Splats):
         return builder.finish("3dgs", strict=strict)
 
 
-def _packed_layer(content: Content) -> str | None:
-    """Name of the USD file that a .usdz package is read by, its first; None for what is no package."""
-    if not content.is_archive or content.member is not None:
-        return None
-    try:
-        names = content.archive.names
-    except FileFormatError:
-        return None
-    first = names[0] if names else ""
-    return first if first.lower().endswith((".usd", ".usdc", ".usda")) else None
-
-
 def _matches(content: Content) -> bool:
-    """Whether it is a USD file with splats in it; meshes are not of this format."""
-    if content.container == "usd":
-        with content.open() as file:
-            return _holds_splats(file)
-    name = _packed_layer(content)
-    if name is None:
+    """Whether it is a USD file, or a package, with splats in it; meshes are not of this format."""
+    if not content.is_usd:
         return False
-    with content.archive.open(name) as file:
+    with content.open_usd() as file:
         return _holds_splats(file)
 
 
