@@ -63,6 +63,18 @@ def score(mesh: SplatMesh, dataset: Dataset) -> float:
 # ---- What it is for
 
 
+def test_vertices_of_large_splats_move_as_far_as_pixels(scene):
+    """The first step of Adam is of the whole rate: a share of the splat's size, or of pixels."""
+    cloud, dataset, _ = scene
+    mesh = convert(replace(cloud, scales=cloud.scales * 8))
+    rates = {"steps": 1, "position_rate": 0.1, "final_share": 1, "rate_steps": 0}
+    free, few = (finetune(mesh, dataset, position_pixels=pixels, **rates) for pixels in (0, 0.5))
+    far, near = (np.linalg.norm(tuned.vertices - mesh.vertices, axis=1) for tuned in (free, few))
+    pixel = max(np.linalg.norm(v.camera.center) / v.camera.fx for v in dataset.train)
+    assert np.quantile(far, 0.9) > 0.3 * pixel
+    assert 0 < near.max() < 0.1 * pixel
+
+
 def test_held_out_images_get_better_and_the_loss_falls(scene):
     """At least 1 dB on views that it never saw, and 3 dB on those that it did, in ten epochs."""
     _, dataset, mesh = scene

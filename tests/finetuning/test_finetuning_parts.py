@@ -143,6 +143,23 @@ def test_sizes_follow_the_scale_of_each_splat():
     assert (vertex_sizes(flat) == 0).all()
 
 
+def test_sizes_are_limited_to_pixels_of_the_images_that_see_a_splat():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    far, behind = corners * 4 + [0, 0, 8], corners * 5 - [0, 0, 8]
+    mesh = SplatMesh(
+        np.concatenate([corners / 4 + [0, 0, 2], far, behind]), np.arange(9).reshape(3, 3), np.ones((9, 4))
+    )
+    camera = Camera(width=64, height=64, fx=32, fy=32, cx=32, cy=32, world_to_camera=np.eye(4))
+    whole = vertex_sizes(mesh)
+    assert np.allclose(whole, np.repeat([0.25, 4, 5], 3))
+    # A pixel is as large as the distance of the centre over the focal length.
+    middle = far.mean(axis=0)
+    limited = vertex_sizes(mesh, [camera], 8)
+    assert np.allclose(limited, np.repeat([0.25, 8 * np.linalg.norm(middle) / 32, 5], 3), rtol=1e-4)
+    assert np.array_equal(vertex_sizes(mesh, [camera], 0), whole)
+    assert np.array_equal(vertex_sizes(mesh, [], 8), whole)
+
+
 def test_sizes_of_a_real_mesh_are_those_of_its_splats():
     cloud = make_scene(200)
     mesh = convert(cloud)

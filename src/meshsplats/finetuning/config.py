@@ -65,6 +65,9 @@ class FinetuneConfig:
     position_unit: Annotated[Unit, Advanced] = "splat"
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
     as in the paper."""
+    position_pixels: Annotated[float, Range(0, 1e6), Advanced] = 2.0
+    """Greatest size of a splat as that unit, in pixels of the training images that see it: what a step learns
+    at the edges of larger ones is as fine as pixels are. 0: without a limit."""
     soft_edges: Annotated[bool, Advanced] = True
     """Keep opacities of 0 on the boundary of the mesh, such as the rims of fans, at 0. Visible edges get no
     gradient that would move them back, and opacities, which are clamped at 0, would drift upwards there."""
@@ -226,6 +229,7 @@ _PAPER = FinetuneConfig(
     position_rate=math.exp(-3) * 5e-3,
     harmonics_rate=HARMONICS_RATE,
     position_unit="scene",
+    position_pixels=0.0,
     soft_edges=False,
     final_share=1.0,
     rate_steps=0,
@@ -262,6 +266,7 @@ class FinetuneChanges(TypedDict, total=False):
     position_rate: float
     harmonics_rate: float | None
     position_unit: Unit
+    position_pixels: float
     soft_edges: bool
     final_share: float
     rate_steps: int

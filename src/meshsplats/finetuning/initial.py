@@ -13,7 +13,7 @@ from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.detail import OnImage
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverage
 from meshsplats.conversion.options import FLAT_SIDES, make_options
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import View
@@ -154,19 +154,24 @@ def starting_sides(splats: int, config: FinetuneConfig | None, views: int) -> in
     return min(max(most // splats, FEWEST_SIDES), sides)
 
 
-def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
+def vertex_sizes(mesh: SplatMesh, cameras: Sequence[Camera] = (), pixels: float = 0.0) -> np.ndarray:
     """(v,) float32 size of each vertex in scene units: the square root of twice its triangles' area.
 
-    The triangles of one splat (``face_splat``) share the mean of their sizes. A vertex of several triangles
-    takes the mean of theirs. Vertices without area take the smallest size in the mesh, so that they hardly
-    move; all sizes are 0 if no triangle has an area.
+    The triangles of one splat (``face_splat``) share the mean of their sizes, at most this many ``pixels`` in
+    images of ``cameras``, unless these are 0 or none sees it. A vertex of several triangles takes the mean of
+    theirs. Vertices without area take the smallest size in the mesh, so that they hardly move; all sizes are
+    0 if no triangle has an area.
     """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.sqrt(np.linalg.norm(normals, axis=1))
     splats = mesh.splats
-    size = (splats.sums(size) / splats.counts)[splats.of_face]
-    return vertex_means(mesh, size)
+    size = splats.sums(size) / splats.counts
+    if len(cameras) and pixels:
+        centers = splats.centers(mesh.vertices, mesh.colors[:, 3]).astype(np.float32)
+        most = pixels * CameraCoverage(centers, cameras).pixel_sizes()
+        size = np.where(most > 0, np.minimum(size, most), size)
+    return vertex_means(mesh, size[splats.of_face])
 
 
 def vertex_means(mesh: SplatMesh, values: np.ndarray) -> np.ndarray:

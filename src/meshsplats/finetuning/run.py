@@ -251,7 +251,10 @@ def run_start(
     if journal is not None:
         fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if journal is None or not options.resume:
-        state = kind.begin(mesh, views, config, options.threads, frozen=frozen, device=options.device)
+        cameras = [view.camera for view in dataset.train]
+        state = kind.begin(
+            mesh, views, config, options.threads, cameras=cameras, frozen=frozen, device=options.device
+        )
         if journal is not None:
             journal.begin(config.to_dict())
         return RunStart(config, near, mesh, state, journal, fingerprints, loss)
@@ -376,8 +379,7 @@ class TrainingLoop:
 
     def finished(self) -> SplatMesh:
         """``result``, with plain colours for programs that draw no harmonics."""
-        mesh = self.result()
-        images = self.clock.plain_images
+        mesh, images = self.result(), self.clock.plain_images
         if mesh.harmonics is None or not images:
             return mesh
         return with_plain_colors(mesh, self.dataset, self.config, images, threads=self.options.threads)
@@ -409,8 +411,7 @@ class TrainingLoop:
 
     def _save_preview(self) -> None:
         if self.journal is not None and self.options.preview_every:
-            step, listing = self.clock.step, self.phase.listing
-            self.reports.save_preview(self.journal, step, self.result(), listing)
+            self.reports.save_preview(self.journal, self.clock.step, self.result(), self.phase.listing)
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 
@@ -134,10 +134,12 @@ class State:
         config: FinetuneConfig,
         threads: int | None,
         *,
+        cameras: Sequence[Camera] = (),
         frozen: np.ndarray | None = None,
         device: Device = "cpu",
     ) -> State:
-        """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
+        """The state before the first step, for ``views`` training views, with ``cameras``, and vertices that
+        are ``frozen``."""
         mesh = replace(mesh, order=order_of(mesh, config))
         engine(device, threads).check(mesh=mesh)
         # Positions and colours change, these would not.
@@ -159,7 +161,7 @@ class State:
         if mesh.binding is not None:
             sizes = weight_units(mesh, config.position_unit == "scene")
         else:
-            sizes = vertex_sizes(mesh)
+            sizes = vertex_sizes(mesh, cameras, config.position_pixels)
         state = cls(mesh, sizes, exposures, config, threads, device)
         state.frozen = frozen
         return state
@@ -229,13 +231,7 @@ class State:
         )
 
     def step(
-        self,
-        gradients: Gradients,
-        color_rate: float,
-        position_rate: float,
-        view: int,
-        *,
-        edges: bool = False,
+        self, gradients: Gradients, color_rate: float, position_rate: float, view: int, *, edges: bool = False
     ) -> None:
         """One step of Adam along ``gradients`` for the vertices that the training view of index ``view``
         reached. ``edges``: they include the motion of edges, without which opaque triangles stay in place.

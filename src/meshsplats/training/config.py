@@ -25,6 +25,7 @@ class TrainConfig(FinetuneConfig):
     rate_steps: int = 1000
     color_rate: float = 0.03
     position_rate: float = 0.12
+    position_pixels: float = 0.0
     harmonics_rate: float | None = HARMONICS_RATE
     l2_weight: float = 10.0
     opacity: Annotated[Literal["blended", "cutoff"], Fixed(_GROWS)] = "blended"
