@@ -168,8 +168,8 @@ def vertex_sizes(mesh: SplatMesh, cameras: Sequence[Camera] = (), pixels: float 
     splats = mesh.splats
     size = splats.sums(size) / splats.counts
     if len(cameras) and pixels:
-        centers = splats.centers(mesh.vertices, mesh.colors[:, 3]).astype(np.float32)
-        most = pixels * CameraCoverage(centers, cameras).pixel_sizes()
+        places = mesh.vertices[mesh.faces[splats.starts, 0]]  # the centres of fans
+        most = pixels * CameraCoverage(places, cameras).pixel_sizes()
         size = np.where(most > 0, np.minimum(size, most), size)
     return vertex_means(mesh, size[splats.of_face])
 
