@@ -65,9 +65,10 @@ class FinetuneConfig:
     position_unit: Annotated[Unit, Advanced] = "splat"
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
     as in the paper."""
-    position_pixels: Annotated[float, Range(0, 1e6), Advanced] = 2.0
+    position_pixels: Annotated[float, Range(0, 1e6), With(opacity="blended"), Advanced] = 2.0
     """Greatest size of a splat as that unit, in pixels of the training images that see it: what a step learns
-    at the edges of larger ones is as fine as pixels are. 0: without a limit."""
+    at the edges of larger ones is as fine as pixels are. 0: without a limit. For opacity 'blended': edges
+    that are visible tell more."""
     soft_edges: Annotated[bool, Advanced] = True
     """Keep opacities of 0 on the boundary of the mesh, such as the rims of fans, at 0. Visible edges get no
     gradient that would move them back, and opacities, which are clamped at 0, would drift upwards there."""

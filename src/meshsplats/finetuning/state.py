@@ -161,7 +161,7 @@ class State:
         if mesh.binding is not None:
             sizes = weight_units(mesh, config.position_unit == "scene")
         else:
-            sizes = vertex_sizes(mesh, cameras, config.position_pixels)
+            sizes = vertex_sizes(mesh, cameras, 0.0 if config.cuts else config.position_pixels)
         state = cls(mesh, sizes, exposures, config, threads, device)
         state.frozen = frozen
         return state
