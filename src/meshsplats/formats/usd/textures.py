@@ -34,8 +34,8 @@ def usd_textures(
     triangle in the order of ``read_usd``; and the textures.
 
     ``override`` is a texture for all triangles that have coordinates. A DataWarning names images that are
-    missing, or of a kind that is not read. FileFormatError for a name that leads out of the folder of
-    ``path``, or out of the package, and for broken files.
+    missing, or of a kind that is not read. FileFormatError for a name that leads out of the package, or out
+    of the folder of ``path`` (unless ``file_beside`` finds the image there), and for broken files.
     """
     report, arrays = extracted(path, "meshsplats.formats.usd.texture_extraction")
     uv, index = arrays["uv"], arrays["texture"]
