@@ -164,7 +164,7 @@ LOWEST_LEFT_OUT := $(addprefix tests/,$(addprefix viewer/test_,compilers.py cont
 # What MESHSPLATS_REQUIRE names is in the newcomer's environment alone, neither here nor in those of Blender.
 test-lowest: $(LOWEST_VENV)/installed
 	MESHSPLATS_REQUIRE= MESHSPLATS_SHARED_DATA=left-out MESHSPLATS_EXAMPLES=10 $(LOWEST_VENV)/bin/python -m pytest \
-	  $(PARALLEL) --tier few $(LOWEST_LEFT_OUT:%=--ignore=%)
+	  $(PARALLEL) --assert plain --tier few $(LOWEST_LEFT_OUT:%=--ignore=%)
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
 $(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')

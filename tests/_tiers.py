@@ -8,6 +8,7 @@ tests. The tier ``daily`` has all but the slowest, ``few`` at most two of the qu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +30,13 @@ def of_tier(items: Sequence[pytest.Item], tier: str) -> tuple[list[pytest.Item],
     }
     wanted = set(tests[tier])
     return [item for item in items if item in wanted], [item for item in items if item not in wanted]
+
+
+def has_none(path: Path, tier: str) -> bool:
+    """Whether a file of tests names no marker of ``tier``: it has no slow, or no nightly, test."""
+    if tier not in ("slow", "nightly") or not path.name.startswith("test_") or path.suffix != ".py":
+        return False
+    return f"mark.{tier}" not in path.read_text(encoding="utf-8")
 
 
 def marked(items: Sequence[pytest.Item], name: str) -> set[pytest.Item]:

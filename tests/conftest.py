@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from _needs import lacking, skipped_lines
-from _tiers import TIERS, of_tier
+from _tiers import TIERS, has_none, of_tier
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -115,43 +115,27 @@ def make_link(link: Path, target: Path) -> None:
         pytest.skip("symbolic links are not recognised here")
 
 
-LEFT_OUT = pytest.StashKey[int]()
-"""Number of tests of other tiers, by worker processes if there are any, which all collect the same."""
-
-
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--tier", choices=TIERS, default="all", help="which tests, see tests/_tiers.py")
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    config.stash[LEFT_OUT] = 0
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """To import all files takes each worker half a minute."""
+    return has_none(collection_path, config.getoption("tier")) or None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     items[:], others = of_tier(items, config.getoption("tier"))
-    config.stash[LEFT_OUT] = len(others)
     if others:
         config.hook.pytest_deselected(items=others)
 
 
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    if (output := getattr(session.config, "workeroutput", None)) is not None:
-        output["left_out"] = session.config.stash[LEFT_OUT]
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: Any) -> None:
-    """Of pytest-xdist: a worker has ended."""
-    node.config.stash[LEFT_OUT] = getattr(node, "workeroutput", {}).get("left_out", 0)
-
-
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Says what was left out or skipped, and how to get it."""
-    config = terminalreporter.config
-    if count := config.stash[LEFT_OUT]:
+    if (tier := terminalreporter.config.getoption("tier")) != "all":
         commands = {"quick": "make test", "slow": "make test-slow", "nightly": "make test-nightly"}
-        others = ", ".join(command for tier, command in commands.items() if tier != config.getoption("tier"))
-        terminalreporter.write_line(f"{count:5} tests of other tiers left out: {others}")
+        others = ", ".join(command for other, command in commands.items() if tier != other)
+        terminalreporter.write_line(f"tests of other tiers are left out: {others}")
     skipped = [report.longrepr for report in terminalreporter.stats.get("skipped", [])]
     for line in skipped_lines(str(where[2]) for where in skipped if isinstance(where, tuple)):
         terminalreporter.write_line(line)

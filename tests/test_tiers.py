@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from _tiers import of_tier
+from _tiers import TIERS, has_none, of_tier
 
 pytest_plugins = "pytester"
 
@@ -67,3 +67,19 @@ def test_each_test_is_of_one_tier_and_some_cases_stay_quick(pytester):
     daily, left_out = ([item.name for item in part] for part in of_tier(items, "daily"))
     assert (daily, left_out) == ([name for name in names if name not in NIGHTLY], NIGHTLY)
     assert of_tier(items, "all") == (items, [])
+
+
+def test_files_without_a_test_of_the_tier_are_not_imported(tmp_path):
+    path = tmp_path / "test_some.py"
+    for text, without in (
+        ("def test_slow(): pass", {"slow", "nightly"}),
+        ("@pytest.mark.slow(keep=2)\ndef test(): pass", {"nightly"}),
+        ("pytestmark = [pytest.mark.nightly]", {"slow"}),
+    ):
+        path.write_text(text)
+        assert {tier for tier in TIERS if has_none(path, tier)} == without
+    path.write_text("")
+    (tmp_path / "conftest.py").write_text("")
+    assert has_none(path, "slow")
+    assert not has_none(tmp_path / "conftest.py", "slow")
+    assert not has_none(tmp_path, "slow")

@@ -296,6 +296,44 @@ def test_gltf_alpha_modes(tmp_path):
         np.testing.assert_allclose(at_corners(base)[..., 3], alpha, atol=1e-6)
 
 
+def textured_parts(tmp_path, materials):
+    """The base mesh of a square in each of ``materials``."""
+    parts = [
+        {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": i}
+        for i in range(len(materials))
+    ]
+    return load_base(gltf(tmp_path, meshes=[{"primitives": parts}], materials=materials))
+
+
+def looks(mode, colors, cutoff=0.5):
+    """A textured material of each of the base ``colors``."""
+    pbrs = [{"baseColorTexture": {"index": 0}, "baseColorFactor": color} for color in colors]
+    return [{"pbrMetallicRoughness": pbr, "alphaMode": mode, "alphaCutoff": cutoff} for pbr in pbrs]
+
+
+def test_materials_share_the_pixels_of_an_image(tmp_path):
+    """The image is opaque: OPAQUE and BLEND show it as it is; MASK removes all of it below a factor."""
+    reds = [(0.1 * i, 1, 1, 0.4) for i in range(9)]
+    base = textured_parts(tmp_path, looks("OPAQUE", reds) + looks("BLEND", reds) + looks("MASK", reds))
+    pixels = [texture.pixels for texture in base.textures]
+    assert len(pixels) == 27
+    assert len({id(p) for p in pixels[:18]}) == len({id(p) for p in pixels[18:]}) == 1
+    assert (pixels[0][..., 3] == 255).all()
+    assert not pixels[18][..., 3].any()
+    np.testing.assert_array_equal(pixels[0][..., :3], pixels[18][..., :3])
+
+
+def test_cut_out_images_are_of_the_budget(tmp_path, monkeypatch):
+    spent = []
+    monkeypatch.setattr(
+        "meshsplats.formats._validation.Budget.spend", lambda _, count, what: spent.append((count, what))
+    )
+    few = [(1, 1, 1, 0.1 * i) for i in range(1, 5)]  # each cuts the image on its own
+    textured_parts(tmp_path, looks("MASK", few) + looks("OPAQUE", few) + looks("MASK", few))
+    assert spent.count((16, "an image")) == 1
+    assert spent.count((16, "a texture")) == 4
+
+
 def test_gltf_without_a_texture_keeps_its_colours(tmp_path):
     material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}
     base = load_base(gltf(tmp_path, materials=[material]))

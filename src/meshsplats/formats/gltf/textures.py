@@ -69,11 +69,12 @@ def gltf_textures(
 
 
 def cut_out(pixels: np.ndarray, factor: float, cutoff: float) -> np.ndarray:
-    """A copy of ``pixels`` (h, w, 4) uint8 RGBA, opaque where ``factor`` times their alpha, 0 to 1, is at
-    least ``cutoff``, and transparent elsewhere."""
-    cut = pixels.copy()
-    cut[..., 3] = np.where(pixels[..., 3] * (factor / 255) >= cutoff, 255, 0)
-    return cut
+    """``pixels`` (h, w, 4) uint8 RGBA, opaque where ``factor`` times their alpha, 0 to 1, is at least
+    ``cutoff``, and transparent elsewhere: themselves if they are so, else a copy."""
+    alpha = np.where(pixels[..., 3] * (factor / 255) >= cutoff, np.uint8(255), np.uint8(0))
+    if (alpha == pixels[..., 3]).all():
+        return pixels
+    return np.concatenate([pixels[..., :3], alpha[..., None]], axis=2)
 
 
 def _coordinates(
@@ -114,6 +115,7 @@ class _Textures:
     unread: int = 0
     _indices: dict[tuple[Any, ...], int] = field(default_factory=dict)
     _images: dict[int, np.ndarray] = field(default_factory=dict)
+    _cut: dict[tuple[int, float, float], np.ndarray] = field(default_factory=dict)
 
     def index_of(self, material: dict[str, Any], info: dict[str, Any]) -> int:
         """Index of the base-colour texture ``info`` of ``material``; -1 if it is of an unknown kind."""
@@ -138,11 +140,21 @@ class _Textures:
         if key not in self._indices:
             pixels = self._image(source)
             if mode != "BLEND":
-                pixels = cut_out(pixels, factor[3], -math.inf if mode == "OPAQUE" else cutoff)
+                pixels = self._cut_out(source, pixels, factor[3], -math.inf if mode == "OPAQUE" else cutoff)
                 factor[3] = 1
             self._indices[key] = len(self.textures)
             self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]
         return self._indices[key]
+
+    def _cut_out(self, source: int, pixels: np.ndarray, factor: float, cutoff: float) -> np.ndarray:
+        """``cut_out``, once for all materials that cut the image ``source`` alike."""
+        key = source, 1.0 if cutoff == -math.inf else factor, cutoff
+        if key not in self._cut:
+            cut = cut_out(pixels, factor, cutoff)
+            if cut is not pixels:
+                self.document.budget.spend(cut.nbytes, "a texture")
+            self._cut[key] = cut
+        return self._cut[key]
 
     def _image(self, source: object) -> np.ndarray:
         document = self.document
