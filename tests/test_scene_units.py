@@ -125,7 +125,8 @@ def test_other_units_change_rounding_only(usual, unit):
 def test_training_in_other_units(unit, backdrop):
     def score(unit: float) -> float:
         targets = photographs(unit, backdrop)
-        mesh = train(targets, steps=15, start_splats=100, max_splats=300, growth_events=2)
+        # Whether exposures seem to differ in images this small depends on rounding.
+        mesh = train(targets, steps=15, start_splats=100, max_splats=300, growth_events=2, exposure=False)
         return evaluate(mesh, targets).method("mesh").mean("psnr")
 
     # Where matching decides otherwise by rounding, some of the few fans stand elsewhere.

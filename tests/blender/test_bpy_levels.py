@@ -100,7 +100,9 @@ def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chai
         assert visible(scene) == ([names[i]], [names[i]])
         rendering.render_to(scene, tmp_path / "b.png")
         off = np.abs(load_image(tmp_path / "b.png").astype(int) - alone[i])
-        assert off.max() <= (0 if light is None else 2)
+        # Where Cycles has AVX-512, one value of an unlit image may be rounded otherwise.
+        assert off.max() <= (1 if light is None else 2)
+        assert np.count_nonzero(off) <= (3 if light is None else off.size)
     assert any(np.abs(alone[i].astype(int) - alone[i - 1]).max() > 20 for i in (1, 2)), "levels differ"
 
 

@@ -194,7 +194,9 @@ def _root(outlines: Sequence[_Silhouette]) -> tuple[np.ndarray, float]:
         left = np.einsum("n,nij->ij", weights, across) + 1e-9 * np.eye(3)
         middle = np.linalg.solve(left, np.einsum("n,nij,nj->i", weights, across, origins))
         error = np.linalg.norm(np.einsum("nij,nj->ni", across, middle - origins), axis=1)
-        weights = 1 / np.maximum(error, 1e-6 * max(error.max(), 1e-12))
+        if not error.max():
+            break
+        weights = 1 / np.maximum(error / error.max(), 1e-6)
     half = float(np.median(np.linalg.norm(origins - middle, axis=1)))
     return middle - half, 2 * half
 
