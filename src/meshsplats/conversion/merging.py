@@ -4,7 +4,8 @@ Splats are merged pair by pair; dropping some of them would tear holes. A pair b
 mass, mean and covariance, and colours are averaged by mass. Mass is integrated optical depth: that of a splat
 of opacity o, ``-log(1 - o exp(-r^2 / 2))``, is ``2 pi Li2(o)`` over the plane of its standard deviations
 (Li2: the dilogarithm, the sum of ``o^k / k^2``), times the mean area of its projections. It adds up where
-splats lie behind each other, and as long as opacities are small it is opacity times area.
+splats lie behind each other, and as long as opacities are small it is opacity times area. Splats that lie
+beside each other and cover more than one opaque splat of their covariance would become a wider one.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import SceneSample, SceneViews, widen
+from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
 from meshsplats.conversion.options import ConversionOptions
@@ -42,6 +44,16 @@ BLOCK = 1 << 16
 LARGE = 1_000_000
 """Splats from which on they are merged in blocks for cameras: 12 million took 7.5 GB together."""
 
+DENSE = 0.9
+"""Integrated optical depth of a merged splat, over that of its two standard deviations, from which its parts
+may cover more than it does: their opacities add up to less than this."""
+
+SOLID, SOLID_SHARE = 0.98, 0.95
+"""Splats of at least the first opacity that have at least the second share of all mass are a surface sampled
+by opaque splats..."""
+SOLID_COVER = 1.4
+"""... and cover this multiple of their area: through gaps between merged ones shows what is behind all."""
+
 FEWEST_OF_BLOCK = 64
 """Splats that it leaves of a block at least, before the blocks are joined."""
 
@@ -58,9 +70,10 @@ def simplify(
 
     Neighbours are merged, always the pair of least cost: growth of the area and difference in colour, in
     proportion to their mass. Mass, mean and covariance of the whole are preserved; spherical harmonics of
-    every degree are averaged by mass. A splat that was not merged keeps its values to the last bit. Mass
-    beyond that of an opaque splat is lost: many opaque layers become one. Splats of less opacity than 1/255,
-    which are never drawn, have no mass and go first.
+    every degree are averaged by mass. A splat that was not merged keeps its values to the last bit. Splats
+    that cover more, beside each other, than one opaque splat of their covariance become a wider one of the
+    same axes; mass beyond that of an opaque splat is lost: many opaque layers become one. Splats of less
+    opacity than 1/255, which are never drawn, have no mass and go first.
 
     Merged splats have the cloud's kernel. Those of '2dgs' stay flat: the smallest of their three axes is
     dropped, with its part of the covariance.
@@ -200,7 +213,7 @@ def _merge(
     if n > np.iinfo(np.int32).max:
         raise ValueError(f"at most 2^31 - 1 splats can be merged, got {n}")
     group = groups_of(cloud, counted, low_pass, int(count), threads or processors())
-    return Merged(_merged(cloud, masses, low_pass, group), group, masses)
+    return Merged(_merged(cloud, masses, low_pass, group, threads or processors()), group, masses)
 
 
 def _checked_width(low_pass: float | np.ndarray, n: int) -> np.ndarray:
@@ -259,8 +272,25 @@ def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:
     return widen(scales.astype(np.float64), low_pass, 1.0, kernel)
 
 
+def _depths(masses: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """(n,) float64 ``optical_depth`` of splats of these ``masses`` (n,), with standard deviations ``drawn``
+    (n, 3)."""
+    area = mean_shadow(disc_areas(drawn))
+    return np.divide(masses, area, out=np.zeros_like(masses), where=area > 0)
+
+
+def _are_solid(cloud: GaussianCloud, masses: np.ndarray) -> bool:
+    """Whether nearly all of ``cloud`` is opaque, as where splats were made of points or of a mesh."""
+    return float(masses[cloud.opacities >= SOLID].sum()) >= SOLID_SHARE * float(masses.sum())
+
+
+def _matrices(covariances: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of (n, 6) xx, xy, xz, yy, yz, zz."""
+    return covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
 def _merged(
-    cloud: GaussianCloud, masses: np.ndarray, low_pass: np.ndarray, group: np.ndarray
+    cloud: GaussianCloud, masses: np.ndarray, low_pass: np.ndarray, group: np.ndarray, threads: int
 ) -> GaussianCloud:
     """One splat for each group."""
     sizes = np.bincount(group)
@@ -276,15 +306,28 @@ def _merged(
     groups = Groups(own, masses[rows])
     means, covariances, mass, _ = all_moments.together(groups)
     width = groups.averages(low_pass[rows, None])[:, 0]
-    matrices = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    variances, axes = np.linalg.eigh(matrices)
+    variances, axes = np.linalg.eigh(_matrices(covariances))
     scales = np.sqrt(np.maximum(variances[:, ::-1], 0))  # largest first
     axes = axes[:, :, ::-1].copy()
     axes[np.linalg.det(axes) < 0, :, 2] *= -1
     if cloud.kernel == "2dgs":
         scales[:, 2] = 0
-    area = mean_shadow(disc_areas(_drawn(scales, width, cloud.kernel)))
-    depth = np.divide(mass, area, out=np.zeros_like(mass), where=area > 0)
+    depth = _depths(mass, _drawn(scales, width, cloud.kernel))
+    dense = depth > DENSE
+    if dense.any():
+        inside = groups.order[dense[own[groups.order]]]
+        filtered = 0.0 if cloud.kernel == "antialiased" else np.square(low_pass[rows[inside]])
+        parts = Parts(
+            (np.cumsum(dense) - 1)[own[inside]],
+            all_moments.means[inside],
+            _matrices(all_moments.covariances[inside]) + np.multiply.outer(filtered, np.eye(3)),
+            part.opacities[inside].astype(np.float64),
+        )
+        drawn = _drawn(scales[dense], width[dense], cloud.kernel)
+        shares = covered_shares(parts, Wholes(means[dense], axes[dense], drawn[:, :2]), threads)
+        wanted = shares * (SOLID_COVER if _are_solid(cloud, masses) else 1.0)
+        scales[dense, :2] *= np.sqrt(np.maximum(wanted, 1))[:, None]
+        depth = _depths(mass, _drawn(scales, width, cloud.kernel))
     fields = {
         name: getattr(result, name).copy() for name in ("means", "quaternions", "scales", "opacities", "sh")
     }
