@@ -29,6 +29,46 @@ def test_a_folder_becomes_a_chain_where_nothing_is_lost(tmp_path):
     check_folder(folder, replace_old=True)
     with pytest.raises(FileExistsError):
         check_folder(folder)
+    check_folder(folder, resume=True)  # as for a run that was to replace it
+
+
+@pytest.mark.parametrize("finished", [False, True])
+@pytest.mark.parametrize("left", ["", "folder", "record"])
+def test_the_way_that_a_message_names_is_open(tmp_path, finished, left):
+    """Whatever lies there: following each message leads to a run that may begin."""
+    folder, unfinished = tmp_path / "chain", tmp_path / "chain.partial"
+    for start in ({}, {"resume": True}, {"replace_old": True}):
+        if finished:
+            folder.mkdir(exist_ok=True)
+            (folder / TABLE).touch()
+        if left:
+            unfinished.mkdir(exist_ok=True)
+        if left == "record":
+            (unfinished / CONFIGURATION).touch()
+        how, said = dict(start), []
+        for _ in range(4):
+            try:
+                check_folder(folder, **how)
+                break
+            except OSError as error:
+                said.append(str(error))
+            if "remove it" in said[-1]:
+                unfinished.rmdir()
+            if "leave out ``resume``" in said[-1]:
+                how = {}
+            elif "``resume`` continues it" in said[-1]:
+                how = {"resume": True}
+            elif "``force``" in said[-1]:
+                how = {"replace_old": True}
+        else:
+            pytest.fail(f"{start}: {said}")
+
+
+def test_a_folder_of_something_else_is_not_to_be_overwritten(tmp_path):
+    (tmp_path / "mine").mkdir()
+    for replace_old in (False, True):
+        with pytest.raises(FileExistsError, match=r"give another folder$"):
+            check_folder(tmp_path / "mine", replace_old=replace_old)
 
 
 def test_a_chain_begins_in_an_empty_folder(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -23,6 +24,7 @@ ARGUMENTS = {
 """Fewer and smaller images, and fewer steps, run the same lines."""
 SURFACES = {"views": 8, "size": 64, "resolution": 48, "texture": 512, "rounds": 1}
 """At most, of the surfaces that examples make."""
+QUALITY = Path(__file__).parents[1] / "docs" / "quality.md"
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
 
 
@@ -55,6 +57,19 @@ def test_example_runs(example, tmp_path, monkeypatch, capsys):
     for written in (tmp_path / "example-output").glob("*"):
         assert written.stat().st_size > 0
         assert written.name in printed
+
+
+@pytest.mark.slow
+def test_the_table_of_quality_is_what_the_example_prints(monkeypatch, capsys):
+    """Other processors round in another way."""
+    (example,) = [path for path in EXAMPLES if path.stem == "03_compare"]
+    monkeypatch.setattr(sys, "argv", [str(example)])
+    runpy.run_path(str(example), run_name="__main__")
+    printed = [float(found) for found in re.findall(r"PSNR ([\d.]+) dB", capsys.readouterr().out)]
+    rows = (QUALITY.read_text(encoding="utf-8").partition("| 160,000 triangles |")[2]).split("\n\n")[0]
+    written = [float(found) for found in re.findall(r"\b\d\d\.\d\d\b", rows)]
+    by_row = [score for scores in zip(printed[:4], printed[4:], strict=True) for score in scores]
+    assert by_row == pytest.approx(written, abs=0.02)
 
 
 def test_examples_are_here():

@@ -9,8 +9,11 @@ import pytest
 from _splats import few_splats
 
 import meshsplats as ms
+from meshsplats import file_conversion
+from meshsplats.errors import OptionsError
+from meshsplats.evaluation import viewers
 from meshsplats.evaluation.mesh_files import MeshFileOptions
-from meshsplats.file_conversion import ConversionCallbacks, Converter, seen_from
+from meshsplats.file_conversion import ConversionCallbacks, Converter, counts_in_words, seen_from
 from meshsplats.jobs import jobs
 from meshsplats.product import Product
 
@@ -83,6 +86,32 @@ def test_a_preview_is_seen_from_where_the_file_opens(job, tmp_path, as_splats):
     assert asked == [(len(few_splats()), job.source, [camera])]
 
 
+@pytest.mark.parametrize("preview", [True, False])
+def test_the_alpha_mode_of_a_place_is_measured_from_within(job, tmp_path, monkeypatch, preview):
+    """By given cameras, else by views that are found; with a preview or without, it is the same file. An
+    object is seen from around."""
+    views = [ms.Camera(np.eye(4), 50, 50, 32, 32, 64, 64)] * 4
+    found, measured = [], []
+    monkeypatch.setattr(viewers, "choose_alpha", lambda mesh, cameras, **more: measured.append(cameras))
+    files = replace(job, outputs=(tmp_path / "c.glb",), configs=())
+    if not preview:
+        files = replace(files, preview=None)
+    converter = Converter(Product(), PLAIN)
+    converter.made(files, [])  # an object
+    monkeypatch.setattr(
+        file_conversion, "default_views", lambda *given, **more: found.append(more) or (views, "found")
+    )
+    converter.made(files, [])
+    converter.made(files, views[:1])
+    assert measured == [[], views, views[:1]]
+    assert len(found) == 1
+    # Nothing is looked for where nothing is measured.
+    npz = replace(files, outputs=(tmp_path / "c.npz",))
+    converter.made(npz, [])
+    Converter(Product(files=MeshFileOptions(alpha="mask")), PLAIN).made(files, [])
+    assert len(found) == 1
+
+
 def test_an_error_in_one_format_leaves_no_file_of_another(job, tmp_path):
     wrong = replace(job, outputs=(job.outputs[0], tmp_path / "b.none"))
     with pytest.raises(ValueError, match="does not name a mesh format"):
@@ -95,3 +124,41 @@ def test_cameras_are_in_the_world(tmp_path):
     (moved,) = seen_from([camera], tmp_path, np.array([1.0, 2, 3]))
     np.testing.assert_allclose(moved.world_to_camera[:3, 3], [1, 2, 3])
     assert seen_from(None, tmp_path, np.zeros(3)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("m.usdz", r"m\.npz: a mesh, not splats: convert writes \.usdz of splats only; .* \.glb, \.usdc"),
+        ("m.compressed.ply", r"convert writes \.compressed\.ply of splats only"),
+        ("m.glb", r"no splats are made of it; without as_splats it can become \.npz, "),
+    ],
+)
+def test_what_a_mesh_can_become_is_said_where_it_is_to_become_splats(job, tmp_path, name, message):
+    ms.save_mesh(ms.convert(few_splats()), tmp_path / "m.npz")
+    wrong = replace(job, source=tmp_path / "m.npz", outputs=(tmp_path / name,))
+    with pytest.raises(ms.FileFormatError, match=message):
+        Converter(Product(as_splats=True), PLAIN).made(wrong, [])
+
+
+def test_files_are_all_meshes_or_all_splats(tmp_path):
+    """Also where a name ends in that of a mesh."""
+    for kinds, as_splats in ((["glb", "ply"], False), (["usdz", "spz", "compressed.ply", "ply"], True)):
+        Product(as_splats=as_splats).check(kinds, [], tmp_path)
+    for kinds, message in (
+        (
+            ["glb", "compressed.ply"],
+            "glb would be meshes, .compressed.ply splats: .* all as splats: as_splats",
+        ),
+        (["npz", "sog"], "a second command$"),
+        (["usdz"], "hold splats: as_splats"),
+        (["stl"], "meshes are written as .*, not as .stl"),
+    ):
+        with pytest.raises(OptionsError, match=message):
+            Product().check(kinds, [], tmp_path)
+
+
+def test_one_is_no_plural():
+    counts = {"triangles": 8, "vertices": 7, "splats": 1, "converted": 1, "fidelity": None}
+    assert counts_in_words(counts) == "1 splat -> 8 triangles, 7 vertices"
+    assert counts_in_words({"triangles": 1, "vertices": 1, "fidelity": None}) == "1 triangle, 1 vertex"

@@ -16,7 +16,7 @@ from _splats import few_splats
 import meshsplats as ms
 from meshsplats._options import Help, settings
 from meshsplats.blender.files import PictureOptions
-from meshsplats.chains import make_chain, table_in_words
+from meshsplats.chains import make_chain
 from meshsplats.cluster import Workers
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
@@ -24,6 +24,7 @@ from meshsplats.datasets.scene_views import SceneViews, check_photographs
 from meshsplats.edits import EditCallbacks, bake_file, clean_file, simplify_file
 from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.evaluation.comparison_files import save_comparison
+from meshsplats.evaluation.level_tables import load_table, table_in_words
 from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.evaluation.options import ComparisonOptions
 from meshsplats.file_options import BakingOptions, ChainOptions, LevelTuning, ScoringOptions, SimplifyOptions
@@ -284,10 +285,11 @@ def test_a_chain_is_told_in_a_table(files):
     with pytest.raises(OptionsError, match=r"alpha mask is for .glb files, not .npz"):
         ChainOptions(alpha="mask", format="npz").check()
     table = make_chain(few_splats(), files / "chain", ChainOptions(levels=1, width=24))
-    lines = table_in_words(table, files / "chain")
+    assert load_table(files / "chain" / "levels.json") == table
+    lines = table_in_words(table)
     assert lines[1].split()[:2] == ["level_0.glb", "40"]
     assert lines[0].endswith("alpha")
-    assert lines[-1].endswith("chain/: levels.json has this table")
+    assert lines[-1].startswith("look area: ")
 
 
 def test_surfaces_and_tiles_need_options_that_agree():

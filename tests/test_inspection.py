@@ -14,7 +14,7 @@ from meshsplats import convert
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.inspection import describe
+from meshsplats.inspection import describe, in_words
 from meshsplats.installation import examine
 
 
@@ -52,6 +52,47 @@ def test_findings_about_a_mesh(tmp_path):
     save_mesh(mesh, tmp_path / "mesh.npz")
     found = describe(tmp_path / "mesh.npz")
     assert (found["kind"], found["triangles"]) == ("mesh", len(mesh.faces))
+
+
+def save_chain(folder):
+    levels = [
+        {"splats": 40 >> 2 * number, "triangles": 320 >> 2 * number, "screen_size": 64 >> number}
+        | {"file": f"level_{number}.npz", "bytes": 7, "psnr": 30.5, "views": 8, "seconds": 0.1, "alpha": None}
+        for number in range(2)
+    ]
+    table = {"source": "a.ply", "splats": 40, "factor": 4, "look": "area", "samples": 2, "levels": levels}
+    folder.mkdir()
+    for row in levels:
+        (folder / row["file"]).write_bytes(b"content")
+    (folder / "levels.json").write_text(json.dumps(table))
+    return table
+
+
+def test_levels_of_detail_are_their_table(tmp_path):
+    table = save_chain(tmp_path / "chain")
+    found = describe(tmp_path / "chain")
+    assert found == {"kind": "levels", "bytes": 14} | table
+    assert describe(tmp_path / "chain" / "levels.json") == found
+    lines = in_words(found)
+    assert lines[0].split() == ["kind", "levels", "of", "detail"]
+    assert [line.split()[:3] for line in lines[-3:-1]] == [
+        ["level_0.npz", "40", "320"],
+        ["level_1.npz", "10", "80"],
+    ]
+    assert lines[-1].endswith("; 8 views")
+    (tmp_path / "chain" / "level_1.npz").unlink()
+    assert describe(tmp_path / "chain")["missing"] == ["level_1.npz"]
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"levels": []}', '{"levels": [{"file": 1}]}', '{"levels": 3}'])
+def test_other_tables_are_told_apart(tmp_path, text):
+    (tmp_path / "levels.json").write_text(text)
+    with pytest.raises(FileFormatError, match=r"levels\.json: not the table"):
+        describe(tmp_path / "levels.json")
+    with pytest.raises(FileFormatError, match="a folder without splats"):
+        describe(tmp_path)
+    save_gaussians(few_splats(), tmp_path / "point_cloud.ply")
+    assert describe(tmp_path)["kind"] == "splats"
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -10,9 +11,20 @@ import numpy as np
 import pytest
 from _stock_viewer import stock_image
 
-from meshsplats import ConversionOptions, convert, load_mesh, orbit, psnr, render, save_gaussians, simplify
+from meshsplats import (
+    ConversionOptions,
+    convert,
+    load_gaussians,
+    load_mesh,
+    orbit,
+    psnr,
+    render,
+    save_gaussians,
+    simplify,
+)
 from meshsplats.chains import make_chain
 from meshsplats.cli import main
+from meshsplats.cli.messages import Terminated
 from meshsplats.conversion import merging
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.demo_scene import make_scene
@@ -120,7 +132,6 @@ def test_coarse_levels_take_the_filter_that_is_nearest():
     }
     taken = [px2 for px2, other in tried.items() if np.array_equal(mesh.vertices, other.vertices)]
     assert len(taken) == 1
-    assert taken[0] > FOOTPRINTS_PX2[0]
     views = targets.train[:2]
 
     def error(mesh) -> float:
@@ -188,6 +199,17 @@ def test_a_chain(splats, tmp_path, capsys):
     assert "level_1.ply" in shown
     assert sorted(p.suffix for p in out.iterdir()) == [".json", ".ply", ".ply", ".toml"]
     assert not list(tmp_path.glob(".chain*"))
+
+
+@pytest.mark.parametrize("degree", [0, 1, None])
+def test_converted_levels_have_the_degree_of_their_images(degree, splats, tmp_path):
+    stored = load_gaussians(splats).sh_degree
+    assert stored > 1
+    asked = () if degree is None else ("--sh-degree", degree)
+    assert run(splats, "-o", tmp_path / "chain", *QUICK, "--format", "npz", *asked) == 0
+    for number in range(2):
+        mesh = load_mesh(tmp_path / "chain" / f"level_{number}.npz")
+        assert mesh.sh_degree == (stored if degree is None else degree)
 
 
 def test_a_chain_without_the_command_line(tmp_path):
@@ -338,6 +360,28 @@ def test_levels_with_an_order(splats, tmp_path, capsys, monkeypatch):
     assert tuned > table["levels"][0]["psnr"]
     assert run(splats, "-o", tmp_path / "x", *QUICK, "--alpha", "ordered", "--order", "splat") != 0
     assert "has an order of its own: leave out order" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt, Terminated(signal.SIGTERM), OSError(28, "full", "level_0.glb")]
+)
+def test_a_chain_that_ends_anywhere_says_how_it_goes_on(splats, tmp_path, capsys, monkeypatch, error):
+    import meshsplats.chains as command
+
+    def stops(*_, **__):
+        raise error
+
+    out = tmp_path / "chain"
+    assert run(splats, "-o", out, *QUICK) == 0
+    for options, way in ((["--force"], "--resume in place of --force"), (["--resume"], "--resume")):
+        with monkeypatch.context() as patch:
+            patch.setattr(command, "likeness", stops)
+            assert run(splats, "-o", out, *QUICK, *options) in (4, 130, 143)
+        assert f"what is done stays: the same command with {way} continues\n" in capsys.readouterr().err
+    capsys.readouterr()
+    assert run(splats, "-o", out, *QUICK, "--resume") == 0  # in place of the older chain
+    assert capsys.readouterr().out.endswith(f"{out}/: levels.json has this table\n")
+    assert not out.with_name("chain.partial").exists()
 
 
 @pytest.mark.parametrize(

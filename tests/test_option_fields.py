@@ -25,6 +25,7 @@ from meshsplats._options import (
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.conversion.cleaning_rules import CleaningRules
 from meshsplats.conversion.options import ConversionOptions
+from meshsplats.errors import OptionValueError
 from meshsplats.finetuning import FinetuneConfig, RunOptions
 from meshsplats.tiles.building import TileOptions
 from meshsplats.training.config import TrainConfig
@@ -79,6 +80,19 @@ class Toasting(Baking):
 def test_values_are_checked_by_what_the_field_declares(changes, message):
     with pytest.raises(ValueError, match=re.escape(message) + "$"):
         Baking(**changes)
+
+
+def test_limits_are_written_as_people_write_them():
+    assert str(Range(1, 2**31 - 1)) == "from 1 to 2147483647"
+    assert str(Range(1e-5, 1e9)) == "from 1e-05 to 1e+09"
+    assert str(Range(10**7 + 1, math.inf)) == "of at least 10000001"
+
+
+def test_errors_name_the_option_for_programs_that_show_it_in_their_own_way():
+    for changes, name in (({"heat": 300}, "heat"), ({"glaze": 1}, "glaze"), ({"coats": 2}, "coats")):
+        with pytest.raises(OptionValueError) as caught:
+            Baking(**changes)
+        assert caught.value.spelled("--{}".format).startswith(f"--{name} ")
 
 
 def test_values_that_a_field_allows():

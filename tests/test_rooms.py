@@ -12,16 +12,16 @@ import meshsplats
 ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 13
 LOWEST = (
-    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_lazy", "_options"),
-    *("_origin", "_toml", "choices", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
+    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_lazy", "_origin"),
+    *("_toml", "choices", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
 )
 """Rooms that import no other room."""
 FLOORS = (
     (
-        *("_json", "_option_values", "_words", "binding", "camera", "cluster", "draw_order", "gaussians"),
+        *("_json", "_options", "_words", "binding", "camera", "cluster", "draw_order", "gaussians"),
         "mesh_joining",
     ),
-    ("base_mesh", "demo_scene", "images", "mesh"),
+    ("_option_values", "base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),
     ("viewpoints",),

@@ -158,7 +158,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
         ("save_image", {"path": "x", "image": IMAGE}, {"path": "path", "image": "array"}),
         ("save_mesh", {"mesh": MESH, "path": "x"}, {"mesh": "mesh", "path": "path"}),
         ("draw_surface", {"base": BASE, "camera": CAMERAS[0]}, {"base": "base", "camera": "camera"}),
-        ("make_surface", {"scene": CLOUD}, {"data": "optional dataset", "cameras": "optional cameras"}),
+        (
+            "make_surface",
+            {"scene": CLOUD},
+            {"data": "optional dataset", "cameras": "optional cameras", "options": "options"},
+        ),
         ("save_base", {"base": BASE, "path": "x.glb"}, {"base": "base", "path": "path"}),
         ("simplify", {"cloud": CLOUD, "count": 9}, {"cloud": "cloud", "cameras": "optional cameras"}),
         (
@@ -284,6 +288,38 @@ FIRST_MISTAKES = {
     "meshes for blocks": (
         lambda: ms.save_gaussian_blocks([MESH], "a.ply", 1),
         r"blocks\[0\] must be a Gauss",
+    ),
+    "a misspelt option of a surface": (
+        lambda: ms.make_surface(CLOUD, face=40),
+        "make_surface has no option 'face'; did you mean 'faces'",
+    ),
+    "splats to join": (
+        lambda: ms.SplatMesh.joined([MESH, CLOUD]),
+        r"parts\[1\] must be a SplatMesh, got a GaussianCloud: convert\(cloud\) makes a mesh of it",
+    ),
+    "one mesh to join": (lambda: ms.SplatMesh.joined(MESH), r"a list of SplatMesh.*give \[parts\] or more"),
+    "one cloud to join": (lambda: ms.GaussianCloud.joined(CLOUD), r"got a GaussianCloud: give \[clouds\]"),
+    "a number of cameras as text": (
+        lambda: ms.orbit(MESH, "3"),
+        r"count must be a whole number, got the text '3': int\(count\) makes one",
+    ),
+    "an angle as text": (
+        lambda: ms.orbit(MESH, elevation="20"),
+        r"elevation must be a number, got the text '20': float\(elevation\) makes one",
+    ),
+    "no angle": (lambda: ms.look_around(MESH, fov=None), "fov must be a number, got None: give one"),
+    "a side as text": (lambda: ms.dome(MESH, width="800"), "width must be a number, got the text '800'"),
+    "one attribute": (
+        lambda: ms.render(MESH, CAMERAS[0], attributes="height"),
+        r"attributes must be .* got the text 'height': give \[attributes\] or more of them",
+    ),
+    "a background by name": (
+        lambda: ms.render(MESH, CAMERAS[0], background="white"),
+        r"background must be RGB from 0 to 1, .* got the text 'white': white is \(1, 1, 1\)",
+    ),
+    "a background of splats by name": (
+        lambda: ms.draw_splats(CLOUD, CAMERAS[0], background="#ffffff"),
+        "background must be RGB from 0 to 1",
     ),
     "parts of one": (lambda: ms.save_mesh_blocks(MESH, "a.ply"), r"give \[parts\] or more of them"),
 }

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
@@ -24,11 +25,13 @@ _MAKES = {
     "ConversionOptions": "single options go by name, convert(cloud, sides=6)",
     "FinetuneConfig": "single settings go by name, finetune(mesh, dataset, minutes=5); make_config makes one",
     "TrainConfig": "single settings go by name, train(dataset, minutes=5); train_config makes one",
+    "SurfaceOptions": "single options go by name, make_surface(scene, faces=5000)",
     "RunOptions": "RunOptions(folder='run')",
     "TileOptions": "TileOptions(max_triangles=65536)",
     "PageOptions": "PageOptions(title='A scene')",
     "Workers": "open_workers opens them",
     "ScenePoints": "load_points reads them from a data set",
+    "str": "names are in quotes",
     "path": "a str or a pathlib.Path names a file",
     "array": "np.asarray makes one",
 }
@@ -176,6 +179,31 @@ def need_array(
             array = None
         if array is None or array.dtype.kind not in "fiub":
             raise TypeError(_message(name, wanted, "array", value, instead or {}))
+
+
+def need_numbers(**given: object) -> None:
+    """TypeError unless the arguments ``given`` are numbers."""
+    for name, value in given.items():
+        _number(name, value, "a number")
+
+
+def as_whole(name: str, value: object) -> int:
+    """The whole number that the argument ``name`` gives. TypeError for what is no number, ValueError for a
+    fraction."""
+    number = _number(name, value, "a whole number")
+    if not number.is_integer():
+        raise ValueError(f"{name} must be a whole number, got {value}")
+    return int(number)
+
+
+def _number(name: str, value: Any, wanted: str) -> float:
+    is_text = isinstance(value, (str, bytes))  # which may read as a number
+    with suppress(TypeError, ValueError):
+        if not is_text:
+            return float(value)
+    maker = "int" if "whole" in wanted else "float"
+    todo = f"{maker}({name}) makes one of digits" if is_text else f"give one, {name}=20 say"
+    raise TypeError(f"{name} must be {wanted}, got {described(value)}: {todo}")
 
 
 def described(value: object) -> str:

@@ -24,6 +24,8 @@ from itertools import pairwise
 from numbers import Real
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from meshsplats.errors import OptionValueError
+
 M = TypeVar("M")
 NUMBERS = (Real,)
 """Numbers of Python and of NumPy, which is not imported for help."""
@@ -46,8 +48,13 @@ class Range:
 
     def __str__(self) -> str:
         if self.high == math.inf:
-            return f"of at least {self.low:.7g}"
-        return f"from {self.low:.7g} to {self.high:.7g}"
+            return f"of at least {_digits(self.low)}"
+        return f"from {_digits(self.low)} to {_digits(self.high)}"
+
+
+def _digits(value: float) -> str:
+    """A limit as people write it: one that is an int with all its digits."""
+    return str(value) if isinstance(value, int) else f"{value:.7g}"
 
 
 @dataclass(frozen=True)
@@ -144,22 +151,23 @@ class Setting:
         return simple or PLACEHOLDERS.get(self.name, "VALUE")
 
     def check(self, value: Any, types: tuple[type, ...]) -> None:
-        """ValueError for a value that the field does not allow. ``types``: those of numbers."""
+        """OptionValueError for a value that the field does not allow. ``types``: those of numbers."""
         fixed, limits = self.mark(Fixed), self.mark(Range)
         if fixed is not None and value != self.default:
-            raise ValueError(f"{self.name} must be {self.default!r} {fixed.why}")
+            raise OptionValueError(f"``{self.name}`` must be {self.default!r} {fixed.why}")
         if value is None and self.optional:
             return
         if self.choices and value not in self.choices:
-            raise ValueError(f"{self.name} must be one of {', '.join(map(str, self.choices))}, got {value!r}")
+            known = ", ".join(map(str, self.choices))
+            raise OptionValueError(f"``{self.name}`` must be one of {known}, got {value!r}")
         if bool in self.kinds and not isinstance(value, bool):
-            raise ValueError(f"{self.name} must be True or False, got {value!r}")
+            raise OptionValueError(f"``{self.name}`` must be True or False, got {value!r}")
         if limits is not None:
             whole = int in self.kinds
             number = isinstance(value, types) and not isinstance(value, bool)
             if not number or not limits.low <= value <= limits.high or (whole and value % 1 != 0):
                 what = "a whole number" if whole else "a number"
-                raise ValueError(f"{self.name} must be {what} {limits}, got {value!r}")
+                raise OptionValueError(f"``{self.name}`` must be {what} {limits}, got {value!r}")
 
 
 def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:
@@ -250,7 +258,7 @@ def check_options(
         types: accepted types of numbers; bool is never one.
 
     Raises:
-        ValueError: a value of the wrong type, out of range, or without effect.
+        OptionValueError: a value of the wrong type, out of range, or without effect.
     """
     for name, setting in settings(type(options)).items():
         value = getattr(options, name)
@@ -259,7 +267,21 @@ def check_options(
         is_given = value != setting.default if given is None else name in given
         if condition is not None and is_given and not condition.met(options):
             got = " and ".join(f"{other} {getattr(options, other)!r}" for other in condition.values)
-            raise ValueError(f"{name} has no effect without {condition}" + (f", got {got}" if got else ""))
+            but = f", got {got}" if got else ""
+            raise OptionValueError(f"``{name}`` has no effect without {condition}{but}")
+
+
+def check_naming(group: type, how: Callable[[str], str]) -> Callable[[Any], None]:
+    """``__post_init__`` of the dataclass ``group``, whose errors name options as ``how`` shows them."""
+
+    def check(options: Any) -> None:
+        try:
+            if (own := getattr(group, "__post_init__", None)) is not None:
+                own(options)
+        except OptionValueError as error:
+            raise ValueError(error.spelled(how)) from None
+
+    return check
 
 
 def changed(options: Any) -> list[str]:

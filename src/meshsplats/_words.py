@@ -1,9 +1,13 @@
-"""Directions, colours, times and counts in words: as options of commands have them, and as is printed."""
+"""Directions, colours, times, counts and commands in words: as options have them, and as is printed."""
 
 from __future__ import annotations
 
 import math
+import re
+import shlex
+import sys
 import time
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from meshsplats.errors import OptionValueError
@@ -84,9 +88,34 @@ def _numbers(text: str) -> tuple[float, float, float] | None:
     return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
 
 
-def plural(count: int, noun: str) -> str:
-    """``1 view``, ``1,200 views``."""
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+def plural(count: int, noun: str, several: str = "") -> str:
+    """``1 view``, ``1,200 views``; ``several``: the plural of a noun that has another one."""
+    return f"{count:,} {noun if count == 1 else several or f'{noun}s'}"
+
+
+def naming(text: str, names: Sequence[str]) -> str:
+    """A message with the first of ``names`` in front, behind "error:" or "warning:", unless one of them is in
+    it."""
+    if not names or any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for name in names):
+        return text
+    kind = re.match("(error: |warning: )?", text)
+    start = kind.end() if kind else 0
+    return f"{text[:start]}{names[0]}: {text[start:]}"
+
+
+def command_line(words: Iterable[object]) -> str:
+    """A command as the shell of this system takes it."""
+    return " ".join(quoted(str(word)) for word in words)
+
+
+def quoted(word: str) -> str:
+    """An argument of a command, in quotes where the shell of this system needs them. Those of Windows know no
+    single quotes, and a backslash is part of a path there."""
+    if sys.platform != "win32":
+        return shlex.quote(word)
+    if re.fullmatch(r"[\w@+=:,./\\~-]+", word):
+        return word
+    return '"' + re.sub(r"(\\+)$", r"\1\1", word) + '"'
 
 
 def duration(seconds: float) -> str:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
+from meshsplats._kinds import need_numbers
 from meshsplats.choices import MAX_SIDE
 
 NEAR_SHARE = 0.002
@@ -22,6 +24,14 @@ MAX_SKEW = 1e-2
 """How far a rotation may be from orthonormal; less than that is taken for rounding."""
 OPENGL = np.array([1.0, -1.0, -1.0])
 """Turns OpenGL's y and z axes, up and backwards, to those of OpenCV, and back."""
+
+
+def checked_side(name: str, value: Any) -> int:
+    """A side of an image in pixels. TypeError for what is no number, ValueError for one out of range."""
+    need_numbers(**{name: value})
+    if not (value % 1 == 0 and 1 <= value <= MAX_SIDE):
+        raise ValueError(f"{name} must be a whole number from 1 to {MAX_SIDE}, got {value}")
+    return int(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +87,7 @@ class Camera:
                 raise ValueError(f"{name} must be finite, got {value}")
             object.__setattr__(self, name, value)
         for name in ("width", "height"):
-            value = getattr(self, name)
-            if int(value) != value or not 1 <= value <= MAX_SIDE:
-                raise ValueError(f"{name} must be a whole number from 1 to {MAX_SIDE}, got {value}")
-            object.__setattr__(self, name, int(value))
+            object.__setattr__(self, name, checked_side(name, getattr(self, name)))
 
     @property
     def center(self) -> np.ndarray:

@@ -12,13 +12,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from meshsplats._files.atomic import in_words, replace_folder, write_json
+from meshsplats._files.atomic import replace_folder, write_json
 from meshsplats._kinds import as_path
+from meshsplats.evaluation.level_tables import TABLE
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.file_options import ChainOptions
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.formats.outputs import CONFIGURATION, check_outputs
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs, check_resumption
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import (
     SAMPLES,
@@ -34,9 +35,7 @@ from meshsplats.levels import (
     views_to_score,
 )
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.looks import comparison_in_words
 
-TABLE = "levels.json"
 OnLevel = Callable[[int, Level], AbstractContextManager[Callable[[Progress], None] | None]]
 
 
@@ -65,23 +64,17 @@ def check_folder(folder: Path, *, resume: bool = False, replace_old: bool = Fals
         OSError: it cannot be written.
     """
     unfinished = partial_folder(folder)
-    check_outputs([folder], replace_old)
     if folder.exists() and not (folder / TABLE).is_file():
         raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
-    if resume and not (unfinished / CONFIGURATION).is_file():
-        raise FileNotFoundError(f"nothing to resume in {unfinished}: leave out ``resume`` to start again")
-    if unfinished.exists() and not resume and not replace_old:
-        raise FileExistsError(
-            f"{unfinished} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
-        )
+    check_resumption(folder, unfinished, CONFIGURATION, resume=resume, replace_old=replace_old)
+    check_outputs([folder], replace_old or resume)
 
 
 def begin_folder(folder: Path) -> Path:
     """Makes ``partial_folder(folder)``, empty, and returns it. FileExistsError for one that is no chain's."""
     unfinished = partial_folder(folder)
     if unfinished.exists():
-        if not (unfinished / CONFIGURATION).is_file():
-            raise FileExistsError(f"{unfinished} exists and is not of this command: remove it")
+        check_resumption(folder, unfinished, CONFIGURATION, resume=False, replace_old=True)
         shutil.rmtree(unfinished)
     unfinished.mkdir()
     return unfinished
@@ -140,23 +133,6 @@ def make_chain(
     write_json(unfinished / TABLE, table)
     replace_folder(unfinished, folder)
     return table
-
-
-def table_in_words(table: dict[str, Any], folder: Path) -> list[str]:
-    """Lines with the ``table`` of the chain in ``folder``."""
-    rows, glb = table["levels"], any(row["file"].endswith(".glb") for row in table["levels"])
-    heads = f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}"
-    lines = [f"{heads}  alpha" if glb else heads]
-    for row in rows:
-        lines.append(
-            f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{in_words(row['bytes']):>10}"
-            f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
-            + (f"  {row['alpha']['alpha']}" if glb and row["alpha"] else "")
-        )
-    views = sorted({row["views"] for row in rows})
-    count = " to ".join(map(str, (views[0], views[-1])[: len(views)]))
-    lines.append(f"{comparison_in_words(table['look'], table['samples'])}; {count} views")
-    return [*lines, f"{folder}/: {TABLE} has this table"]
 
 
 def _made(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._files.atomic import together
+from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
@@ -21,21 +22,23 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.comparison import fidelity
+from meshsplats.evaluation.viewers import SIDE, VIEWS
 from meshsplats.formats.base_meshes import load_vertex_colored
 from meshsplats.formats.gaussians import save_gaussian_blocks, save_gaussians
+from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh_blocks
-from meshsplats.formats.outputs import (
-    scaled,
-    splat_options,
-)
+from meshsplats.formats.outputs import scaled, splat_options
 from meshsplats.formats.scenes import save_scene
 from meshsplats.formats.sniff import identify
-from meshsplats.formats.splat_formats import written_ending
+from meshsplats.formats.splat_formats import listed, written_ending
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.jobs import Job
 from meshsplats.mesh import SplatMesh
 from meshsplats.product import Product
+from meshsplats.viewpoints.showing import default_views
+
+LARGE_BYTES = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -62,12 +65,16 @@ class Converter:
 
     product: Product
     callbacks: ConversionCallbacks
+    threads: int | None = None
+    """At most this many; None: all processors. The callbacks have theirs."""
 
     def made(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``. Returns counts, scores and seconds, for JSON."""
         kind, product = identify(job.source), self.product
-        if kind == "cameras" or (kind == "mesh" and product.as_splats):
-            raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
+        if kind == "cameras":
+            raise FileFormatError(f"{job.source}: cameras, not splats; convert needs splats or a mesh")
+        if kind == "mesh" and product.as_splats:
+            raise FileFormatError(_no_splats(job))
         if product.stream and kind == "mesh":
             raise FileFormatError(f"{job.source}: a mesh; ``stream`` is for splats")
         if product.stream:
@@ -96,15 +103,17 @@ class Converter:
             cameras=seen,
             up=product.direction,
             source=job.source,
+            threads=self.threads,
         )
-        mesh = product.files.prepared(mesh, seen)
+        mesh = product.files.prepared(mesh, seen, self.threads)
         times = {"read": read - start, "convert": time.perf_counter() - read}
+        measured = seen or self._views_for_alpha(cloud, job)
         opening = self.callbacks.opening(cloud, job.source, seen) if job.preview else None
         return {
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
             "merged": product.merges,
-            **self._finish(mesh, job, seen, times, opening),
+            **self._finish(mesh, job, seen, times, opening, measured),
             "fidelity": self._fidelity(cloud, mesh, seen),
         }
 
@@ -117,7 +126,8 @@ class Converter:
         )
         parts = (part if product.origin == "keep" else replace(part, origin=np.zeros(3)) for part in blocks)
         with self._recorded(job):
-            vertices, triangles, converted = save_mesh_blocks(parts, job.outputs[0])
+            whole = source.count if product.conversion.crop is None else None
+            vertices, triangles, converted = save_mesh_blocks(parts, job.outputs[0], splats=whole)
         return {
             "splats": source.count,
             "converted": converted,
@@ -155,7 +165,20 @@ class Converter:
             return None
         if self.product.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.product.conversion.crop)
-        return fidelity(cloud, mesh, cameras, self.product.fidelity, self.product.look)
+        counted = self.product.fidelity
+        return fidelity(cloud, mesh, cameras, counted, self.product.look, threads=self.threads)
+
+    def _views_for_alpha(self, cloud: GaussianCloud, job: Job) -> list[Camera]:
+        """Views by which the alpha mode is chosen where no cameras are given: those that are found in a
+        place, which from outside shows the backs of its walls. None for an object. With or without a
+        preview, which has the first of them: it must not change the mesh."""
+        if not self.product.files.measures(job.outputs):
+            return []
+        if self.product.conversion.crop is not None:
+            cloud = choose_splats(cloud, crop=self.product.conversion.crop)
+        up, side = self.product.direction, (SIDE, SIDE)
+        found = default_views(cloud, job.source, VIEWS, side=side, up=up, threads=self.threads)
+        return [] if found is None else found[0]
 
     def _finish(
         self,
@@ -164,12 +187,14 @@ class Converter:
         cameras: Sequence[Camera],
         times: dict[str, float],
         opening: Camera | None = None,
+        measured: Sequence[Camera] | None = None,
     ) -> dict[str, Any]:
         """Writes ``mesh``, which is prepared, and its preview. Its part of the result; ``times``: of what was
-        done before, in seconds."""
-        start, files = time.perf_counter(), self.product.files
-        choice = files.choice(mesh, job.outputs, cameras)
-        order = files.order(mesh, job.outputs, cameras)
+        done before, in seconds; ``measured``: views that the alpha mode is chosen by, by default the
+        ``cameras``."""
+        start, files, threads = time.perf_counter(), self.product.files, self.threads
+        choice = files.choice(mesh, job.outputs, cameras if measured is None else measured, threads)
+        order = files.order(mesh, job.outputs, cameras, threads)
         chosen = time.perf_counter()
         placed = self.callbacks.place(scaled(mesh, self.product.scale))
         with self._recorded(job):
@@ -206,7 +231,7 @@ class Converter:
         )
         seen = seen_from(cameras, job.source, kept.origin)
         if merging and count is not None:
-            kept = simplify_for_views(kept, count, seen, up=product.direction)
+            kept = simplify_for_views(kept, count, seen, up=product.direction, threads=self.threads)
         result = self.callbacks.place(scaled(kept, product.scale))
         with self._recorded(job):
             kinds = [written_ending(path.name) for path in job.outputs]
@@ -235,9 +260,58 @@ class Converter:
         return scene if self.product.direction is None else replace(scene, up=unit_up(self.product.direction))
 
 
+def _no_splats(job: Job) -> str:
+    """Why the mesh that is the source of ``job`` does not become splats, and what it can become."""
+    meshes = listed(written_mesh_suffixes())
+    endings = [f".{written_ending(path.name)}" for path in job.outputs]
+    if splats := [ending for ending in endings if ending not in written_mesh_suffixes()]:
+        why = f"convert writes {listed(tuple(splats), 'and')} of splats only; as a mesh it can be {meshes}"
+    else:
+        why = f"no splats are made of it; without ``as_splats`` it can become {meshes}"
+    return f"{job.source}: a mesh, not splats: {why}"
+
+
 def seen_from(cameras: Sequence[Camera] | None, source: Path, origin: np.ndarray) -> list[Camera]:
     """``cameras``, which are in the world, relative to ``origin``; None: those of the model folder
     ``source``, if it is one."""
     if cameras is None:
         return cameras_beside(source, origin) or []
     return [camera.relative_to(origin) for camera in cameras]
+
+
+def counts_in_words(result: dict[str, Any]) -> str:
+    """Sizes before and after, and the scores, of the ``result`` of a conversion to a mesh."""
+    vertices = plural(result["vertices"], "vertex", "vertices")
+    sizes = f"{plural(result['triangles'], 'triangle')}, {vertices}"
+    if "splats" in result:
+        share = result["converted"] / result["splats"]
+        kept = f", merged into {result['converted']:,} ({share:.1%})"
+        if result["converted"] == result["splats"]:
+            kept = ""
+        elif not result["merged"]:
+            kept = f", {result['converted']:,} of them converted ({share:.1%})"
+        sizes = f"{plural(result['splats'], 'splat')}{kept} -> {sizes}"
+    fidelity = result["fidelity"]
+    if fidelity is None:
+        return sizes
+    psnr = "equal" if fidelity["psnr"] is None else f"{fidelity['psnr']:.2f} dB"
+    views = plural(fidelity["views"], "view")
+    scores = f"{psnr}, SSIM {fidelity['ssim']:.4f} against the splats"
+    return f"{sizes}; {scores}, {views}, look {fidelity['look']}"
+
+
+def times_in_words(seconds: dict[str, float]) -> str:
+    """What took how long."""
+    words = {"read": "read", "convert": "converted", "save": "saved", "choose alpha": "chose alpha"}
+    words["solve order"] = "solved the order"
+    return ", ".join(f"{words[name]} {value:.2f} s" for name, value in seconds.items() if value)
+
+
+def too_large(path: Path) -> list[str]:
+    """A line about a .glb that viewers in browsers do not take: they hold it in memory, more than once."""
+    if path.suffix.lower() != ".glb" or path.stat().st_size <= LARGE_BYTES:
+        return []
+    return [
+        "too large for viewers in browsers, and for most engines: ``max_triangles`` 2000000 merges splats"
+        " first, 'meshsplats tiles' keeps them all"
+    ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats._arrays import checked_array, chosen_rows
 from meshsplats._geometry import quaternion_product, quaternions_of, rotation_rows
-from meshsplats._kinds import need_choice
+from meshsplats._kinds import need_all, need_choice
 from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
 
@@ -141,6 +141,7 @@ class GaussianCloud:
         Missing harmonics are zero; the kernel is '3dgs' unless all share one, ``up`` is None unless all have
         the same, and the origin is that of the first cloud whose origin is not zero.
         """
+        need_all(GaussianCloud, clouds=clouds)
         if not clouds:
             raise ValueError("there must be at least one cloud to join")
         if len(clouds) == 1:

@@ -1,4 +1,4 @@
-"""What a file or folder is and holds: splats, a mesh, a tileset, cameras, a data set of photographs."""
+"""What a file or folder is and holds: splats, a mesh, a tileset, levels of detail, cameras, a data set."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.datasets.layouts import Layout, find_layout
 from meshsplats.errors import FileFormatError
+from meshsplats.evaluation.level_tables import find_table, load_table, table_in_words
 from meshsplats.formats.gaussians import format_of, load_gaussians, moving_splats
 from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.formats.meshes import load_mesh
@@ -34,6 +35,8 @@ from meshsplats.tiles import is_tileset
 SAMPLE = 4000
 """Number of splats that are converted to estimate the size of the mesh."""
 
+_OF_TABLE = ("look", "samples", "levels")
+"""Findings about levels of detail that their table has in its lines."""
 HARMONICS_DRAWN_BY = "meshsplats, its page, Blender unlit; three.js and engines by shaders of docs/viewers.md"
 PLAIN = "plain colours, the mean of views"
 BASE = "the part of degree 0"
@@ -49,6 +52,8 @@ def describe(path: str | os.PathLike[str], reading: Mapping[str, Any] | None = N
     path = as_path("path", path)
     if is_tileset(path):
         return {"kind": "tileset", **_tileset(path)}
+    if (table := _levels(path)) is not None:
+        return {"kind": "levels", **table}
     layout = _layout(path)
     kind = "data set" if layout is not None else identify(path)
     found: dict[str, Any] = {"kind": kind}
@@ -82,7 +87,10 @@ def describe(path: str | os.PathLike[str], reading: Mapping[str, Any] | None = N
 
 
 def in_words(findings: Mapping[str, Any]) -> list[str]:
-    """A line for each of the findings of ``describe``."""
+    """A line for each of the findings of ``describe``; for levels of detail, one for each level."""
+    if findings.get("kind") == "levels":
+        others = {name: value for name, value in findings.items() if name not in _OF_TABLE}
+        return [*in_words({**others, "kind": "levels of detail"}), "", *table_in_words(dict(findings))]
     width = max(map(len, findings))
     return [f"{key.replace('_', ' '):<{width}}  {_in_words(value)}" for key, value in findings.items()]
 
@@ -246,6 +254,23 @@ def _tileset(path: Path) -> dict[str, Any]:
         **_origin(tileset.origin),
         "up": _rounded(tileset.up),
     }
+
+
+def _levels(path: Path) -> dict[str, Any] | None:
+    """The table of a chain; None for anything else, such as a folder with another file of this name."""
+    file = find_table(path)
+    if file is None:
+        return None
+    try:
+        table, folder = load_table(file), file.parent
+    except FileFormatError:
+        if path == file:
+            raise
+        return None
+    names = {str(row["file"]) for row in table["levels"]}
+    missing = sorted(name for name in names if not (folder / name).is_file())
+    held = sum((folder / name).stat().st_size for name in names.difference(missing))
+    return {"bytes": held, **table, **({"missing": missing} if missing else {})}
 
 
 def _cameras(cameras: Sequence[Camera], origin: np.ndarray) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from meshsplats.formats.outputs import (
     file_of,
     recorded_options,
 )
-from meshsplats.formats.sniff import identify
+from meshsplats.formats.sniff import archives_of_splats, identify
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named, splat_file, subject_name
 
@@ -165,8 +165,9 @@ def _taken(paths: Sequence[Path], doubt: str) -> FileExistsError:
 
 
 def sources(paths: Sequence[Path]) -> list[Path]:
-    """``paths``, with the splats and meshes inside in place of a folder that is no model, by name. Raises
-    FileNotFoundError, and FileFormatError for a folder without any."""
+    """``paths``, with the splats and meshes inside in place of a folder that is no model, by name: of models,
+    files, links that lead nowhere and zip archives of splats. Raises FileNotFoundError, and FileFormatError
+    for a folder without any."""
     found: list[Path] = []
     for path in paths:
         found += _inside(path) if path.is_dir() else [path]
@@ -280,7 +281,8 @@ def _inside(folder: Path) -> list[Path]:
         for path in folder.iterdir()
         if path.is_dir() and not path.name.startswith(".") and _is_splats(path)
     ]
-    found = sorted([*models, *files_named(folder, (*mesh_suffixes(), *splat_suffixes()))])
+    files = files_named(folder, (*mesh_suffixes(), *splat_suffixes()))
+    found = sorted([*models, *files, *archives_of_splats(folder)])
     if not found:
         splat_file(folder)  # says what is wrong
     return found

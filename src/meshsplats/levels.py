@@ -13,7 +13,7 @@ from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.footprint import FILTER_PX2
 from meshsplats.conversion.merging import simplify_large
-from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset
+from meshsplats.datasets.splat_targets import HELD_OUT, shown_degree, splat_dataset
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import compare, images_of_view
@@ -120,9 +120,10 @@ def make_level(
     ``config`` says; without one, converted only. Without ``options``, splats have as many triangles as on the
     finest level, so that the numbers of triangles follow those of splats.
 
-    A level that is only converted may be made of the splats of the level before (``merged``). If it is not
-    the finest and there are no ``options``, the low-pass filter is the one of ``FOOTPRINTS_PX2`` that comes
-    nearest to the training views.
+    Its colours have harmonics up to the degree of the images of splats in ``targets``. A level that is only
+    converted may be made of the splats of the level before (``merged``). If it is not the finest and there
+    are no ``options``, the low-pass filter is the one of ``FOOTPRINTS_PX2`` that comes nearest to the
+    training views.
 
     ``options`` and ``up`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
     """
@@ -161,14 +162,16 @@ def _converted_level(
     up: Sequence[float] | np.ndarray | None,
     run: RunOptions | None,
 ) -> SplatMesh:
+    threads = run.threads if run else None
     cameras = [view.camera for view in targets.views]
-    cloud = merged(cloud, level, cameras)
+    degree = shown_degree(targets.views)
+    cloud = merged(cloud if degree is None else cloud.of_degree(degree), level, cameras, threads)
     if options is not None or level.splats == level.finest:
-        return convert(cloud, options, cameras=cameras, up=up)
+        return convert(cloud, options, cameras=cameras, up=up, threads=threads)
     best, found = -math.inf, None
     for px2 in FOOTPRINTS_PX2:
-        mesh = convert(cloud, cameras=cameras, up=up, footprint_px2=px2)
-        score = likeness_to_views(mesh, targets.train[:PLAIN_VIEWS], run.threads if run else None)
+        mesh = convert(cloud, cameras=cameras, up=up, footprint_px2=px2, threads=threads)
+        score = likeness_to_views(mesh, targets.train[:PLAIN_VIEWS], threads)
         if score <= best:
             break
         best, found = score, mesh

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from meshsplats._arrays import checked_array, chosen_rows
-from meshsplats._kinds import need_choice
+from meshsplats._kinds import need_all, need_choice
 from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
@@ -383,6 +383,7 @@ class SplatMesh:
         Raises ValueError, which names the part, where they do not agree, for bases that differ, and for more
         vertices or triangles than int32 can number.
         """
+        need_all(SplatMesh, parts=parts)
         return joined_meshes(parts, same_splats=same_splats)
 
     def moved(

@@ -16,6 +16,7 @@ from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.formats.outputs import (
     WantedOrigin,
+    check_mesh_endings,
     check_origin,
     check_outputs,
     check_splat_endings,
@@ -137,6 +138,7 @@ class Product:
             raise OptionsError("``with_mesh`` and ``collider`` go beside splats: ``as_splats``")
         if self.spz_version is not None or self.linear is not None:
             raise OptionsError("``spz_version`` and linear are for splats: ``as_splats``")
+        check_mesh_endings(*kinds)
         self.files.check(kinds)
         check_photographs(self.data, self.missing, self.cameras)
         self.resolved(sources(inputs))

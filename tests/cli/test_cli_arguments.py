@@ -114,7 +114,17 @@ def test_help_names_options_by_their_flags(capsys):
     assert f"{cutoff} (default: 0.2; paper: 0.2)" in text
 
 
-@pytest.mark.parametrize(("name", "most"), [("finetune", 45), ("convert", 33), ("train", 30), ("prior", 45)])
+@pytest.mark.parametrize("more", [[], ["--set", "sides=5"]])
+def test_what_a_misspelt_flag_may_mean_is_told_as_in_help(splats, capsys, more):
+    with pytest.raises(SystemExit):
+        parse(command("convert"), "meshsplats convert", [splats, "-o", "a.glb", "--maxtriangles", "5", *more])
+    err = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "Unrecognized options: --maxtriangles" in err
+    assert "--max-triangles N Largest number of triangles" in err
+    assert "`" not in err
+
+
+@pytest.mark.parametrize(("name", "most"), [("finetune", 45), ("convert", 34), ("train", 30), ("prior", 45)])
 def test_commands_have_few_options(name, most, capsys):
     assert len(set(re.findall(r"--[a-z][a-z0-9-]+", printed_help(name, "--help-all", capsys)))) <= most
 
@@ -246,8 +256,8 @@ def test_an_option_without_a_flag_is_set_by_its_name(splats):
         (["--set", "soft_edges=1"], "--set: soft_edges must be true or false, got '1'"),
         (["--set", "mode=round"], "--set: mode must be one of crossed, flat, 3d, got 'round'"),
         (["--set", "crop=1,2"], "--set: crop must be a list of 6 values, got '1,2'"),
-        (["--set", "beta1=2"], "beta1 must be a number from 0 to 0.99999, got 2.0"),
-        (["--set", "beta1=nan"], "beta1 must be a number from 0 to 0.99999, got nan"),
+        (["--set", "beta1=2"], "--set beta1 must be a number from 0 to 0.99999, got 2.0"),
+        (["--set", "beta1=nan"], "--set beta1 must be a number from 0 to 0.99999, got nan"),
         (["--set", "beta1=0.5", "--set", "beta1=0.6"], "--set beta1 is given twice"),
         (["--steps", "3", "--set", "steps=4"], "give --steps or --set steps, not both"),
         (["--beta1", "0.5"], "--beta1 is not an option of its own: write --set beta1=VALUE"),

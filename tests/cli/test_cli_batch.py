@@ -7,14 +7,17 @@ import io
 import json
 import os
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from _splats import few_splats
+from conftest import make_link
 
 from meshsplats import _toml as toml
+from meshsplats._words import naming
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
@@ -23,7 +26,8 @@ from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.formats.splat_paths import subject_name
-from meshsplats.jobs import jobs
+from meshsplats.formats.streaming import stream_gaussians
+from meshsplats.jobs import jobs, sources
 
 
 def run(*arguments) -> int:
@@ -106,6 +110,13 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
         (["scans", "-o", "out", "--lit", "--formats", "npz"], 2, "--lit is for .glb"),
         (["scans", "-o", "out", "--as-splats", "--formats", "obj"], 2, "splats are written as .ply"),
         (["scans", "-o", "out", "--set", "sides=2"], 1, "sides"),
+        (
+            ["scans", "-o", "out", "--formats", "glb", "compressed.ply"],
+            2,
+            ".glb would be meshes, .compressed.ply splats: write one of the two by a second command, or all"
+            " as splats: --as-splats",
+        ),
+        (["scans", "-o", "out", "--formats", "usdz", "obj"], 2, "a second command (see meshsplats convert"),
         (["-", "-", "-o", "out"], 2, "can be read once"),
         (["scans/a.ply", "-o", "-"], 2, "-o must end in"),
         (["scans/a.ply", "-o", "a.glb", "--fidelity", "0"], 1, "--fidelity must be"),
@@ -116,6 +127,75 @@ def test_mistakes_are_reported_first(scans, tmp_path, capsys, arguments, code, w
     assert run(*arguments) == code
     assert words in " ".join(capsys.readouterr().err.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_files_that_cannot_be_read_are_not_passed_over(tmp_path, monkeypatch, capsys):
+    """Links that lead nowhere, and zip archives: of splats, of photographs, torn."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    save_gaussians(few_splats(), tmp_path / "a.ply")
+    make_link(folder / "b.ply", tmp_path / "gone.ply")
+    for name, members in (("one", ["a.ply"]), ("two", ["a.ply", "b.ply"]), ("photos", ["a.jpg"])):
+        with zipfile.ZipFile(folder / f"{name}.zip", "w") as archive:
+            for member in members:
+                archive.write("a.ply", member)
+    (folder / "torn.zip").write_bytes((folder / "one.zip").read_bytes()[:2000])
+    assert sources([folder]) == [folder / name for name in ("b.ply", "one.zip", "torn.zip", "two.zip")]
+    assert run("scans", "-o", "out", "--no-sidecar") == 1
+    out, err = capsys.readouterr()
+    assert out.endswith("1 of 4 converted: out/\n")
+    assert os.listdir("out") == ["one.glb"]
+    link, torn, two = err.splitlines()
+    assert link.endswith("gone.ply, which does not exist")
+    assert torn.startswith("meshsplats: error: scans/torn.zip: a broken zip archive")
+    assert two.endswith("2 files of splats in one archive (a.ply, b.ply): unpack it, and give one")
+    (folder / "b.ply").unlink()
+    for name in ("two", "torn"):
+        (folder / f"{name}.zip").unlink()
+    assert [path.name for path in stream_gaussians(folder).paths] == ["one.zip"]
+
+
+def test_messages_about_one_of_several_inputs_name_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cloud = few_splats()
+    faint = replace(cloud, opacities=np.full(len(cloud), 0.001, np.float32))
+    far = replace(cloud, means=np.concatenate([cloud.means[:-1], [[1e5, 0, 0]]]))
+    for name, one in {
+        "a": far,
+        "b": far,
+        "faint": faint,
+        "map": replace(cloud, origin=[5e5, 4e6, 0]),
+    }.items():
+        save_gaussians(one, tmp_path / f"{name}.ply")
+    names = ("a.ply", "b.ply", "faint.ply", "map.ply")
+    assert run(*names, "-o", "out", "--no-preview") == 1
+    lines = capsys.readouterr().err.splitlines()
+    for start in (
+        "warning: a.ply: some splats lie",
+        "warning: b.ply: some splats lie",
+        "error: faint.ply: no splat is left",
+        "map.ply: origin: 500000",
+    ):
+        assert any(line.startswith(f"meshsplats: {start}") for line in lines), start
+    assert all(sum(name in line for name in names) == 1 for line in lines)
+    assert run("faint.ply", "-o", "faint.glb", "--no-preview") == 1  # whose name the user has just written
+    assert "error: no splat is left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("error: no splat", "error: a.ply: no splat"),
+        ("origin: 1 2 3", "a.ply: origin: 1 2 3"),
+        ("error: scans/a.ply: torn", "error: scans/a.ply: torn"),
+        ("warning: a.obj: no opacity", "warning: a.obj: no opacity"),
+        ("error: data.ply: torn", "error: a.ply: data.ply: torn"),
+    ],
+)
+def test_a_name_is_put_before_what_lacks_it(text, shown):
+    assert naming(text, ("a.ply", "a.obj")) == shown
+    assert naming(text, ()) == text
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert, simplify
 from meshsplats.conversion.merging_views import merging_views
+from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.comparison import compare
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.viewers import alpha_for_viewers
@@ -127,6 +128,29 @@ def test_fidelity_is_that_of_the_look_that_was_chosen(splats, tmp_path, capsys, 
     views = orbit(mesh, 2, elevation=15, width=400, height=400)
     wanted = np.mean([view.psnr for view in compare(cloud, mesh, views, look=look).views])
     assert f"{wanted:.2f} dB" in printed
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.glb", ["--fidelity", 1, "--max-triangles", 16]),
+        ("a.glb", ["--alpha", "ordered"]),
+        ("a.glb", ["--lit", "--smooth"]),
+        ("a.ply", ["--stream"]),
+        ("a.spz", ["--max-splats", 2]),
+    ],
+)
+def test_the_command_keeps_to_its_threads(splats, tmp_path, monkeypatch, name, options):
+    """Without the option, images ask for the number of processors; the result is the same."""
+    asked = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: asked.append(pid) or {0}, raising=False)
+    made = tmp_path / name
+    assert run(splats, "-o", made, *options, "--threads", 1) == 0
+    assert not asked
+    first = made.read_bytes()
+    assert run(splats, "-o", made, *options, "--force") == 0
+    assert asked or "--stream" in options
+    assert made.read_bytes() == first
 
 
 def test_up(splats, tmp_path):
@@ -305,6 +329,19 @@ def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options
     assert not (tmp_path / name).exists()
 
 
+def test_the_command_that_keeps_colours_of_views_works(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_gaussians(make_scene(200), tmp_path / "scene.ply")
+    assert run("scene.ply", "-o", "mesh.npz", "--no-sidecar") == 0
+    capsys.readouterr()
+    assert run("scene.ply", "-o", "flat.obj", "--no-sidecar") == 0
+    advised = re.search("'meshsplats (bake .*?)'", capsys.readouterr().err)
+    words = advised[1].replace("MESH.npz", "mesh.npz").replace("NEW.obj", "baked.obj")
+    assert main([*words_of(words), "--width", "64"]) == 0
+    assert "harmonics" not in capsys.readouterr().err
+    assert len(load_mesh("baked.obj").faces) == len(load_mesh("mesh.npz").faces)
+
+
 def test_no_splats_left(splats, tmp_path, capsys):
     assert run(splats, "-o", tmp_path / "a.ply", "--as-splats", "--set", "min_opacity=0.99") == 1
     assert "all are fainter than 0.99" in capsys.readouterr().err
@@ -361,7 +398,7 @@ def test_a_file_that_no_viewer_opens_says_so(tmp_path, capsys, monkeypatch):
     source = tmp_path / "balls.ply"
     save_gaussians(few_splats(), source)
     for limit, said in ((10**6, False), (1000, True)):
-        monkeypatch.setattr("meshsplats.cli.convert.LARGE_BYTES", limit)
+        monkeypatch.setattr("meshsplats.file_conversion.LARGE_BYTES", limit)
         assert run(source, "-o", tmp_path / "m.glb", "--no-preview", "--force") == 0
         assert ("too large for viewers" in capsys.readouterr().out) == said
     assert run(source, "-o", tmp_path / "m.npz", "--no-preview") == 0

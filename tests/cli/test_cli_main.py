@@ -18,7 +18,7 @@ from _datasets import simple_colmap
 from _photographs import write_photographs
 
 import meshsplats
-from meshsplats._words import parse_color, parse_up
+from meshsplats._words import command_line, parse_color, parse_up, quoted
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main, messages
@@ -139,8 +139,8 @@ def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
 )
 def test_commands_are_quoted_for_the_shell_of_the_system(monkeypatch, platform, word, written):
     monkeypatch.setattr(sys, "platform", platform)
-    assert messages.quoted(word) == written
-    assert messages.command_line(["meshsplats", Path("info"), word]) == f"meshsplats info {written}"
+    assert quoted(word) == written
+    assert command_line(["meshsplats", Path("info"), word]) == f"meshsplats info {written}"
 
 
 def test_a_folder_in_place_of_a_file_is_named_as_one(monkeypatch, tmp_path):
@@ -295,7 +295,7 @@ def test_doctor(capsys, monkeypatch):
     monkeypatch.setattr(installation, "_draws", lambda *_: False)
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
-    assert f"pip install {messages.quoted('no-such-thing>=1')}" in out
+    assert f"pip install {quoted('no-such-thing>=1')}" in out
     assert "DOES NOT WORK" in out
 
 
@@ -348,3 +348,9 @@ def test_the_command_leaves_the_processors_to_the_core(variable, more):
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == f"threads {more}"
+
+
+def test_one_splat_that_is_kept_is_no_plural(tmp_path, capsys):
+    save_gaussians(cloud(1), tmp_path / "one.ply")
+    assert main(["clean", str(tmp_path / "one.ply"), "-o", str(tmp_path / "clean.ply")]) == 0
+    assert "\nkept: 1 splat, from [" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 import signal
 import subprocess
@@ -138,6 +139,24 @@ def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, ca
         assert (result["triangles"], result["splats"]) == (triangles, triangles // 8)
         assert result.get("merged_from") == (200 if triangles < 1600 else None)
         assert ("merged from" in settings(page)["statistics"]) == (triangles < 1600)
+
+
+@pytest.mark.parametrize("shown", ["splats", "mesh"])
+def test_the_command_keeps_to_its_threads(folder, tmp_path, monkeypatch, shown):
+    """Without the option, images ask for the number of processors; the result is the same."""
+    monkeypatch.setattr(content, "COARSE_TRIANGLES", 400)
+    asked, page = [], tmp_path / "page.html"
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: asked.append(pid) or {0}, raising=False)
+    given = [folder / "scene.ply", "--max-triangles", 800]
+    if shown == "mesh":
+        given = [folder / "mesh.npz", "--splats", folder / "scene.ply"]
+    words = ["view", *map(str, given), "-o", str(page)]
+    assert main([*words, "--threads", "1"]) == 0
+    assert not asked
+    first = page.read_bytes()
+    assert main([*words, "--force"]) == 0
+    assert asked
+    assert page.read_bytes() == first
 
 
 @pytest.mark.slow

@@ -223,7 +223,7 @@ def test_the_command_keeps_to_its_threads(file, tmp_path, monkeypatch, kind):
     assert asked
 
 
-@pytest.mark.parametrize("command", ["clean", "simplify", "render"])
+@pytest.mark.parametrize("command", ["clean", "convert", "simplify", "render", "view"])
 def test_threads_are_checked_before_the_work(file, tmp_path, capsys, command):
     more = ["--share", "0.5"] if command == "simplify" else []
     output = str(tmp_path / "out.ply")
@@ -253,7 +253,7 @@ def test_the_command_on_a_mesh_in_json(tmp_path, capsys):
         (["-o", "clean.obj"], 2, "splats are written as .ply"),
         (["-o", "clean.txt"], 2, "splats are written as"),
         (["-o", "clean.ply", "--min-opacity", "0.9"], 1, "none of the 2,017 splats would be left"),
-        (["-o", "clean.ply", "--sparse", "2"], 2, "sparse must be a number from 0 to 1"),
+        (["-o", "clean.ply", "--sparse", "2"], 2, "--sparse must be a number from 0 to 1"),
         (["-o", "scene.ply", "--force"], 2, "is read by this command"),
     ],
 )

@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import threading
 import time
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -37,7 +39,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.mesh_formats import written_mesh_suffixes
-from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh
+from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh, save_mesh_blocks
 from meshsplats.images.writing import encode_array, save_animation, save_image
 from meshsplats.mesh import SplatMesh
 
@@ -86,6 +88,35 @@ def test_a_full_disk_is_one_line_with_path_and_bytes(small_disk, suffix):
         f"no space left on the disk: the file needs about {needed}, 262.1 kB are free"
     )
     assert list(small_disk.iterdir()) == []
+
+
+@pytest.mark.parametrize("splats", [None, 300])
+def test_a_mesh_in_parts_on_a_full_disk(small_disk, splats):
+    """Twice the file, as its parts lie beside it: that of all splats, or of the parts that came."""
+    mesh = large_mesh(9000)
+    mesh = replace(mesh, face_splat=np.arange(9000, dtype=np.int32) // 90)
+    with pytest.raises(OSError) as caught:
+        save_mesh_blocks([mesh], small_disk / "mesh.ply", splats=splats)
+    needed = atomic.in_words(2 * expected_bytes(mesh, ".ply") * (3 if splats else 1))
+    assert f"the file needs about {needed}, 262.1 kB are free" in message_of(
+        caught.value, small_disk / "mesh.ply"
+    )
+    assert list(small_disk.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "needs", "message"),
+    [
+        (errno.ENOSPC, None, r"no space left on the disk: [\d.]+ \w+ are free"),
+        (errno.ENOSPC, lambda: 2000, r"no space left on the disk: the file needs about 2\.0 kB, .* are free"),
+        (errno.EDQUOT, lambda: None, "the disk quota is used up"),
+        (errno.EFBIG, None, r"larger than a file may be here \(ulimit -f, or the file system\)"),
+    ],
+)
+def test_what_is_not_known_of_a_file_is_not_said(tmp_path, number, needs, message):
+    with pytest.raises(OSError) as caught, atomic_path(tmp_path / "a", needs=needs):
+        raise OSError(number, os.strerror(number))
+    assert re.fullmatch(message, str(caught.value.strerror))
 
 
 def test_images_on_a_full_disk(small_disk):

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from _splat_files import Table, random_splats, splat_table, write_ply
 from _splats import refused
+from conftest import make_link
 
-from meshsplats import FileFormatError, load_gaussians
+from meshsplats import FileFormatError, load_gaussians, load_mesh
+from meshsplats.formats.sniff import identify
 
 NAMES = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
 NAMES += [f"rot_{i}" for i in range(4)]
@@ -218,5 +220,13 @@ def test_folders_of_photographs_are_told(tmp_path, name):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
 def test_special_files_are_not_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
-    with pytest.raises(FileFormatError, match="neither a file nor a folder"):
-        load_gaussians(tmp_path / "pipe.ply")
+    for read in (load_gaussians, load_mesh, identify):  # none of which waits for a writer
+        with pytest.raises(FileFormatError, match=r"pipe\.ply: a pipe, not a file: .*give - as the input"):
+            read(tmp_path / "pipe.ply")
+
+
+def test_links_that_lead_nowhere_are_told(tmp_path):
+    make_link(tmp_path / "a.ply", tmp_path / "gone.ply")
+    for read in (load_mesh, identify):
+        with pytest.raises(FileNotFoundError, match=r"a link to .*gone\.ply, which does not exist"):
+            read(tmp_path / "a.ply")

@@ -200,12 +200,21 @@ def test_hostile_splats(view, kernel):
         ({"background": np.ones((37, 29, 3))}, "background must have shape"),
         ({"background": (0, float("inf"), 0)}, "background must be finite"),
         ({"background": np.full((29, 37, 3), np.nan)}, "background must be finite"),
+        ({"background": (255, 255, 255)}, "got values up to 255; divide bytes by 255"),
+        ({"background": np.full((29, 37, 3), 200, np.uint8)}, "got values up to 200; divide bytes by 255"),
         ({"attributes": ("cold",)}, "no attribute 'cold'; it has: heat, flow"),
     ],
 )
 def test_wrong_options_of_meshes(options, message):
     with pytest.raises(ValueError, match=message):
         render(soup(1), camera(), **options)
+
+
+def test_backgrounds_may_be_brighter_than_white():
+    drawn = render(soup(1).take(slice(0, 3)), camera(), background=(2, 1.5, 1))
+    empty = drawn.alpha == 0
+    assert empty.any()
+    assert (drawn.color[empty] == np.array([2, 1.5, 1], np.float32)).all()
 
 
 @pytest.mark.parametrize(
@@ -220,6 +229,7 @@ def test_wrong_options_of_meshes(options, message):
         ({"dilation": float("nan")}, "dilation must be"),
         ({"dilation": float("inf")}, "dilation must be"),
         ({"background": 1.0}, "background must have shape"),
+        ({"background": (0, 0, 128)}, "got values up to 128; divide bytes by 255"),
     ],
 )
 def test_wrong_options_of_splats(options, message):

@@ -34,7 +34,7 @@ from meshsplats.demo_scene.city import city_blocks
 from meshsplats.evaluation.viewers import AlphaChoice
 from meshsplats.tiles import buckets, building, making
 from meshsplats.tiles import tileset as tilesets
-from meshsplats.tiles.building import TileOptions, build_tiles
+from meshsplats.tiles.building import TileOptions, TilesetSummary, build_tiles
 from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen_error, tiles_mesh
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.tileset import Tileset
@@ -348,9 +348,11 @@ def test_a_full_disk_is_reported(splats, tmp_path, monkeypatch):
 
 def test_what_a_run_refuses(splats, tileset, tmp_path):
     source = stream_gaussians(splats)
-    with pytest.raises(FileNotFoundError, match="nothing to resume"):
+    with pytest.raises(FileNotFoundError, match=r"nothing to resume .* leave out ``resume``"):
         build_tiles(source, tmp_path / "tiles", SMALL, resume=True)
-    with pytest.raises(FileExistsError, match="exists: give another folder"):
+    with pytest.raises(FileNotFoundError, match="``force``, not ``resume``, replaces"):
+        build_tiles(source, tileset, SMALL, resume=True)
+    with pytest.raises(FileExistsError, match="exists: give another folder, or ``force`` to replace it"):
         build_tiles(source, tileset, SMALL)
     diary = tmp_path / "diary"
     diary.mkdir()
@@ -360,6 +362,10 @@ def test_what_a_run_refuses(splats, tileset, tmp_path):
     (tmp_path / "other.partial").mkdir()
     with pytest.raises(FileExistsError, match="not of this command"):
         build_tiles(source, tmp_path / "other", SMALL, replace_old=True)
+    with pytest.raises(FileExistsError, match="not of this command: remove it"):
+        build_tiles(source, tmp_path / "other", SMALL)
+    with pytest.raises(FileNotFoundError, match=r"nothing to resume .*: remove it"):
+        build_tiles(source, tmp_path / "other", SMALL, resume=True)
     for options, message in [
         (TileOptions(max_triangles=10), "max_triangles of a tile must be at least 64"),
         (TileOptions(conversion=ConversionOptions(max_splats=10)), "limits on splats"),
@@ -373,6 +379,11 @@ def test_what_a_run_refuses(splats, tileset, tmp_path):
             build_tiles(source, tmp_path / "new", options, replace_old=True)
 
 
+def test_one_is_no_plural():
+    one = TilesetSummary(1, 8, 1, 1, 2_000_000, 0.0, AlphaChoice("blend"))
+    assert one.in_words() == "1 splat -> 8 triangles in 1 tile of 1 level, 2.0 MB"
+
+
 def test_another_scene_or_other_options_are_not_mixed(splats, tmp_path, monkeypatch):
     out = tmp_path / "tiles"
     save = making.save_mesh
@@ -380,7 +391,7 @@ def test_another_scene_or_other_options_are_not_mixed(splats, tmp_path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         build_tiles(stream_gaussians(splats), out, SMALL)
     monkeypatch.setattr(making, "save_mesh", save)
-    with pytest.raises(FileExistsError, match="left from an earlier run"):
+    with pytest.raises(FileExistsError, match="``resume`` continues it, ``force`` starts again"):
         build_tiles(stream_gaussians(splats), out, SMALL)
     with pytest.raises(ValueError, match="started with other options"):
         build_tiles(stream_gaussians(splats), out, TileOptions(max_triangles=8192), resume=True)

@@ -12,7 +12,7 @@ import socket
 import stat
 import sys
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +48,7 @@ def replace_folder(finished: Path, target: Path) -> None:
 def atomic_path(
     path: str | os.PathLike[str],
     *,
-    needs: int | None = None,
+    needs: int | Callable[[], int | None] | None = None,
     temporary: Path | None = None,
     new: bool = False,
 ) -> Iterator[Path]:
@@ -62,7 +62,7 @@ def atomic_path(
 
     Args:
         path: the file.
-        needs: its estimated size in bytes, for the message about a full disk.
+        needs: its estimated size in bytes, for the message about a full disk; or what tells it then.
         temporary: the temporary path, as ``temporary_beside`` names it, if others have to know it.
         new: ``path`` must not exist. Of several processes that write it at a time, exactly one succeeds.
 
@@ -128,7 +128,8 @@ def atomic_path(
         number = _full(error)
         if number is None:
             raise
-        raise OSError(number, _no_room(number, folder, needs, written), shown) from None
+        wanted = needs() if callable(needs) else needs
+        raise OSError(number, _no_room(number, folder, wanted, written), shown) from None
 
 
 @contextmanager
@@ -277,15 +278,19 @@ def _full(error: BaseException) -> int | None:
 
 
 def _no_room(number: int, folder: Path, needs: int | None, written: int) -> str:
-    wanted = f"about {in_words(needs)}" if needs is not None else f"more than {in_words(written)}"
+    wanted = f"needs more than {in_words(written)}" if written else ""
+    if needs is not None:
+        wanted = f"needs about {in_words(needs)}"
     if number == errno.EFBIG:
-        return f"larger than a file may be here (ulimit -f, or the file system): it needs {wanted}"
+        return "larger than a file may be here (ulimit -f, or the file system)" + (
+            wanted and f": it {wanted}"
+        )
     if number == errno.EDQUOT:
-        return f"the disk quota is used up: the file needs {wanted}"
+        return "the disk quota is used up" + (wanted and f": the file {wanted}")
+    facts = [f"the file {wanted}"] if wanted else []
     with suppress(OSError):
-        free = in_words(shutil.disk_usage(folder).free)
-        return f"no space left on the disk: the file needs {wanted}, {free} are free"
-    return f"no space left on the disk: the file needs {wanted}"
+        facts.append(f"{in_words(shutil.disk_usage(folder).free)} are free")
+    return ": ".join(["no space left on the disk", *([", ".join(facts)] if facts else [])])
 
 
 def in_words(count: float) -> str:

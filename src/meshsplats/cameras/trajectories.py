@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats._geometry import direction
-from meshsplats._kinds import need_array
-from meshsplats.camera import Camera
+from meshsplats._kinds import as_whole, need_array, need_numbers
+from meshsplats.camera import Camera, checked_side
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
     Framable,
@@ -53,8 +53,7 @@ def look_at(
     Raises ValueError if the two points coincide or are not finite, and for a value out of range.
     """
     need_array(center=center, target=target, up=up)
-    if not 1 <= fov <= 170:
-        raise ValueError(f"fov must lie between 1 and 170 degrees, got {fov}")
+    width, height = _checked_lens(width, height, fov)
     center = np.asarray(center, np.float64)
     upward = unit_up(up)
     forward = np.asarray(target, np.float64) - center
@@ -104,8 +103,8 @@ def orbit(
     Raises ValueError for an empty scene or a value out of range.
     """
     need_scene(scene)
-    if count < 1:
-        raise ValueError(f"count must be at least 1, got {count}")
+    need_numbers(elevation=elevation, azimuth=azimuth)
+    count = _checked_count(count)
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
     return around_subject(scene, angles, up, width, height, fov, distance, target)
 
@@ -133,8 +132,7 @@ def dome(
     The other arguments are those of ``orbit``.
     """
     need_scene(scene)
-    if count < 1:
-        raise ValueError(f"count must be at least 1, got {count}")
+    count = _checked_count(count)
     golden = 180 * (3 - 5**0.5)
     lowest = -1.0 if whole else 0.0
     heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
@@ -161,8 +159,9 @@ def look_around(
     The other arguments are those of ``orbit``.
     """
     need_scene(scene)
-    if count < 1:
-        raise ValueError(f"count must be at least 1, got {count}")
+    need_numbers(elevation=elevation, azimuth=azimuth)
+    count = _checked_count(count)
+    width, height = _checked_lens(width, height, fov)
     bounds = scene_bounds(scene)
     axes = front_axes(guess_up(scene) if up is None else unit_up(up))
     lens: dict[str, Any] = {"width": width, "height": height, "fov": fov, "near": bounds.radius * NEAR_SHARE}
@@ -189,6 +188,8 @@ def around_subject(
 
     The other arguments are those of ``orbit``; ``aim`` is its ``target``.
     """
+    need_numbers(distance=distance)
+    width, height = _checked_lens(width, height, fov)
     if not (np.isfinite(distance) and distance > 0):
         raise ValueError(f"distance must be positive, got {distance}")
     if not all(np.isfinite(a) and -90 <= e <= 90 for a, e in angles):
@@ -211,3 +212,17 @@ def around_subject(
         look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)
         for i, d in enumerate(directions)
     ]
+
+
+def _checked_count(count: int) -> int:
+    if (whole := as_whole("count", count)) < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    return whole
+
+
+def _checked_lens(width: int, height: int, fov: float) -> tuple[int, int]:
+    """Sides of images, whose ``fov`` is checked, too."""
+    need_numbers(fov=fov)
+    if not 1 <= fov <= 170:
+        raise ValueError(f"fov must lie between 1 and 170 degrees, got {fov}")
+    return checked_side("width", width), checked_side("height", height)

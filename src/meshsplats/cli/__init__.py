@@ -132,15 +132,16 @@ def _signals_raise() -> Iterator[None]:
 
 
 def _run(name: str, arguments: list[str]) -> int:
+    from meshsplats.cli import messages
     from meshsplats.errors import DataWarning, StraysWarning
 
-    named: list[str] = []
+    warned: list[tuple[str, ...]] = []
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
         if isinstance(message, StraysWarning):
-            if named:
+            if messages.subject in warned:
                 return  # splats and their mesh have the same
-            named.append(str(message))
+            warned.append(messages.subject)
         say(f"warning: {one_line(message)}")
 
     warnings.simplefilter("always", DataWarning)

@@ -18,7 +18,7 @@ import tyro
 
 from meshsplats import _toml as toml
 from meshsplats._option_values import converted, from_text, short
-from meshsplats._options import did_you_mean, reachable, settings
+from meshsplats._options import check_naming, did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say, with_flags
 from meshsplats.errors import OptionsError, OptionValueError
 
@@ -137,8 +137,7 @@ def _parsed(command: type[C], prog: str, line: Line) -> C:
     for group in command.EXCLUSIVE:
         if any(flag(option) in flags or option in given for option in group):
             values = {option: value for option, value in values.items() if option not in group}
-    default = _filled(command, values | given)
-    return tyro.cli(command, prog=prog, args=line.words, default=default, config=_FILLED)
+    return _with_all(command, prog, line.words, values | given)
 
 
 def _with_given(command: type[C], prog: str, words: list[str], flags: Collection[str]) -> C:
@@ -155,7 +154,24 @@ def _with_given(command: type[C], prog: str, words: list[str], flags: Collection
             found: Any = tyro.cli(given, prog=prog, args=words, config=_PARSED)
         return _filled(command, vars(found))
     except (SystemExit, ValueError):
-        return tyro.cli(command, prog=prog, args=words, config=_PARSED)
+        return _with_all(command, prog, words)
+
+
+def _with_all(command: type[C], prog: str, words: list[str], values: Mapping[str, Any] | None = None) -> C:
+    """``command`` as ``words`` describe it, where ``values`` of a configuration are not replaced."""
+
+    def read(kind: type[T]) -> T:
+        if values is None:
+            return tyro.cli(kind, prog=prog, args=words, config=_PARSED)
+        return tyro.cli(kind, prog=prog, args=words, default=_filled(kind, values), config=_FILLED)
+
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            return read(command)
+    except SystemExit:
+        flags = [name for name, option in options_of(command).items() if option.has_flag]
+        read(_described(command, flags, flags))  # says why, with the help of options that are close
+        return read(command)  # or what is wrong are values
 
 
 def _default(part: Field[Any]) -> Any:
@@ -247,8 +263,7 @@ def as_cli_options(
                 hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
             parts.append((name, hint, start))
         names: dict[str, Any] = {"__doc__": about or group.__doc__, "__module__": group.__module__}
-        if not checked:
-            names["__post_init__"] = lambda self: None
+        names["__post_init__"] = check_naming(group, flag) if checked else lambda self: None
         return make_dataclass(group.__name__, parts, bases=(group,), namespace=names, frozen=True)
 
     return made

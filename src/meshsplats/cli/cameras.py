@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from meshsplats._words import optional_up
+from meshsplats._words import command_line, optional_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions
-from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.cli.messages import UsageError, say
 
 if TYPE_CHECKING:
     import numpy as np

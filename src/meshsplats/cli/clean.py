@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from meshsplats._words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import SplatOptions, named, written
@@ -74,6 +75,6 @@ class Clean(Command):
             "upper": upper,
             "seconds": round(time.perf_counter() - start, 3),
         }
-        lines = [*made.found.in_words(made.rules), f"kept: {kept:,} splats, from {lower} to {upper}"]
+        lines = [*made.found.in_words(made.rules), f"kept: {plural(kept, 'splat')}, from {lower} to {upper}"]
         lines += [] if self.preview_only else [named(self.output)]
         self.finish(result, *lines, f"preview, before | removed, in red | after: {made.preview}", indent=None)

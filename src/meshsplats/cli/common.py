@@ -15,8 +15,9 @@ import tyro
 from meshsplats._files import atomic
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.messages import flag, one_line, say, with_flags
+from meshsplats.cli.messages import Terminated, flag, one_line, say, with_flags
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
+from meshsplats.errors import ClusterError
 from meshsplats.formats.outputs import Scene, placed
 
 if TYPE_CHECKING:
@@ -106,6 +107,18 @@ def warnings_kept() -> Iterator[list[str]]:
         yield kept
     finally:
         warnings.showwarning = show
+
+
+@contextmanager
+def resumable(record: Path, *, force: bool) -> Iterator[None]:
+    """Says how to go on if the block is ended early and unfinished work with its ``record`` is left."""
+    try:
+        yield
+    except (KeyboardInterrupt, Terminated, OSError, ClusterError):
+        if record.is_file():
+            how = "--resume in place of --force" if force else "--resume"
+            say(f"what is done stays: the same command with {how} continues")
+        raise
 
 
 def track(items: Iterable[T], total: int, label: str) -> Iterable[T]:

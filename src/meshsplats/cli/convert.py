@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from meshsplats._options import of_presets
-from meshsplats._words import plural
+from meshsplats._words import command_line, plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options, usage_errors
 from meshsplats.cli.common import (
@@ -33,7 +33,7 @@ from meshsplats.cli.messages import (
     NO_SPACE,
     OK,
     UsageError,
-    command_line,
+    about,
     error_record,
     exit_code,
     one_line,
@@ -55,14 +55,8 @@ if TYPE_CHECKING:
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.jobs import Job
 
-_IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
+_IDLE = ("fidelity", "no_preview", "no_sidecar", "stream", "threads")
 """Options that do not change the mesh."""
-LARGE_BYTES = 1_000_000_000
-TOO_LARGE = (
-    "too large for viewers in browsers, and for most engines: --max-triangles 2000000 merges splats first,"
-    " `meshsplats tiles` keeps them all"
-)
-"""Of a .glb of more than ``LARGE_BYTES``: viewers in browsers hold it in memory, more than once."""
 ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 """What meshes for a depth buffer gain in three.js with MSAA: docs/viewers.md."""
 ORDER_GAIN = "7 to 10 dB in three.js and Babylon.js in half a minute; not for ray tracers and CesiumJS"
@@ -108,9 +102,10 @@ class Convert(Command):
     """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or
     splats: .spz, .sog, .splat, .compressed.ply, .usdz. Or a folder, for files named like the inputs."""
     formats: Annotated[tuple[Ending, ...], tyro.conf.arg(help_behavior_hint="")] = ()
-    """With a folder: formats to write. Default: glb."""
+    """With a folder: formats to write, all of meshes or all of splats. Default: glb."""
     product: Annotated[ProductOptions, Flat] = field(default_factory=ProductOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: option.Threads = None
     json: bool = False
     """Print the results as JSON, a line for each input, errors too."""
     force: option.Force = False
@@ -162,8 +157,9 @@ class Convert(Command):
         failures if they are all of one kind."""
         codes, skipped = [], 0
         for job in track(todo, len(todo), "converting"):
+            named = (job.shown, *(path.name for path in job.outputs))
             try:
-                with usage_errors():
+                with usage_errors(), about(*named):
                     result = self._convert(job, cameras)
                 skipped += result["skipped"]
                 self._print_line(result, job)
@@ -171,7 +167,8 @@ class Convert(Command):
                 raise
             except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
                 codes.append(exit_code(error))
-                say(f"error: {one_line(error)}")
+                with about(*named):
+                    say(f"error: {one_line(error)}")
                 if self.json:
                     print(json.dumps({"input": job.shown, "error": error_record(error)}), flush=True)
                 if codes[-1] == NO_SPACE:
@@ -207,20 +204,20 @@ class Convert(Command):
         if not (self.product.as_splats or self.product.stream):
             self.product.check_kind(job, self.reading)
         callbacks = ConversionCallbacks(
-            load=partial(self.reading.load, up=self.product.up),
+            load=partial(self.reading.load, up=self.product.up, threads=self.threads),
             stream=self._opened,
             place=partial(written, origin=self.product.origin),
             record=self._record,
-            preview=draw_preview,
+            preview=partial(draw_preview, threads=self.threads),
             opening=self._opening,
         )
-        return Converter(self.product, callbacks).made(job, cameras)
+        return Converter(self.product, callbacks, self.threads).made(job, cameras)
 
     def _opened(self, source: Path) -> SplatStream:
         """The splats of an input in blocks, relative to the origin that is asked for."""
         origin = self.product.origin
         given = None if isinstance(origin, str) else origin
-        found = self.reading.stream(source, given, up=self.product.up)
+        found = self.reading.stream(source, given, up=self.product.up, threads=self.threads)
         say_origin(found.origin, origin, splats=self.product.as_splats)
         return found
 
@@ -236,7 +233,8 @@ class Convert(Command):
     def _opening(self, cloud: GaussianCloud, source: Path, given: Sequence[Camera] | None) -> Camera | None:
         from meshsplats.viewpoints.showing import default_views
 
-        if (found := default_views(cloud, source, 1, up=self.product.direction, given=given or None)) is None:
+        how: dict[str, Any] = {"up": self.product.direction, "threads": self.threads}
+        if (found := default_views(cloud, source, 1, given=given or None, **how)) is None:
             return None
         say(found[1])
         return found[0][0] if found[0] else None
@@ -253,20 +251,17 @@ class Convert(Command):
     def _lines(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> list[str]:
         from meshsplats._origin import zero_origin
         from meshsplats.evaluation.viewers import AlphaChoice
-        from meshsplats.file_conversion import seen_from
+        from meshsplats.file_conversion import counts_in_words, seen_from, times_in_words, too_large
 
         made = named(self.output)
         if result["skipped"]:
             return [f"{made}: kept"]
         if "written" in result:
-            lines = [f"{result['written']:,} of {result['read']:,} splats in {result['seconds']:.2f} s", made]
+            read = plural(result["read"], "splat")
+            lines = [f"{result['written']:,} of {read} in {result['seconds']:.2f} s", made]
         else:
-            words = {"read": "read", "convert": "converted", "save": "saved", "choose alpha": "chose alpha"}
-            words["solve order"] = "solved the order"
-            times = [f"{words[name]} {value:.2f} s" for name, value in result["seconds"].items() if value]
-            lines = [_counts(result), f"{made}: {', '.join(times)}"]
-            if self.output.suffix.lower() == ".glb" and self.output.stat().st_size > LARGE_BYTES:
-                lines.append(TOO_LARGE)
+            lines = [counts_in_words(result), f"{made}: {times_in_words(result['seconds'])}"]
+            lines += too_large(self.output)
             if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
@@ -280,10 +275,12 @@ class Convert(Command):
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:
         """Prints the result of one of several inputs."""
+        from meshsplats.file_conversion import counts_in_words
+
         if result["skipped"]:
             sizes = "kept"
         else:
-            sizes = f"{result['written']:,} splats" if "written" in result else _counts(result)
+            sizes = plural(result["written"], "splat") if "written" in result else counts_in_words(result)
         files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
         alpha = f", alpha {choice['alpha']}" if (choice := result.get("alpha")) else ""
         self.finish(result, f"{job.shown}: {sizes}: {files}{alpha}", indent=None)
@@ -307,23 +304,3 @@ class Convert(Command):
         words += [*again(self.product, "data", missing="few"), *self.reading.again()]
         words += ["-o", self.output.with_suffix(".solid.glb"), "--opacity", "cutoff", "--soft-share", "0.05"]
         return f"{command_line(words)} ({ENGINE_GAIN})"
-
-
-def _counts(result: dict[str, Any]) -> str:
-    """Sizes before and after."""
-    sizes = f"{result['triangles']:,} triangles, {result['vertices']:,} vertices"
-    if "splats" in result:
-        share = result["converted"] / result["splats"]
-        kept = f", merged into {result['converted']:,} ({share:.1%})"
-        if result["converted"] == result["splats"]:
-            kept = ""
-        elif not result["merged"]:
-            kept = f", {result['converted']:,} of them converted ({share:.1%})"
-        sizes = f"{result['splats']:,} splats{kept} -> {sizes}"
-    fidelity = result["fidelity"]
-    if fidelity is None:
-        return sizes
-    psnr = "equal" if fidelity["psnr"] is None else f"{fidelity['psnr']:.2f} dB"
-    views = plural(fidelity["views"], "view")
-    scores = f"{psnr}, SSIM {fidelity['ssim']:.4f} against the splats"
-    return f"{sizes}; {scores}, {views}, look {fidelity['look']}"

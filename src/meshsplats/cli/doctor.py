@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from meshsplats._words import quoted
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.messages import quoted
 
 
 @dataclass(frozen=True)

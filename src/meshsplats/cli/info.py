@@ -14,8 +14,8 @@ from meshsplats.cli.messages import shown_path
 
 @dataclass(frozen=True)
 class Info(Command):
-    """Describes a splat file, a mesh, a tileset, a camera file, a model folder, or a data set of
-    photographs."""
+    """Describes a splat file, a mesh, a tileset, levels of detail, a camera file, a model folder, or a data
+    set of photographs."""
 
     input: tyro.conf.Positional[Path]
     """The file or folder."""

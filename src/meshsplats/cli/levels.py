@@ -15,7 +15,7 @@ import tyro
 from meshsplats._words import optional_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
-from meshsplats.cli.common import SplatOptions, say_origin
+from meshsplats.cli.common import SplatOptions, resumable, say_origin
 from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, write_configuration
@@ -77,7 +77,8 @@ class Levels(Command):
     """Overwrite an older chain in the folder."""
 
     def execute(self) -> int:
-        from meshsplats.chains import make_chain, planned, table_in_words
+        from meshsplats.chains import make_chain, partial_folder, planned
+        from meshsplats.evaluation.level_tables import table_in_words
         from meshsplats.finetuning import Interrupted
         from meshsplats.formats.sniff import identify
 
@@ -87,12 +88,9 @@ class Levels(Command):
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
         cloud = self.reading.load(self.input, up=self.up, threads=self.threads)
         say_origin(cloud.origin, self.origin)
-        level_now = 0
 
         @contextmanager
         def shown(number: int, level: Level) -> Iterator[Callable[[Progress], None]]:
-            nonlocal level_now
-            level_now = number
             say(f"level {number}: {level.splats:,} splats for {level.width} pixels")
             with progress_display() as show:
                 yield show
@@ -102,11 +100,12 @@ class Levels(Command):
         self._begin()
         how: dict[str, Any] = {"place": partial(placed, origin=self.origin), "on_level": shown}
         try:
-            table = make_chain(cloud, self.output, options, config, source=str(self.input), **how)
+            with resumable(partial_folder(self.output) / CONFIGURATION, force=self.force):
+                table = make_chain(cloud, self.output, options, config, source=str(self.input), **how)
         except Interrupted as stop:
-            say(f"stopped in level {level_now}: the same command with --resume continues with it")
             return 128 + (stop.signal or signal.SIGINT)
-        self.finish(table | {"folder": str(self.output)}, *table_in_words(table, self.output))
+        lines = [*table_in_words(table), f"{self.output}/: levels.json has this table"]
+        self.finish(table | {"folder": str(self.output)}, *lines)
         return 0
 
     def resolved(self) -> dict[str, Any]:

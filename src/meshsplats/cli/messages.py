@@ -5,14 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
-import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
+from meshsplats._words import naming
 from meshsplats.errors import ClusterError, DeviceError, NamingOptions, OverwritingError, with_options
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -31,6 +30,8 @@ ENDINGS = {signal.SIGINT: "interrupted"} | {
 
 _standard_input: str | None = None
 """The temporary file that holds standard input, if the input is -."""
+subject: tuple[str, ...] = ()
+"""Names of the input that messages are about, and of its outputs, where there are several."""
 _spelled: Callable[[str], str] | None = None
 """How the command writes its options, where the library names them."""
 
@@ -125,25 +126,21 @@ def one_line(error: object) -> str:
     return " ".join(with_flags(text).split()) or type(error).__name__
 
 
-def command_line(words: Iterable[object]) -> str:
-    """A command as the shell of this system takes it."""
-    return " ".join(quoted(str(word)) for word in words)
-
-
-def quoted(word: str) -> str:
-    """An argument of a command, in quotes where the shell of this system needs them. Those of Windows know no
-    single quotes, and a backslash is part of a path there."""
-    if sys.platform != "win32":
-        return shlex.quote(word)
-    if re.fullmatch(r"[\w@+=:,./\\~-]+", word):
-        return word
-    return '"' + re.sub(r"(\\+)$", r"\1\1", word) + '"'
-
-
 def say(text: str) -> None:
     """Prints a line on standard error, if anybody reads it."""
     with suppress(OSError):
-        print(f"meshsplats: {with_flags(text)}", file=sys.stderr, flush=True)
+        print(f"meshsplats: {naming(with_flags(text), subject)}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def about(*names: str) -> Iterator[None]:
+    """Within the block, lines are about one of several inputs: ``naming``."""
+    global subject
+    subject = tuple("standard input" if name == "-" else name for name in names)
+    try:
+        yield
+    finally:
+        subject = ()
 
 
 def flag(name: str) -> str:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from meshsplats._words import quoted
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import SplatOptions
-from meshsplats.cli.messages import quoted, say
+from meshsplats.cli.messages import say
 from meshsplats.cli.training import TrainingCommand, tuning_options
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.prior.options import LayingOptions, prior_config

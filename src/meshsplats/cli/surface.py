@@ -10,10 +10,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from meshsplats._words import command_line
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, size_of, written
-from meshsplats.cli.messages import command_line, say
+from meshsplats.cli.messages import say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.base_meshes import PRINTED

@@ -10,11 +10,10 @@ import tyro
 
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
-from meshsplats.cli.common import ClusterOptions, SplatOptions, say_origin
-from meshsplats.cli.messages import Terminated, UsageError, say
+from meshsplats.cli.common import ClusterOptions, SplatOptions, resumable, say_origin
+from meshsplats.cli.messages import UsageError
 from meshsplats.cli.progress import terminal_bar
 from meshsplats.cli.records import write_configuration
-from meshsplats.errors import ClusterError
 from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
 from meshsplats.tiles.options import TileOptions, TilingOptions
 
@@ -58,22 +57,18 @@ class Tiles(Command):
         start = time.perf_counter()
         origin = None if isinstance(self.origin, str) else self.origin
         source = self.reading.stream(self.input, origin, up=self.tiles.up, threads=self.threads)
-        try:
-            with self.cluster.workers(self.threads) as workers, terminal_bar() as bar:
-                found = build_tiles(
-                    source,
-                    self.output,
-                    options,
-                    resume=self.resume,
-                    replace_old=self.force,
-                    threads=self.threads,
-                    workers=workers,
-                    on_progress=None if bar is None else lambda done, total: bar.phase("tiles", done / total),
-                )
-        except (KeyboardInterrupt, Terminated, OSError, ClusterError):
-            if (partial_folder(self.output) / JOURNAL).is_file():
-                say("what is done stays: the same command with --resume continues")
-            raise
+        left = resumable(partial_folder(self.output) / JOURNAL, force=self.force)
+        with left, self.cluster.workers(self.threads) as workers, terminal_bar() as bar:
+            found = build_tiles(
+                source,
+                self.output,
+                options,
+                resume=self.resume,
+                replace_old=self.force,
+                threads=self.threads,
+                workers=workers,
+                on_progress=None if bar is None else lambda done, total: bar.phase("tiles", done / total),
+            )
         write_configuration(config, "tiles", self)
         seconds = time.perf_counter() - start
         if source.origin.any() and not self.json:

@@ -13,10 +13,11 @@ import tyro
 
 from meshsplats._files.atomic import together
 from meshsplats._options import of_presets
+from meshsplats._words import command_line
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import draw_preview, written
-from meshsplats.cli.messages import UsageError, command_line, say, with_flags
+from meshsplats.cli.messages import UsageError, say, with_flags
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, in_plain_words, write_configuration
 from meshsplats.errors import OtherRunError

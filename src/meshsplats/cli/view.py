@@ -50,6 +50,7 @@ class View(Command):
     viewing: Annotated[ViewerOptions, Flat] = field(default_factory=ViewerOptions)
     no_open: bool = False
     """Print the address, and open no browser."""
+    threads: option.Threads = None
     json: option.AsJson = False
     force: option.Force = False
 
@@ -61,7 +62,7 @@ class View(Command):
             inputs = [self.input, viewing.splats, viewing.surface, viewing.cameras]
             outputs = [self.output, beside(self.output, CONFIGURATION)]
             check_outputs(outputs, self.force, inputs=[path for path in inputs if path is not None])
-        shown = shown_file(self.input, viewing, say=say)
+        shown = shown_file(self.input, viewing, say=say, threads=self.threads)
         self._announce(shown.content)
         name = shown_path(self.input)
         page, result = shown.page("scene" if name == "-" else Path(name).resolve().stem)

@@ -59,7 +59,8 @@ def convert(
             of the whole subject are assumed.
         up: direction that points up, world frame; by default that of the cameras, of the file (``cloud.up``),
             or (0, -1, 0).
-        threads: maximum number of threads for the images of ``detail='cameras'``; all processors by default.
+        threads: at most this many, for splats that are merged and for the images of ``detail='cameras'``;
+            all processors by default.
         on_image: called after each of these images, with how many are rendered and how many there will be;
             if it returns False, those so far have to do, but at least 6.
         changes: fields of ``ConversionOptions``, which says what they mean, in place of those of
@@ -90,7 +91,7 @@ def convert(
     chosen, count = within_limits(given, chosen, len(part))
     whole = part
     if chosen.budget == "merge" and count < len(part):
-        cloud = part = simplify_large(part, count, cameras)
+        cloud = part = simplify_large(part, count, cameras, threads)
         rows = np.arange(count, dtype=np.int32)
     views = SceneViews(SceneSample.of(part), chosen, cameras, direction, whole=True)
     driver = Driver(chosen, views, direction, cloud.origin, filter_px2)

@@ -122,7 +122,9 @@ class SceneReading:
 
         return self._load(path, load_vertex_colored, up, find_up, threads)
 
-    def load_shown(self, path: Path, *, up: str | None = None) -> GaussianCloud | SplatMesh | BaseMesh:
+    def load_shown(
+        self, path: Path, *, up: str | None = None, threads: int | None = None
+    ) -> GaussianCloud | SplatMesh | BaseMesh:
         """``load_scene``, but a surface with one texture on all faces as it is."""
         from meshsplats.base_mesh import BaseMesh
         from meshsplats.formats.base_meshes import load_textured, vertex_colored
@@ -133,7 +135,7 @@ class SceneReading:
             whole = isinstance(found, BaseMesh) and has_whole_texture(found)
             return found if whole else vertex_colored(found, path)
 
-        return self._load(path, load, up, True, None)
+        return self._load(path, load, up, True, threads)
 
     def _load(
         self,

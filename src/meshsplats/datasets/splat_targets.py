@@ -262,6 +262,14 @@ def are_rendered(views: Sequence[View]) -> bool:
     return any(isinstance(view.source, RenderedSplats) for view in views)
 
 
+def shown_degree(views: Sequence[View]) -> int | None:
+    """Greatest degree of the harmonics that the images of splats among ``views`` show; None: all of them,
+    or there are no such images."""
+    degrees = [view.source.sh_degree for view in views if isinstance(view.source, RenderedSplats)]
+    known = [degree for degree in degrees if degree is not None]
+    return max(known) if known and len(known) == len(degrees) else None
+
+
 @dataclass(frozen=True, eq=False)
 class RenderedSplats:
     """An image of splats, rendered on demand."""

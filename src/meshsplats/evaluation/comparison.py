@@ -183,12 +183,18 @@ def compare(
 
 
 def fidelity(
-    cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera], count: int, look: Look = "area"
+    cloud: GaussianCloud,
+    mesh: SplatMesh,
+    cameras: Sequence[Camera],
+    count: int,
+    look: Look = "area",
+    *,
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Mean scores of ``mesh`` against its splats in ``count`` views of at most 400 pixels, of the ``cameras``
     or, without any, around it; for JSON."""
     views = [camera.within(400) for camera in subsample(cameras, count)] or orbit(
         mesh, count, elevation=15, width=400, height=400
     )
-    mean = compare(cloud, mesh, views, look=look).to_dict()["mean"]
+    mean = compare(cloud, mesh, views, look=look, threads=threads).to_dict()["mean"]
     return {"views": len(views), "look": look, "psnr": mean["psnr"], "ssim": mean["ssim"]}

@@ -90,35 +90,50 @@ class MeshFileOptions:
                 taken = replace(taken, alpha="auto", cutoff=None, nodes=None, quick=False)
         return taken if takes(path, "lit") else replace(taken, lit=False, smooth=False)
 
-    def prepared(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
+    def prepared(
+        self, mesh: SplatMesh, cameras: Sequence[Camera] = (), threads: int | None = None
+    ) -> SplatMesh:
         """``mesh`` cut and with normals, where that is asked for. ``cameras``: where it is seen from."""
         from meshsplats.conversion.normals import shading_normals
         from meshsplats.formats.cutting import CUTOFF, cut_mesh
 
         if self.alpha == "opaque":
             mesh = cut_mesh(mesh, CUTOFF if self.cutoff is None else self.cutoff)
-        return replace(mesh, normals=shading_normals(mesh, cameras)) if self.smooth else mesh
+        if not self.smooth:
+            return mesh
+        return replace(mesh, normals=shading_normals(mesh, cameras, threads=threads))
+
+    def measures(self, paths: Sequence[Path]) -> bool:
+        """Whether the alpha mode of a .glb among ``paths`` is left to the measurement."""
+        return self.alpha == "auto" and any(takes(path, "alpha") for path in paths)
 
     def choice(
-        self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
+        self,
+        mesh: SplatMesh,
+        paths: Sequence[Path],
+        cameras: Sequence[Camera] = (),
+        threads: int | None = None,
     ) -> AlphaChoice | None:
         """The alpha mode of the .glb among ``paths``, where it is left to the measurement."""
         from meshsplats.evaluation.viewers import choose_alpha
 
-        measured = self.alpha == "auto" and len(mesh.faces) and any(takes(path, "alpha") for path in paths)
-        return choose_alpha(mesh, cameras) if measured else None
+        measured = len(mesh.faces) and self.measures(paths)
+        return choose_alpha(mesh, cameras, threads=threads) if measured else None
 
     def order(
-        self, mesh: SplatMesh, paths: Sequence[Path], cameras: Sequence[Camera] = ()
+        self,
+        mesh: SplatMesh,
+        paths: Sequence[Path],
+        cameras: Sequence[Camera] = (),
+        threads: int | None = None,
     ) -> DrawOrder | None:
         """The order of blending of the .glb among ``paths``, where it is to have one."""
         from meshsplats.rendering.ordering import NODES, drawing_order
 
         if self.alpha != "ordered" or not any(takes(path, "alpha") for path in paths):
             return None
-        return drawing_order(
-            mesh, cameras or None, nodes=NODES if self.nodes is None else self.nodes, quick=self.quick
-        )
+        nodes = NODES if self.nodes is None else self.nodes
+        return drawing_order(mesh, cameras or None, nodes=nodes, quick=self.quick, threads=threads)
 
     def save(
         self,

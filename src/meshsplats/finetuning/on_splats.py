@@ -16,7 +16,7 @@ from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.merging_views import merged_within_limits
-from meshsplats.datasets.splat_targets import RenderedSplats
+from meshsplats.datasets.splat_targets import shown_degree
 from meshsplats.datasets.views import Dataset
 from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import OptionsError
@@ -91,15 +91,13 @@ class SplatRun:
 def with_colors(options: ConversionOptions, dataset: Dataset, config: FinetuneConfig) -> ConversionOptions:
     """``options`` with the harmonics that images of splats in ``dataset`` show, unless they name colours. For
     opacity 'cutoff' with one colour: programs with a depth buffer draw no harmonics."""
-    sources = [view.source for view in dataset.train if isinstance(view.source, RenderedSplats)]
-    degrees = {source.sh_degree for source in sources}
+    degree = shown_degree(dataset.train)
     if options.colors is not None or options.color_degree is not None:
         return options
     if config.cuts:
         return replace(options, colors="base")
-    if degrees <= {None}:
+    if degree is None:
         return options
-    degree = max(degree or 0 for degree in degrees)
     return replace(options, colors="view", color_degree=degree) if degree else replace(options, colors="base")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import stat
 import zlib
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +31,22 @@ _SIGNATURES: dict[Container, re.Pattern[bytes]] = {
 }
 
 
+def refuse_stream(path: Path) -> None:
+    """FileFormatError if ``path`` is a pipe, a socket or a device: these can be read once, and readers open
+    their files several times."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # opening it says what is wrong
+        return
+    kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device"}
+    for is_kind, what in kinds.items():
+        if is_kind(mode):
+            raise FileFormatError(
+                f"{path}: {what}, not a file: it can be read only once; give - as the input of the command,"
+                " and redirect it to standard input"
+            )
+
+
 class Content:
     """A file and the format of its first bytes; to be closed if it is a zip archive.
 
@@ -42,12 +59,18 @@ class Content:
     def __init__(self, path: Path, member: str | None = None, archive: Archive | None = None) -> None:
         self.path, self.member = path, member
         self._archive = archive
+        refuse_stream(path)
         try:
             with self.open_raw() as file:
                 self.head = file.read(4096)
         except PermissionError:
             if path.is_dir():  # on Windows
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path)) from None
+            raise
+        except FileNotFoundError:
+            if path.is_symlink():
+                lost = f"a link to {os.readlink(path)}, which does not exist"
+                raise FileNotFoundError(errno.ENOENT, lost, os.fspath(path)) from None
             raise
         self.container = next((name for name, p in _SIGNATURES.items() if p.match(self.head)), None)
 

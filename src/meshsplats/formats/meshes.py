@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -217,8 +217,8 @@ def save_mesh(
     if mesh.harmonics is not None and "harmonics" not in kind.keeps:
         warnings.warn(
             f"{target.name}: harmonics are left out, {suffix} has no place for them: colours will be the same"
-            " from everywhere. plain_colors_of(mesh, cameras), or meshsplats bake with ``colors``, makes them"
-            " the mean of what given views show",
+            " from everywhere. For the mean of what views show, save the mesh as .npz and run"
+            f" 'meshsplats bake MESH.npz --colors -o NEW{suffix}', or use plain_colors_of(mesh, cameras)",
             DataWarning,
             stacklevel=2,
         )
@@ -227,7 +227,9 @@ def save_mesh(
         kind.codec.write(mesh, temporary, **options)
 
 
-def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -> tuple[int, int, int]:
+def save_mesh_blocks(
+    parts: Iterable[SplatMesh], path: str | os.PathLike[str], *, splats: int | None = None
+) -> tuple[int, int, int]:
     """Writes one mesh that comes in ``parts``, as from ``convert_blocks``, to a `.ply` file, whole or not at
     all; the file is that of ``save_mesh`` for the whole mesh.
 
@@ -237,6 +239,8 @@ def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -
         parts: meshes, each with vertex indices of its own, alike as ``SplatMesh.joined`` wants them, without
             depth groups.
         path: the file, whose name ends in .ply.
+        splats: about how many all parts have, from which the size is estimated for the message about a full
+            disk; without, that of the parts so far is named.
 
     Returns:
         Counts of vertices, triangles and splats.
@@ -250,8 +254,28 @@ def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"parts of meshes are written as .ply, got {target.name!r}: for others, build tiles")
-    with atomic_path(target) as temporary:
-        return write_mesh_blocks(parts, temporary)
+    taken = _Taken(splats)
+    with atomic_path(target, needs=taken.needs) as temporary:
+        return write_mesh_blocks(taken.counted(parts), temporary)
+
+
+class _Taken:
+    """Bytes and splats of the parts of a mesh so far, and of all its ``splats`` what the disk must hold."""
+
+    def __init__(self, splats: int | None) -> None:
+        self._all, self._splats, self._bytes = splats, 0, 0
+
+    def counted(self, parts: Iterable[SplatMesh]) -> Iterator[SplatMesh]:
+        for part in parts:
+            self._bytes += expected_bytes(part, ".ply")
+            self._splats += part.splat_count or 0
+            yield part
+
+    def needs(self) -> int | None:
+        """Twice the file, as its parts lie beside it while it is put together; None before the first part."""
+        if not self._splats:
+            return 2 * self._bytes or None
+        return round(2 * self._bytes * max(1, (self._all or 0) / self._splats))
 
 
 def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False, copies: bool = False) -> int:

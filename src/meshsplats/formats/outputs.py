@@ -126,6 +126,21 @@ def check_splat_endings(*kinds: str) -> None:
             raise OptionsError(f"splats are written as {listed(written_suffixes())}, not as .{kind}")
 
 
+def check_mesh_endings(*kinds: str) -> None:
+    """OptionsError if one of the files that end in ``kinds``, without a dot, cannot be a mesh."""
+    known, endings = written_mesh_suffixes(), tuple(f".{kind}" for kind in kinds)
+    if not (others := tuple(ending for ending in endings if ending not in known)):
+        return
+    if not set(others) <= set(written_suffixes()):
+        raise OptionsError(f"meshes are written as {listed(known)}, not as {listed(others)}")
+    meshes = tuple(ending for ending in endings if ending in known)
+    way = "``as_splats``" if set(meshes) <= set(written_suffixes()) else ""
+    if meshes:
+        way = "write one of the two by a second command" + (way and f", or all as splats: {way}")
+        raise OptionsError(f"{listed(meshes, 'and')} would be meshes, {listed(others, 'and')} splats: {way}")
+    raise OptionsError(f"{listed(others, 'and')} files hold splats: {way}")
+
+
 def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:
     """The options in the configuration file at ``path``; None if there is none, or of another command than
     ``name``."""
@@ -160,6 +175,34 @@ def check_outputs(
             raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
         if not os.access(above, os.W_OK):
             raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
+
+
+def check_resumption(
+    folder: Path, unfinished: Path, record: str | Path, *, resume: bool, replace_old: bool
+) -> None:
+    """Checks what is left of an earlier run that was to make ``folder``: the folder ``unfinished``, which is
+    of that command if it holds a ``record``.
+
+    Raises:
+        FileNotFoundError: there is nothing to ``resume``.
+        FileExistsError: something is left, and is neither to be resumed nor replaced, or of another origin.
+    """
+    known = (unfinished / record).is_file()
+    if resume and not known:
+        way = "leave out ``resume`` to start"
+        if unfinished.exists():
+            way = "it is not of this command: remove it, and leave out ``resume``"
+        elif folder.exists():
+            way = f"``force``, not ``resume``, replaces {folder}"
+        raise FileNotFoundError(f"nothing to resume in {unfinished}: {way}")
+    if unfinished.exists() and not known:
+        raise FileExistsError(
+            f"{unfinished} exists and is not of this command: remove it, or give another folder"
+        )
+    if known and not (resume or replace_old):
+        raise FileExistsError(
+            f"{unfinished} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
+        )
 
 
 def file_of(source: Path) -> Path:

@@ -11,6 +11,7 @@ from meshsplats.formats import splat_formats
 from meshsplats.formats.content import Container, Content
 from meshsplats.formats.mesh_formats import mesh_format
 from meshsplats.formats.splat_formats import SplatFormat, listed, zipped_suffixes
+from meshsplats.formats.splat_paths import files_named
 
 _UNREAD: dict[Container | None, str] = {
     "gzip": "a gzip file, but not SPZ; unpack it first",
@@ -170,6 +171,27 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
         if not kind.has_signature and _is_marked_mesh(content):
             return "mesh"
         return "splats" if kind.reader.holds_splats(content) else "mesh"
+
+
+def archives_of_splats(folder: Path) -> list[Path]:
+    """The zip archives of ``folder`` that are to be read as splats, by name: also those that are broken or
+    hold several files of splats, which their reading says."""
+    return [path for path in files_named(folder, (".zip",)) if _may_hold_splats(path)]
+
+
+def _may_hold_splats(path: Path) -> bool:
+    try:
+        with Content(path) as content:
+            if content.is_archive:
+                content.archive  # noqa: B018 - opened: it may be broken
+    except (FileFormatError, OSError):
+        return True
+    try:
+        return identify(path) == "splats"
+    except UnreadSplats:
+        return True
+    except FileFormatError:
+        return False
 
 
 def _without_splats(content: Content) -> Literal["mesh", "cameras"]:

@@ -51,6 +51,9 @@ def splat_file(path: Path) -> Path:
     if path.is_file():
         return path
     if not path.is_dir():
+        from meshsplats.formats.content import refuse_stream
+
+        refuse_stream(path)
         raise FileFormatError(f"{path}: neither a file nor a folder")
     for name in folder_files():
         if (path / name).is_file():
@@ -86,9 +89,17 @@ def splat_file(path: Path) -> Path:
 
 
 def files_named(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    """The files of ``folder`` whose names end in one of ``suffixes``, by name; hidden ones are left out."""
+    """The files of ``folder`` whose names end in one of ``suffixes``, by name; hidden ones are left out.
+    Links that lead nowhere are among them: whoever reads one says so."""
     return sorted(
         path
         for path in folder.iterdir()
-        if path.name.lower().endswith(tuple(suffixes)) and not path.name.startswith(".") and path.is_file()
+        if path.name.lower().endswith(tuple(suffixes))
+        and not path.name.startswith(".")
+        and (path.is_file() or is_broken_link(path))
     )
+
+
+def is_broken_link(path: Path) -> bool:
+    """Whether ``path`` is a symbolic link to what does not exist."""
+    return path.is_symlink() and not path.exists()

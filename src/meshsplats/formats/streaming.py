@@ -21,7 +21,7 @@ from meshsplats.formats.opened import Splats
 from meshsplats.formats.opening import open_splats, to_y_down
 from meshsplats.formats.ply.activated import Activated
 from meshsplats.formats.reading import Axes, Reading
-from meshsplats.formats.sniff import content_of, identify, splat_format
+from meshsplats.formats.sniff import archives_of_splats, content_of, identify, splat_format
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named, splat_file
 from meshsplats.gaussians import GaussianCloud, Kernel, shared_up
@@ -197,6 +197,7 @@ def _splat_files(path: Path) -> list[Path]:
         if not path.is_dir():
             raise
         found = [part for part in files_named(path, splat_suffixes()) if not _is_mesh(part)]
+        found = sorted([*found, *archives_of_splats(path)])
         if not found:
             raise
         return found

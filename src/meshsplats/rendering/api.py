@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from meshsplats._core import library, structures
-from meshsplats._kinds import need
+from meshsplats._kinds import each, need
 from meshsplats.camera import Camera
 from meshsplats.choices import Device
 from meshsplats.gaussians import GaussianCloud
@@ -140,6 +140,7 @@ def render(
     order = resolved_order(mesh, order, cutoff)
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
     values, widths = None, {}
+    attributes = list(each(str, "attributes", attributes))
     if attributes:
         for name in attributes:
             if name not in mesh.attributes:

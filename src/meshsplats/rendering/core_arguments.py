@@ -9,13 +9,17 @@ import numpy as np
 
 from meshsplats._core import library, structures
 from meshsplats._core.library import check_threads
+from meshsplats._kinds import need_array
 from meshsplats.camera import Camera
 from meshsplats.choices import MAX_SIDE
-from meshsplats.mesh import Triangles, checked_filter
+from meshsplats.mesh import MAX_COLOR, Triangles, checked_filter
 from meshsplats.order import checked_order
 
 MAX_SAMPLES = 16
 """Largest side of the grid of samples in each pixel."""
+
+_TEXT = {"path": "white is (1, 1, 1), black (0, 0, 0); np.asarray(Image.open(path)) / 255 reads an image"}
+"""What to give in place of a background in words."""
 
 
 class Pointers:
@@ -69,10 +73,12 @@ def checked_options(
     samples: int,
     threads: int | None,
 ) -> structures.OptionsStruct:
-    """The options of an image. ValueError for values out of range, or a background of another shape."""
+    """The options of an image. ValueError for values out of range, or a background of another shape;
+    TypeError for one that is no array."""
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
     check_threads(threads)
+    need_array(background=background, wanted="RGB from 0 to 1, or an image of it", instead=_TEXT)
     backdrop = np.ascontiguousarray(background, np.float32)
     if backdrop.shape not in ((3,), (camera.height, camera.width, 3)):
         raise ValueError(
@@ -80,6 +86,10 @@ def checked_options(
         )
     if not np.isfinite(backdrop).all():
         raise ValueError("background must be finite")
+    if backdrop.max() > MAX_COLOR:
+        raise ValueError(
+            f"background must be RGB from 0 to 1, got values up to {backdrop.max():g}; divide bytes by 255"
+        )
     assert max(camera.width, camera.height) <= MAX_SIDE
     return structures.OptionsStruct(
         samples=int(samples),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
@@ -35,10 +36,12 @@ def save_preview(
     path: str | os.PathLike[str],
     camera: Camera | None = None,
     listing: DrawOrder | None = None,
+    *,
+    threads: int | None = None,
 ) -> bool:
     """Saves an image of ``scene`` from ``camera``, by default ``preview_camera``; of a mesh as viewers draw a
-    file with the order ``listing``, where there is one. Returns False, and saves nothing, if it would have
-    more than ``FRAGMENTS`` at an eighth of the size, too."""
+    file with the order ``listing``, where there is one. ``threads``: at most this many. Returns False, and
+    saves nothing, if it would have more than ``FRAGMENTS`` at an eighth of the size, too."""
     camera = preview_camera(scene) if camera is None else camera
     camera = camera.scaled(max(1.0, SIDE / max(camera.width, camera.height)))
     samples = 1
@@ -51,7 +54,8 @@ def save_preview(
     if small is None:
         return False
     if isinstance(scene, SplatMesh):
-        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples, listing=listing)[0])
+        how: dict[str, Any] = {"samples": samples, "threads": threads, "listing": listing}
+        save_image(path, image_of(scene, small, (1, 1, 1), **how)[0])
     else:
-        save_image(path, render_splats(scene, small).color)
+        save_image(path, render_splats(scene, small, threads=threads).color)
     return True

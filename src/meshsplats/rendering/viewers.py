@@ -88,10 +88,10 @@ def ordered_image(
 def _checked_backdrop(
     camera: Camera, background: Sequence[float] | np.ndarray, threads: int | None
 ) -> np.ndarray:
+    checked_options(Pointers(), camera, background, 1, threads)
     backdrop = np.ascontiguousarray(background, np.float32)
     if backdrop.shape != (3,):
         raise ValueError(f"background must have shape (3,), got {backdrop.shape}")
-    checked_options(Pointers(), camera, backdrop, 1, threads)
     return backdrop
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from meshsplats._core.surfaces import Grid
 from meshsplats._kinds import need, need_all
+from meshsplats._options import check_names
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.binding import Binding
 from meshsplats.camera import Camera
@@ -112,6 +113,8 @@ def make_surface(
         need(GaussianCloud, scene=scene)
     need(Dataset, data=data, optional=True)
     need_all(Camera, cameras=cameras, optional=True)
+    need(SurfaceOptions, options=options, optional=True)
+    check_names("make_surface", changes, [f.name for f in fields(SurfaceOptions)])
     chosen = replace(options or SurfaceOptions(), **changes).checked()
     if data is not None:
         data = data.relative_to(scene.origin)

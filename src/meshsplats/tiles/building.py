@@ -23,6 +23,7 @@ import numpy as np
 from meshsplats._files.atomic import atomic_path, replace_folder
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
+from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up
 from meshsplats.cameras.trajectories import orbit
@@ -33,6 +34,7 @@ from meshsplats.conversion.streaming import Survey, survey
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
 from meshsplats.formats.gltf.writer import change_alpha
+from meshsplats.formats.outputs import check_resumption
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.buckets import BUCKET, Buckets, Cube, records_of
@@ -65,10 +67,10 @@ class TilesetSummary:
 
     def in_words(self) -> str:
         """Counts and size."""
-        made = f" -> {self.triangles:,} triangles" if self.alpha else ""
+        made = f" -> {plural(self.triangles, 'triangle')}" if self.alpha else ""
         return (
-            f"{self.splats:,} splats{made} in {self.tiles:,} tiles of {self.levels} levels,"
-            f" {self.bytes / 1e6:,.1f} MB"
+            f"{plural(self.splats, 'splat')}{made} in {plural(self.tiles, 'tile')} of"
+            f" {plural(self.levels, 'level')}, {self.bytes / 1e6:,.1f} MB"
         )
 
 
@@ -147,15 +149,9 @@ def _check_folders(target: Path, unfinished: Path, resume: bool, replace_old: bo
         if not (target / "tileset.json").is_file():
             raise FileExistsError(f"{target} is there and holds no tileset.json: give another folder")
         if not (replace_old or resume):
-            raise FileExistsError(f"{target} exists: give another folder, or have it replaced")
-    if resume:
-        if not (unfinished / JOURNAL).is_file():
-            raise FileNotFoundError(f"nothing to resume in {unfinished}")
-    elif unfinished.exists():
-        if not replace_old:
-            raise FileExistsError(f"{unfinished} is left from an earlier run: resume it, or remove it")
-        if not (unfinished / JOURNAL).is_file():
-            raise FileExistsError(f"{unfinished} exists and is not of this command: remove it")
+            raise FileExistsError(f"{target} exists: give another folder, or ``force`` to replace it")
+    check_resumption(target, unfinished, JOURNAL, resume=resume, replace_old=replace_old)
+    if unfinished.exists() and not resume:
         shutil.rmtree(unfinished)
 
 
@@ -291,7 +287,7 @@ class _Build:
             if before.get(name) != value:
                 raise ValueError(
                     f"{self._work.parent} was started with other {name} ({str(before.get(name))[:200]}):"
-                    " resume with the same, or begin again"
+                    " ``resume`` with the same, or begin again with ``force``"
                 )
 
     def _survey(self) -> Survey:

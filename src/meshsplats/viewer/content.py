@@ -97,45 +97,52 @@ def content_of_splats(
     max_triangles: int | None = None,
     shown: bool = True,
     up: np.ndarray | None = None,
+    threads: int | None = None,
 ) -> Content:
     """The content of a page of splats, merged until their mesh has at most ``max_triangles``.
 
     ``cameras``: where they are seen from. ``shown``: whether the splats are in the page, too. ``up``: (3,)
-    direction, where the user names it.
+    direction, where the user names it. ``threads``: at most this many.
 
     Raises TooManyTrianglesError above ``MOST_TRIANGLES``.
     """
     each = usual_triangles_each()
     count = len(cloud) if max_triangles is None else max(1, max_triangles // each)
     _check_size(each * min(count, len(cloud)))
-    views = merging_views(cloud, up=up) if count < len(cloud) else None
-    kept = simplify_in_blocks(cloud, count, cameras=views)
-    mesh = convert(kept)
-    coarse = _coarse(mesh, kept, views, up)
+    views = merging_views(cloud, up=up, threads=threads) if count < len(cloud) else None
+    kept = simplify_in_blocks(cloud, count, cameras=views, threads=threads)
+    mesh = convert(kept, threads=threads)
+    coarse = _coarse(mesh, kept, views, up, threads)
     content = Content(mesh, kept.of_degree(0) if shown else None, coarse, kept=len(kept))
     if kept is cloud:
         return content
-    images = (render_splats(each, _camera(cloud, cameras)).color for each in (kept, cloud))
+    camera = _camera(cloud, cameras)
+    images = (render_splats(each, camera, threads=threads).color for each in (kept, cloud))
     return replace(content, merged_from=len(cloud), merging_psnr=psnr(*images))
 
 
-def content_of_mesh(mesh: SplatMesh, splats: GaussianCloud | None = None) -> Content:
+def content_of_mesh(
+    mesh: SplatMesh, splats: GaussianCloud | None = None, threads: int | None = None
+) -> Content:
     """The content of a page of a mesh, with ``splats`` to compare it with. Raises TooManyTrianglesError above
     ``MOST_TRIANGLES``."""
     _check_size(len(mesh.faces))
     if splats is None:
         return Content(mesh, None)
-    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats))
+    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats, threads=threads))
 
 
-def measured(content: Content, page: Page, cameras: Sequence[Camera]) -> dict[str, Any]:
+def measured(
+    content: Content, page: Page, cameras: Sequence[Camera], threads: int | None = None
+) -> dict[str, Any]:
     """Sizes of ``page``, and the errors that merging and quantisation make."""
     mesh, packed = content.mesh, page.mesh
     image = {}
     if mesh is not None:
         camera = _camera(mesh, cameras)
         camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
-        images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
+        shown = (mesh, packed.decoded)
+        images = [render(each, camera, samples=2, threads=threads).color for each in shown]
         image = {"image_error_levels": 255 * float(np.abs(images[0] - images[1]).max())}
     merged: dict[str, Any] = {}
     if content.merged_from is not None:
@@ -188,15 +195,17 @@ def _coarse(
     splats: GaussianCloud,
     views: Sequence[Camera] | None = None,
     up: np.ndarray | None = None,
+    threads: int | None = None,
 ) -> SplatMesh | None:
     """The coarse level of a mesh with many triangles, made of its splats, for ``views``: by default those of
     a place. An object is shown so while it moves only."""
     if len(mesh.faces) <= COARSE_TRIANGLES:
         return None
-    views = views or views_of_place(splats, up=up)
+    views = views or views_of_place(splats, up=up, threads=threads)
     splats = splats.of_degree(min(mesh.sh_degree, splats.sh_degree))
-    few = simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each(), cameras=views)
-    return convert(few, up=mesh.up)
+    count = COARSE_TRIANGLES // usual_triangles_each()
+    few = simplify_in_blocks(splats, count, cameras=views, threads=threads)
+    return convert(few, up=mesh.up, threads=threads)
 
 
 def _check_size(triangles: int) -> None:

@@ -96,6 +96,7 @@ class ShownFile:
     content: Content
     cameras: list[Camera]
     photographs: Dataset | None
+    threads: int | None = None
 
     def page(self, name: str) -> tuple[Page, dict[str, Any]]:
         """The page, with the title ``name`` unless the options have one, and its sizes and errors
@@ -106,7 +107,7 @@ class ShownFile:
             None if content.mesh is None else self.photographs,
             {} if content.mesh is None else {"mesh": content.mesh},
             self.source,
-            None,
+            self.threads,
             whole=options.part.crop is None,
         )
         made = content.page(
@@ -118,7 +119,7 @@ class ShownFile:
                 merged_from=content.merged_from,
             ),
         )
-        return made, measured(content, made, self.cameras)
+        return made, measured(content, made, self.cameras, self.threads)
 
 
 def shown_file(
@@ -126,23 +127,26 @@ def shown_file(
     options: ViewingOptions,
     *,
     say: Callable[[str], object] = lambda text: None,
+    threads: int | None = None,
 ) -> ShownFile:
     """Reads the file or folder ``source`` for a page. ``say`` gets a line that says where views come from.
+    ``threads``: at most this many.
 
     Raises OptionsError as ``ViewingOptions.check`` does, and for options without effect on this file or with
     more triangles than a page can hold, FileFormatError and OSError for files that cannot be read.
     """
     options.check()
     reading = options.reading
-    scene: Shown = reading.load_shown(source, up=options.up)
+    scene: Shown = reading.load_shown(source, up=options.up, threads=threads)
     if not isinstance(scene, BaseMesh):
         scene = cropped(scene, options.part.crop)
     _check_effects(scene, source, options)
     photographs = None
     if options.data is not None:
         photographs = load_dataset(options.data, missing=options.missing, origin=scene.origin)
-    cameras = _cameras(scene, source, options, photographs, say)
-    return ShownFile(source, options, _content(scene, options, cameras), cameras, photographs)
+    cameras = _cameras(scene, source, options, photographs, say, threads)
+    content = _content(scene, options, cameras, threads)
+    return ShownFile(source, options, content, cameras, photographs, threads)
 
 
 def _check_effects(scene: Shown, source: Path, options: ViewingOptions) -> None:
@@ -157,15 +161,17 @@ def _check_effects(scene: Shown, source: Path, options: ViewingOptions) -> None:
         raise OptionsError(f"{source} is a mesh: ``{given}`` is for splats")
 
 
-def _content(scene: Shown, options: ViewingOptions, cameras: Sequence[Camera]) -> Content:
+def _content(
+    scene: Shown, options: ViewingOptions, cameras: Sequence[Camera], threads: int | None
+) -> Content:
     beside = None if options.surface is None else load_base(options.surface, origin=scene.origin)
     try:
         if isinstance(scene, GaussianCloud):
             advice = "leave ``whole`` out, or make 'meshsplats tiles'"
             most = None if options.whole else options.max_triangles or content.TRIANGLES
-            shown = not options.without_splats
+            how: dict[str, Any] = {"shown": not options.without_splats, "threads": threads}
             up = optional_up(options.up)
-            made = content_of_splats(scene, cameras, max_triangles=most, shown=shown, up=up)
+            made = content_of_splats(scene, cameras, max_triangles=most, up=up, **how)
             return replace(made, surface=beside)
         advice = "fine-tune it with ``max_triangles``, or make 'meshsplats tiles'"
         splats = None
@@ -175,7 +181,7 @@ def _content(scene: Shown, options: ViewingOptions, cameras: Sequence[Camera]) -
             splats = cropped(drawn, options.part.crop)
         if isinstance(scene, BaseMesh):
             return Content(None, splats, surface=scene)
-        return replace(content_of_mesh(scene, splats), surface=beside)
+        return replace(content_of_mesh(scene, splats, threads), surface=beside)
     except TooManyTrianglesError as error:
         raise OptionsError(f"{error}: {advice}") from None
 
@@ -186,6 +192,7 @@ def _cameras(
     options: ViewingOptions,
     photographs: Dataset | None,
     say: Callable[[str], object],
+    threads: int | None,
 ) -> list[Camera]:
     if photographs is not None:
         return [view.camera for view in photographs.views]
@@ -197,7 +204,8 @@ def _cameras(
     if beside is not None:
         return [*first, *beside]
     # As many as splats are merged for: looking for them once is enough.
-    found = default_views(scene, source, max(FOUND_VIEWS, VIEWS), up=optional_up(options.up))
+    count, up = max(FOUND_VIEWS, VIEWS), optional_up(options.up)
+    found = default_views(scene, source, count, up=up, threads=threads)
     if found is None:
         return first
     say(found[1])

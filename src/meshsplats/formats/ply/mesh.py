@@ -236,7 +236,10 @@ def read_mesh_ply(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         if vertex is None or any(n not in names for n in "xyz"):
             raise FileFormatError(f"{path}: not a mesh: no element 'vertex' with x, y and z")
         if face is None:
-            raise FileFormatError(f"{path}: not a mesh but points: it has no element 'face'")
+            raise FileFormatError(
+                f"{path}: not a mesh but points: it has no element 'face'; nor splats, whose vertices have"
+                " f_dc_0 to f_dc_2, opacity, scale_0 to scale_2 and rot_0 to rot_3"
+            )
         return _read(file, header, vertex, face, path, origin)
 
 
