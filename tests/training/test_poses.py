@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from meshsplats.training.poses import Poses, find_poses, judge, strong_pairs
+from meshsplats.training.poses import MANY, Poses, find_poses, judge, strong_pairs
 
 
 def model_of(common: dict[tuple[int, ...], int], placed: set[int]) -> SimpleNamespace:
@@ -107,17 +107,37 @@ PAIRS = {(1, 2): 250, (2, 3): 250, (3, 4): 250}
 )
 def test_poses_that_matches_contradict_are_found_once_more(tmp_path, first, second, chosen, calls):
     library, lines = Library(first, second), []
-    found = find_poses(library, database_of(tmp_path / "a.db", PAIRS), tmp_path, tmp_path, lines.append)
+    found = find_poses(library, database_of(tmp_path / "a.db", PAIRS), tmp_path, tmp_path, 4, lines.append)
     assert found.model is chosen
     assert library.calls == ["one after the other", "together"][:calls]
     assert any("1 of 3 pairs contradict the poses" in line for line in lines) == (calls == 2)
     assert found.doubtful == (chosen is SPLIT)
 
 
+@pytest.mark.parametrize(
+    ("together", "alone", "chosen", "calls"),
+    [
+        ([GOOD], [SPLIT], GOOD, 1),
+        ([SPLIT], [GOOD], GOOD, 2),
+        ([SPLIT], [SMALL], SPLIT, 2),
+        ([], [SMALL], SMALL, 2),
+        ([], [], None, 2),
+    ],
+)
+def test_many_are_first_found_all_together(tmp_path, together, alone, chosen, calls):
+    library, lines = Library(alone, together), []
+    database = database_of(tmp_path / "a.db", PAIRS)
+    found = find_poses(library, database, tmp_path, tmp_path, MANY, lines.append)
+    assert (found and found.model) is chosen
+    assert library.calls == ["together", "one after the other"][:calls]
+    assert any("one after the other" in line for line in lines) == (calls == 2)
+
+
 def test_an_older_library_finds_poses_once(tmp_path):
     library = SimpleNamespace(
         IncrementalPipelineOptions=SimpleNamespace, incremental_mapping=lambda *_, options: {0: SPLIT}
     )
-    assert find_poses(library, database_of(tmp_path / "a.db", PAIRS), tmp_path, tmp_path).doubtful
+    database = database_of(tmp_path / "a.db", PAIRS)
+    assert find_poses(library, database, tmp_path, tmp_path, MANY).doubtful
     library.incremental_mapping = lambda *_, options: {}
-    assert find_poses(library, tmp_path / "a.db", tmp_path, tmp_path) is None
+    assert find_poses(library, database, tmp_path, tmp_path, MANY) is None

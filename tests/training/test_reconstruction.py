@@ -57,8 +57,12 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
         find_cameras(photographs(tmp_path, 3))
 
 
-def test_large_photographs_are_not_doubled(scene, monkeypatch):
-    monkeypatch.setattr(reconstruction, "DOUBLED_BELOW", 60)  # as long as their longest side
+@pytest.mark.parametrize(
+    ("limit", "value"),
+    [("DOUBLED_BELOW", 60), ("DOUBLED_UP_TO", 4)],  # their longest side; fewer than there are
+)
+def test_large_and_many_photographs_are_not_doubled(scene, monkeypatch, limit, value):
+    monkeypatch.setattr(reconstruction, limit, value)
     folder, colmap, _ = scene()
     colmap.octave = 0
     with pytest.warns(DataWarning, match="1 of 5 photographs"):
