@@ -7,6 +7,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 
+from .checks import can_edit, report_lost
 from .settings import copy_choices, is_splat_mesh
 from .work import waiting
 
@@ -14,26 +15,15 @@ DONE = {"delete": "deleted", "separate": "separated", "hide": "hid", "select": "
 """What each action of ``CutSplats`` did."""
 
 
-def can_edit(operator, context):
-    """Whether the active object is a splat mesh in object mode; if not, the tooltip of ``operator`` says
-    why."""
-    if not is_splat_mesh(context.object):
-        operator.poll_message_set("The active object is no splat mesh")
-    elif context.object.mode != "OBJECT":
-        operator.poll_message_set("Only in Object Mode")
-    else:
-        return True
-    return False
-
-
-def cut(context, obj, mesh, faces, *, action="delete"):
-    """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so
-    again."""
+def cut(operator, context, obj, mesh, faces, *, action="delete"):
+    """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so again,
+    and ``operator`` reports what was lost."""
     from meshsplats.blender.inside import baking, cutting, materials
 
     baked = any(materials.shows_baked(material) for material in obj.data.materials)
     separate = action != "delete"
-    made = cutting.cut(obj, mesh, faces, separate=separate, collection=obj.users_collection[0])
+    made, lost = cutting.cut(obj, mesh, faces, separate=separate, collection=obj.users_collection[0])
+    report_lost(operator, {obj.name: lost})
     parts = [obj]
     if made is not None:
         copy_choices(made.meshsplats, obj.meshsplats)
@@ -143,7 +133,7 @@ class CutSplats(bpy.types.Operator):
                 if self.action == "select":
                     cutting.select(obj, faces)
                 else:
-                    cut(context, obj, mesh, faces, action=self.action)
+                    cut(self, context, obj, mesh, faces, action=self.action)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -195,7 +185,7 @@ class CleanSplats(bpy.types.Operator):
             with waiting(context):
                 mesh, faces = cutting.floaters(obj, rules)
                 if faces.any():
-                    cut(context, obj, mesh, faces)
+                    cut(self, context, obj, mesh, faces)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -2,6 +2,7 @@
 """File > Export > Splat Mesh and Gaussian Splats, and help for Blender's own glTF exporter, which by itself
 loses our colours."""
 
+import os
 import warnings
 
 import bpy
@@ -20,6 +21,13 @@ FORMATS = [
     (".usdc", "USD (.usdc)", "Colour and opacity as primvars; needs the Python module pxr"),
 ]
 SPLAT_FORMATS = [(suffix, f"*{suffix}", "A format of splat files") for suffix in written_suffixes()]
+
+
+def other_suffix(path):
+    """What the name ``path`` ends with if that looks like a suffix, and not like a number as in ball.001;
+    else ''."""
+    suffix = os.path.splitext(path)[1]
+    return suffix if suffix[1:2].isalpha() and suffix[1:].isalnum() else ""
 
 
 class Export(ExportHelper):
@@ -45,7 +53,9 @@ class Export(ExportHelper):
     def check(self, context):
         before = (self.filepath, self.format)
         suffix = self.suffix_of(self.filepath)
-        if suffix and self.format == self._shown:  # the name was typed
+        if not suffix and other_suffix(self.filepath):
+            pass  # ``execute`` says so
+        elif suffix and self.format == self._shown:  # the name was typed
             self.format = suffix
         else:
             self.filepath = self.filepath[: len(self.filepath) - len(suffix)] + self.format
@@ -57,6 +67,10 @@ class Export(ExportHelper):
 
         path = self.filepath
         if not self.suffix_of(path):
+            if other := other_suffix(path):
+                what = f"{other} is none of the formats of this export: {', '.join(self.suffixes)}"
+                self.report({"ERROR"}, what)
+                return {"CANCELLED"}
             path += self.format
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")

@@ -11,6 +11,8 @@ BASE = "meshsplats_base"
 
 STAND_IN = "meshsplats_stand_in"
 """Property of what was made for the light of splats; ``meshsplats.blender.inside.stand_ins`` sets it."""
+POINTS = "meshsplats_light_points"
+"""Property of lit splats: the points that their light is baked at."""
 
 
 def _has_followers(scene):
@@ -23,17 +25,43 @@ def after_update(scene, depsgraph):
         from meshsplats.blender.inside import priors
 
         priors.after_update(scene, depsgraph)
-    # Handlers may change objects, but not remove them.
-    strays = any(STAND_IN in obj and obj.parent is None for obj in scene.objects)
-    if strays and not bpy.app.background and not bpy.app.timers.is_registered(sweep):
+    _sweep_soon(scene)
+
+
+def _sweep_soon(scene):
+    """Handlers may change objects, but neither remove nor move them."""
+    if not bpy.app.background and has_strays(scene) and not bpy.app.timers.is_registered(sweep):
         bpy.app.timers.register(sweep, first_interval=0)
 
 
+def has_strays(scene):
+    """Whether stand-ins in ``scene`` lack their splats, or are not where these are, or not hidden as they
+    are."""
+    return any(_is_stray(obj, obj.parent) for obj in scene.objects if STAND_IN in obj)
+
+
+def _is_stray(obj, owner):
+    if owner is None or set(obj.users_collection) != set(owner.users_collection):
+        return True
+    if owner.get(POINTS) == obj:  # hidden always
+        return False
+    return obj.hide_viewport != owner.hide_viewport or obj.hide_get() != owner.hide_get()
+
+
 def sweep():
-    """Removes the stand-ins of splats that were deleted."""
+    """Removes the stand-ins of splats that were deleted, and has the others follow theirs."""
     from meshsplats.blender.inside import stand_ins
 
     stand_ins.remove_strays(bpy.context.scene)
+
+
+@persistent
+def before_render(scene, *_):
+    """Scripts have no timers. In the window, images are rendered by a thread, which must move nothing."""
+    if bpy.app.background and has_strays(scene):
+        from meshsplats.blender.inside import stand_ins
+
+        stand_ins.follow(scene)
 
 
 @persistent
@@ -42,15 +70,18 @@ def after_frame(scene, depsgraph):
         from meshsplats.blender.inside import priors
 
         priors.after_frame(scene, depsgraph)
+    _sweep_soon(scene)
 
 
 def register():
     bpy.app.handlers.depsgraph_update_post.append(after_update)
     bpy.app.handlers.frame_change_post.append(after_frame)
+    bpy.app.handlers.render_init.append(before_render)
 
 
 def unregister():
     if bpy.app.timers.is_registered(sweep):
         bpy.app.timers.unregister(sweep)
+    bpy.app.handlers.render_init.remove(before_render)
     bpy.app.handlers.frame_change_post.remove(after_frame)
     bpy.app.handlers.depsgraph_update_post.remove(after_update)

@@ -15,8 +15,33 @@ from .work import Modal, Work, bpy_background, settle
 SUFFIXES = (*splat_suffixes(), ".npz")
 ENDS = tuple(dict.fromkeys(f".{suffix.rpartition('.')[2]}" for suffix in SUFFIXES))
 """Their last parts, by which Blender knows a dropped file."""
+IMAGES = (".webp", ".png")
+"""In the folders of unpacked SOG files, beside their meta.json."""
 CHAIN = "levels.json"
 """Table of a chain of levels of detail, as ``meshsplats levels`` writes it."""
+
+
+def refused(path):
+    """Why ``path`` is no choice: nothing, a folder that holds no splats, or an image of a SOG. Else ''."""
+    from pathlib import Path
+
+    from meshsplats.blender.levels import is_chain
+    from meshsplats.formats.splat_paths import splat_file
+
+    place = Path(path)
+    if not path:
+        return "choose a file: no name was given"
+    if place.is_dir() and not is_chain(place):
+        try:
+            splat_file(place)
+        except ValueError:  # for commands, which take folders
+            return f"choose a file: {place} is a folder without a model or a chain of levels of detail"
+        except OSError:  # said when it is read
+            return ""
+    table = place.with_name("meta.json")
+    if place.suffix.lower() in IMAGES and table.is_file():
+        return f"{place.name} is one of the images of a SOG: choose {table.name} beside it"
+    return ""
 
 
 class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHelper):
@@ -66,6 +91,10 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         names = [file.name for file in self.files if file.name]
         # Without a file: the folder, of a model or of levels of detail.
         paths = [os.path.join(self.directory, name) for name in names] or [self.filepath or self.directory]
+        refusal = refused(paths[0]) if len(paths) == 1 else ""  # Work names those of several files
+        if refusal:
+            self.report({"ERROR"}, refusal)
+            return {"CANCELLED"}
         choices = {name: getattr(self, name) for name in (*CHOICES, "frame_view")}
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 

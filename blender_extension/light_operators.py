@@ -4,10 +4,38 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty
 
+from .checks import can_change, can_change_all
 from .settings import is_blenders
 from .work import LightWork, Modal, follow_shading, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
+
+
+DARK = 0.1
+"""Brightness of a sky up to which it lights nothing: Blender starts with one of 0.05."""
+
+
+def is_dark(scene):
+    """Whether images of ``scene`` have neither a lamp nor a sky that lights anything; what glows does not
+    count."""
+    for obj in scene.objects:
+        shown = not obj.hide_render and not all(home.hide_render for home in obj.users_collection)
+        if obj.type == "LIGHT" and shown and obj.data.energy > 0:
+            return False
+    world = scene.world
+    if world is None:
+        return True
+    # Since 5.0, all have nodes, and asking for that warns.
+    if world.node_tree is None or (bpy.app.version < (5, 0, 0) and not world.use_nodes):
+        return max(world.color) <= DARK
+    for node in world.node_tree.nodes:
+        if node.type == "BACKGROUND":
+            color, strength = node.inputs["Color"], node.inputs["Strength"]
+            if color.is_linked or strength.is_linked:
+                return False
+            if strength.default_value * max(color.default_value[:3]) > DARK:
+                return False
+    return True
 
 
 class SetShading(Modal, bpy.types.Operator):
@@ -21,7 +49,9 @@ class SetShading(Modal, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return context.object is not None and (context.object.type == "MESH" or is_blenders(context.object))
+        obj = context.object
+        mesh = obj is not None and (obj.type == "MESH" or is_blenders(obj))
+        return mesh and can_change(cls, [obj])
 
     def execute(self, context):
         from meshsplats.blender.inside import foreign, levels, lit_points, objects
@@ -46,11 +76,13 @@ class SetShading(Modal, bpy.types.Operator):
         return self.begin(context, LightWork(meshes, self.shading, fast))
 
     def done(self, context, work):
-        done = take_over(work)
+        done = take_over(self, work)
         if self._changed:
             follow_shading(self, context.scene, self.shading == "lit")
         if self._own:  # lamps alone do not light them
             bake(context, done, work.choices["fast"])
+        if self.shading == "lit" and is_dark(context.scene):
+            self.report({"WARNING"}, "MeshSplats: no lamp lights it: choose Sun to Studio")
 
 
 class SetUpRender(bpy.types.Operator):
@@ -109,6 +141,10 @@ class SetUpStage(Modal, bpy.types.Operator):
     )
 
     @classmethod
+    def poll(cls, context):
+        return can_change_all(cls, context.scene)
+
+    @classmethod
     def description(cls, context, properties):
         (light,) = (text for name, _, text in LIGHTS if name == properties.lights)
         return f"{light}. {cls.__doc__}"
@@ -129,7 +165,7 @@ class SetUpStage(Modal, bpy.types.Operator):
     def done(self, context, work):
         from meshsplats.blender.inside import objects, setting
 
-        take_over(work)
+        take_over(self, work)
         setting.hide_start_scene(context.scene)
         with waiting(context):
             every = objects.subjects(context.scene)
@@ -166,6 +202,10 @@ class BakeLight(Modal, bpy.types.Operator):
         name="Only Active", description="Of the active object, not of all", default=False
     )
 
+    @classmethod
+    def poll(cls, context):
+        return can_change_all(cls, context.scene)
+
     def execute(self, context):
         from meshsplats.blender.inside import baking, objects, stand_ins
 
@@ -196,7 +236,7 @@ class BakeLight(Modal, bpy.types.Operator):
         return self.begin(context, LightWork(sources, "lit", self.fast))
 
     def done(self, context, work):
-        renewed = take_over(work)
+        renewed = take_over(self, work)
         count = bake(context, self._names, self.fast)
         if renewed:
             self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")

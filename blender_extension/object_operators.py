@@ -4,6 +4,7 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
+from .checks import can_change, report_lost
 from .settings import CHOICES, SCENE_CHOICES, Choices, SceneChoice, copy_choices, draw_choices
 from .work import (
     AgainWork,
@@ -26,7 +27,9 @@ class ConvertAgain(Modal, bpy.types.Operator):
     @classmethod
     def poll(cls, context):
         obj = context.object
-        return obj is not None and bool(obj.meshsplats.path) and not obj.meshsplats.busy
+        if obj is None or not obj.meshsplats.path or obj.meshsplats.busy:
+            return False
+        return can_change(cls, [obj])
 
     def execute(self, context):
         from meshsplats.blender.inside import levels, objects, sources
@@ -69,7 +72,7 @@ class ConvertAgain(Modal, bpy.types.Operator):
         for result in work.results:
             obj = bpy.data.objects.get(result.name)
             if obj is not None:
-                objects.replace_mesh(obj, result.prepared[0])
+                report_lost(self, {obj.name: objects.replace_mesh(obj, result.prepared[0])})
                 if result.path:
                     sources.mark(obj)
         obj = bpy.data.objects.get(self._active)

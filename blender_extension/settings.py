@@ -58,6 +58,8 @@ class Choices:
             ("auto", "Automatic", "As the format prescribes"),
             ("y-down", "-Y", "The y axis points down, as in trained .ply files"),
             ("y-up", "Y", "The y axis points up"),
+            ("z-up", "Z", "The z axis points up, as in maps and survey data"),
+            ("z-down", "-Z", "The z axis points down"),
         ],
         default="auto",
     )
@@ -80,7 +82,8 @@ class SceneChoice:
 
     set_up_scene: BoolProperty(
         name="Set up Render",
-        description="Set bounce limits and colour management for these meshes",
+        description="Set bounce limits and colour management for these meshes. In a saved file with other"
+        " objects, unless it is chosen anew, only the layers that rays pass",
         default=True,
     )
     use_cycles: BoolProperty(

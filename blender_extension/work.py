@@ -7,6 +7,9 @@ import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+Z_AXES = {"z-up": (0.0, 0.0, 1.0), "z-down": (0.0, 0.0, -1.0)}
+"""Choices of what points up in a file, besides those of ``load_gaussians``."""
+
 
 class Stopped(Exception):
     """The user pressed Escape."""
@@ -134,9 +137,7 @@ class Work:
 
             scene = mesh = load_mesh(path)
         else:
-            from meshsplats.formats.gaussians import load_gaussians
-
-            scene = load_gaussians(path, axes=self.choices["axes"])
+            scene = self._splats(path)
             self._at(begin + 0.3 * share, "converting")
             mesh = self._converted(scene, source=Path(path))
         if views is None and self.choices.get("frame_view"):
@@ -145,6 +146,16 @@ class Work:
         # One alone is a given start camera: what light needs is still to be found.
         known = None if views is None or len(views) == 1 else views
         return self._ready(mesh, begin, share, known), views
+
+    def _splats(self, path):
+        from dataclasses import replace
+
+        from meshsplats.formats.gaussians import load_gaussians
+
+        axes = self.choices["axes"]
+        if axes not in Z_AXES:
+            return load_gaussians(path, axes=axes)
+        return replace(load_gaussians(path, axes="y-down"), up=Z_AXES[axes])  # y-down: as the file has it
 
     def _views(self, scene, path):
         """The views of a place from within, the first one to open with; none of an object, and of a mesh that
@@ -257,7 +268,10 @@ class Modal:
 
     def begin(self, context, work):
         """Return value of ``execute``."""
+        from meshsplats.blender.inside import notes
+
         self._work = work
+        notes.take()  # of what scripts did before
         if bpy_background():
             work.run()
             return self._end(context)
@@ -302,6 +316,10 @@ class Modal:
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        from meshsplats.blender.inside import notes
+
+        for note in notes.take():
+            self.report({"INFO"}, f"MeshSplats: {note}")
         return {"FINISHED"}
 
     def cancelled(self):
@@ -349,7 +367,8 @@ def settle(operator, context, objs):
     if operator.set_up_scene:
         # Rays may pass through several meshes.
         every = objects.splat_objects(context.scene)
-        objects.render_settings(context.scene, every, operator.shading == "lit")
+        chosen = operator.properties.is_property_set("set_up_scene")
+        setting.set_up_render(context.scene, every, operator.shading == "lit", chosen=chosen)
         clash = objects.clash(every, operator.shading == "lit")
         if clash:
             operator.report({"WARNING"}, f"MeshSplats: {clash}")
@@ -358,11 +377,11 @@ def settle(operator, context, objs):
 def follow_shading(operator, scene, lit):
     """Sets up the render for splat meshes that have become ``lit`` or unlit, unless others in the ``scene``
     are of the other kind: ``operator`` then says so."""
-    from meshsplats.blender.inside import objects
+    from meshsplats.blender.inside import objects, setting
 
     every = objects.splat_objects(scene)  # Blender's own splats are right in light's settings, lit or not
     if all(objects.is_lit(obj) == lit for obj in every):
-        objects.render_settings(scene, every, lit)
+        setting.set_up_render(scene, every, lit)
     else:
         operator.report(
             {"WARNING"},
@@ -371,18 +390,21 @@ def follow_shading(operator, scene, lit):
         )
 
 
-def take_over(work):
+def take_over(operator, work):
     """Gives the objects that ``work``, a ``LightWork``, was about their new meshes, but for those that were
-    edited or deleted meanwhile. Returns the names of those that got theirs."""
+    edited or deleted meanwhile. Returns the names of those that got theirs; ``operator`` reports what was
+    lost."""
     import bpy
 
     from meshsplats.blender.inside import objects, stand_ins
+
+    from .checks import report_lost
 
     done = []
     for result in work.results:
         obj = bpy.data.objects.get(result.name)
         if obj is not None and stand_ins.shape(obj.data) == work.shapes[result.name]:
-            objects.take_light(obj, result.prepared[0])
+            report_lost(operator, {obj.name: objects.take_light(obj, result.prepared[0])})
             obj.meshsplats.shading = work.choices["shading"]
             done.append(result.name)
     return done

@@ -64,7 +64,7 @@ def test_what_lies_in_a_region_becomes_an_object_at_its_place(ball, shape):
     inside = (place**2).sum(axis=1) <= 1 if shape == "sphere" else (abs(place) <= 1).all(axis=1)
     assert 20 < inside.sum() < 380
     mesh, faces = cutting.chosen_splats(ball, box, shape=shape)
-    part = cutting.cut(ball, mesh, faces, separate=True, collection=bpy.context.collection)
+    part = cutting.cut(ball, mesh, faces, separate=True, collection=bpy.context.collection).made
     bpy.context.view_layer.update()
     np.testing.assert_allclose(world_centers(part), before[inside], atol=1e-4)
     np.testing.assert_allclose(world_centers(ball), before[~inside], atol=1e-4)
@@ -104,7 +104,7 @@ def test_faint_and_large_splats():
     bpy.ops.object.mode_set(mode="OBJECT")
     assert [p.select for p in obj.data.polygons] == faces.tolist()
     assert sum(v.select for v in obj.data.vertices) == len(obj.data.vertices) // 2
-    part = cutting.cut(obj, found, faces, separate=True, collection=bpy.context.collection)
+    part = cutting.cut(obj, found, faces, separate=True, collection=bpy.context.collection).made
     cutting.hide(part)
     bpy.context.view_layer.update()
     assert [part.visible_get(), obj.visible_get()] == [False, True]

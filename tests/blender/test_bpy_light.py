@@ -14,7 +14,17 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import baking, materials, meshes, objects, rendering, scene, stage
+from meshsplats.blender.inside import (
+    baking,
+    materials,
+    meshes,
+    objects,
+    rendering,
+    scene,
+    stage,
+    stand_ins,
+    versions,
+)
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb
 from meshsplats.mesh import SplatMesh
@@ -166,19 +176,60 @@ def test_the_stand_in_is_seen_by_light_alone(ball, tmp_path):
     """A mirror shows the splats, the ground their shadow, and no camera the surface itself."""
     mesh, view = ball.mesh, ball.view
     made = built(ball, LightOptions(ground="none"))
-    made.obj.hide_render = True
+    made.obj.visible_camera = False
     seen = shot(made, tmp_path / "a.exr")
-    made.obj.hide_render = False
-    for child in made.obj.children:
-        child.hide_render = True
+    made.obj.visible_camera = True
     bare = shot(made, tmp_path / "b.exr")
     assert np.ptp(seen) < 1e-3, "the background alone"
     assert np.ptp(bare) > 0.2
     home = stage.collection("ground")
     stage.add_ground(np.array([0.0, 0, -1.2]), 1.0, False, home)
+    made.obj.hide_render = True  # and with it the stand-in: it casts no shadow
     without = shot(made, tmp_path / "c.exr")
-    for child in made.obj.children:
-        child.hide_render = child.name.endswith("points")
+    made.obj.hide_render = False
     shadowed = shot(made, tmp_path / "d.exr")
     floor = render(mesh, view).alpha < 0.01
     assert (shadowed[floor] < 0.6 * without[floor]).mean() > 0.02, "the stand-in alone casts the shadow"
+
+
+def test_the_stand_in_is_hidden_and_moved_with_its_splats(ball):
+    obj = lit_ball(ball)
+    view = bpy.context.scene
+    points = baking.points_of(obj)
+    (surface,) = (child for child in obj.children if child != points)
+    obj.hide_render = True
+    obj.keyframe_insert("hide_render", frame=1)
+    obj.hide_render = False
+    obj.keyframe_insert("hide_render", frame=2)
+    for number in (1, 2, 1):  # also where the extension is missing
+        view.frame_set(number)
+        assert surface.hide_render == obj.hide_render == (number == 1)
+        assert points.hide_render
+    home = bpy.data.collections.new("home")
+    view.collection.children.link(home)
+    view.collection.objects.unlink(obj)
+    home.objects.link(obj)
+    obj.hide_viewport = True
+    stand_ins.follow(view)
+    assert [child.users_collection for child in obj.children] == [(home,)] * len(obj.children)
+    assert surface.hide_viewport
+    obj.hide_viewport = False
+    stand_ins.follow(view)
+    assert not surface.hide_viewport
+    assert points.hide_viewport
+
+
+def test_hidden_splats_are_baked_as_if_they_were_visible(ball):
+    obj = lit_ball(ball)
+    versions.enable_cycles()
+    stage.add_sun(np.array([0.0, 0, 1]), 3.0, 1.0, 0.01, bpy.context.collection)
+    light = []
+    for hidden in (False, True):
+        obj.hide_render = hidden
+        assert baking.bake(bpy.context.scene, [obj], samples=4) == 1
+        assert obj.hide_render == hidden
+        assert obj.visible_camera
+        assert not obj.visible_shadow
+        light.append(light_of(obj))
+    np.testing.assert_array_equal(*light)
+    assert light[0].min() < 0.02 < light[0].max(), "its stand-in shades it"

@@ -6,14 +6,13 @@ long as an unlit one; the light stays as it was when it was gathered.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import levels, materials, meshes, versions
+from meshsplats.blender.inside import levels, light_state, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIGHT
 from meshsplats.blender.options import CAREFUL
@@ -25,7 +24,9 @@ POINTS = "meshsplats_light_points"
 SIZE = "meshsplats_spacing"
 """Property of the points' mesh: distance of neighbouring points, scene units."""
 STATE = "meshsplats_light_state"
-"""Property of the splats: the ``state`` of the scene when their light was baked."""
+"""Property of the splats: the ``light_state`` of the scene when their light was baked."""
+_RAYS = ("camera", "diffuse", "glossy", "transmission", "volume_scatter", "shadow")
+"""Cycles leaves out what none of these rays can see."""
 _AGREE = 4
 """Power of the cosine between the normals of two points that share their light."""
 _WIDTH = 1.0
@@ -96,7 +97,9 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
         (scene.cycles, "use_denoising", False),
         (scene.cycles, "use_adaptive_sampling", False),
     ]
-    with _held(settings + [(obj, "hide_render", True) for obj in chosen]):
+    # Not by ``hide_render``, which hides their stand-ins, too.
+    unseen = [(obj, f"visible_{way}", False) for obj in chosen for way in _RAYS]
+    with _held(settings + unseen):
         for obj in chosen:
             target = targets[obj.name]
             chain = levels.chain_of(obj)
@@ -105,14 +108,15 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
                 shown = {}
             if shown:
                 levels.show(chain, obj[levels.LEVEL])
-            with _held([(target, "hide_render", False), (target, "hide_viewport", False)]):
+            shows = [(target, "hide_render", False), (target, "hide_viewport", False)]
+            with _held([*shows, (obj, "hide_render", False)]):  # lit as if it were visible
                 _bake(target)
             for where, level in shown.items():
                 if level is not None:
                     levels.show(chain, level, where)
             show(obj.data, smoothed(target.data))
     for obj in chosen:
-        obj[STATE] = state(scene, obj)
+        obj[STATE] = light_state.state(scene, obj)
     return len(chosen)
 
 
@@ -120,34 +124,7 @@ def is_older(scene: Any, obj: Any) -> bool:
     """Whether the splats ``obj`` show baked light, and lamps, sky, other objects or they themselves have
     moved or changed since."""
     shows = any(materials.shows_baked(material) for material in obj.data.materials)
-    return shows and obj.get(STATE) != state(scene, obj)
-
-
-def state(scene: Any, obj: Any) -> str:
-    """A checksum of what lights the splats ``obj``: lamps, sky and the places of all that is rendered."""
-    parts: list[Any] = [_numbers(obj.matrix_world)]
-    for other in sorted(scene.objects, key=lambda other: other.name):
-        if not _is_rendered(other):
-            continue
-        if other.type == "LIGHT":
-            lamp = other.data
-            parts += [_numbers(other.matrix_world), lamp.type, _numbers([[lamp.energy, *lamp.color]])]
-        elif other.type in ("MESH", "POINTCLOUD") and other != obj and other.parent != obj:
-            parts += [other.name, _numbers(other.matrix_world), meshes.size(other.data)]
-    tree = scene.world.node_tree if scene.world is not None else None
-    for node in tree.nodes if tree is not None else ():
-        if node.type == "BACKGROUND":
-            values = [node.inputs["Strength"].default_value, *node.inputs["Color"].default_value]
-            parts.append(_numbers([values]))
-    return f"{zlib.crc32(repr(parts).encode()):08x}"
-
-
-def _is_rendered(obj: Any) -> bool:
-    return not obj.hide_render and not all(home.hide_render for home in obj.users_collection)
-
-
-def _numbers(rows: Any) -> list[float]:
-    return [float(f"{value:.4g}") + 0.0 for row in rows for value in row]
+    return shows and obj.get(STATE) != light_state.latest(scene, obj)
 
 
 def forget(objs: list[Any]) -> None:

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats.blender.inside import objects
+from meshsplats.blender.inside import objects, remaking
 from meshsplats.blender.inside.host import bpy
 from meshsplats.conversion import surroundings
 from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.mesh import SplatMesh
+
+
+class Cut(NamedTuple):
+    """What ``cut`` has made, and what it could not keep."""
+
+    made: Any
+    """The new object, or None."""
+    lost: list[str]
+    """What an artist has added to the mesh that went (``remaking.added``)."""
 
 
 def chosen_splats(
@@ -88,9 +97,9 @@ def _within(region: Any, points: np.ndarray, shape: str) -> np.ndarray:
     return (np.square(share).sum(axis=1) <= 1) if shape == "sphere" else (np.abs(share) <= 1).all(axis=1)
 
 
-def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collection: Any) -> Any:
+def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collection: Any) -> Cut:
     """Takes the triangles ``faces`` (f,) bool of ``mesh``, as from ``chosen_splats``, out of ``obj``. With
-    ``separate``, returns a new object of them at the same place; else None.
+    ``separate``, they become a new object at the same place.
 
     Raises:
         ValueError: none are chosen, or all.
@@ -100,15 +109,38 @@ def cut(obj: Any, mesh: SplatMesh, faces: np.ndarray, *, separate: bool, collect
         raise ValueError(f"{'all' if count else 'none'} of the splats meet the conditions: nothing was cut")
     lit, fast = bool(obj.data[objects.LIT]), bool(obj.get(objects.ROUGH))
     views = objects.views_within(obj) if lit else None
-    made = None
+    added, made = remaking.added(obj), None
+    origin = np.array(obj.data[objects.ORIGIN])
     if separate:
         prepared = objects.prepare(mesh.take(np.flatnonzero(faces)), lit, fast=fast)
-        made = objects.add(prepared, obj.name, collection)
-        away = np.array(made.data[objects.ORIGIN]) - np.array(obj.data[objects.ORIGIN])
+        onto = _part(obj.data.copy(), prepared, faces) if added else None
+        made = objects.add(prepared, obj.name, collection, onto)
+        away = np.array(made.data[objects.ORIGIN]) - origin
         made.matrix_world = obj.matrix_world.copy()
         made.location = obj.matrix_world @ type(made.location)(away.tolist())
-    objects.replace_mesh(obj, objects.prepare(mesh.take(np.flatnonzero(~faces)), lit, fast=fast, views=views))
-    return made
+        if onto is None:
+            remaking.take_properties(made.data, obj.data)
+    rest = objects.prepare(mesh.take(np.flatnonzero(~faces)), lit, fast=fast, views=views)
+    rest["origin"] = origin
+    onto = _part(remaking.copied(obj.data), rest, ~faces) if added else None
+    objects.replace_mesh(obj, rest, onto)
+    return Cut(made, added if onto is None else [])
+
+
+def _part(data: Any, prepared: dict[str, Any], faces: np.ndarray) -> Any:
+    """The mesh ``data`` cut to the triangles ``faces`` (f,) bool, which were ``prepared``, with its origin
+    where they have it; None where its faces are others."""
+    if len(data.polygons) != len(faces) or len(data.loops) != 3 * len(faces):
+        if not data.users:
+            bpy.data.meshes.remove(data)
+        return None
+    away = np.array(data[objects.ORIGIN]) - prepared["origin"]
+    remaking.part(data, faces)
+    if away.any():
+        from mathutils import Matrix
+
+        data.transform(Matrix.Translation(away.tolist()), shape_keys=True)
+    return data if objects.fits(data, prepared) else None
 
 
 def hide(obj: Any) -> None:

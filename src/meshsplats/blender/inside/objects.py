@@ -16,7 +16,9 @@ from meshsplats.blender.inside import (
     materials,
     meshes,
     priors,
+    remaking,
     rendering,
+    sorted_copies,
     sources,
     stand_ins,
     versions,
@@ -92,11 +94,12 @@ def foot(mesh: SplatMesh) -> np.ndarray:
     return bounds.center + (lowest(bounds, up) - bounds.center @ up) * up
 
 
-def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
+def add(prepared: dict[str, Any], name: str, collection: Any, onto: Any = None) -> Any:
     """A new object in ``collection``, upright in Blender's frame, with its material. Its origin lies under
-    the subject. The splats of a mesh prior are a child of a new object of their base, which they follow."""
+    the subject. The splats of a mesh prior are a child of a new object of their base, which they follow.
+    ``onto``: a mesh of this shape, which it takes (``cutting``)."""
     rotation = frame.to_blender(prepared["mesh"].up)
-    obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
+    obj = meshes.make_object(_data(prepared, name, onto), name, rotation, collection)
     obj.location = (rotation @ prepared["origin"]).tolist()
     far_to_near.add(obj, viewport=False)
     _give_stand_in(obj, prepared)
@@ -155,11 +158,27 @@ def count_layers(objs: Iterable[Any]) -> int:
     return sum(most.values())
 
 
-def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
-    """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay."""
+def replace_mesh(obj: Any, prepared: dict[str, Any], onto: Any = None) -> list[str]:
+    """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay. So does what
+    an artist has added to a mesh of the same triangles, or to ``onto``, a part of it (``cutting``).
+
+    Returns:
+        What could not stay (``remaking.added``).
+    """
     old, as_made = obj.data, sources.is_as_made(obj)
     prepared = prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
-    obj.data = _data(prepared, old.name)
+    name, lost = old.name, []
+    modifier = far_to_near.modifier_of(obj)
+    if modifier is not None:
+        sorted_copies.drop(modifier)
+    if onto is None and fits(old, prepared):
+        onto = remaking.copied(old)
+    elif onto is None:
+        lost = remaking.added(obj)
+    data = _data(prepared, name, onto)
+    obj.data = data
+    if onto is None:
+        remaking.take_properties(data, old)
     far_to_near.add(obj, viewport=False)
     stand_ins.remove(obj)
     _give_stand_in(obj, prepared)
@@ -167,6 +186,16 @@ def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
         sources.mark(obj)
     if old.users == 0:
         bpy.data.meshes.remove(old)
+    return lost
+
+
+def fits(data: Any, prepared: dict[str, Any]) -> bool:
+    """Whether the mesh ``data`` has the shape that was ``prepared``, but for rounding. What follows a base is
+    moved anyway."""
+    mesh: SplatMesh = prepared["mesh"]
+    largest = float(np.abs(mesh.vertices).max(initial=0)) + float(np.abs(prepared["origin"]).max())
+    away = 1e-6 * largest if mesh.binding is None else None
+    return remaking.fits(data, mesh.vertices - prepared["origin"].astype(np.float32), mesh.faces, away)
 
 
 def renew_light(scene: Any, objs: Iterable[Any], *, fast: bool = False) -> list[str]:
@@ -193,12 +222,13 @@ def light_source(obj: Any) -> SplatMesh | lit_points.Source:
     return as_splat_mesh(obj)
 
 
-def take_light(obj: Any, prepared: dict[str, Any]) -> None:
-    """Gives ``obj`` what was prepared for its ``light_source``."""
+def take_light(obj: Any, prepared: dict[str, Any]) -> list[str]:
+    """Gives ``obj`` what was prepared for its ``light_source``. Returns what that has lost, as
+    ``replace_mesh``."""
     if lit_points.can_be_lit(obj):
         lit_points.light(obj, prepared)
-    else:
-        replace_mesh(obj, prepared)
+        return []
+    return replace_mesh(obj, prepared)
 
 
 def views_within(obj: Any) -> list[Camera] | None:
@@ -238,26 +268,30 @@ def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
     )
 
 
-def _data(prepared: dict[str, Any], name: str) -> Any:
+def _data(prepared: dict[str, Any], name: str, onto: Any = None) -> Any:
+    """A mesh of what was ``prepared``: a new one, or ``onto``, which has its shape."""
     mesh: SplatMesh = prepared["mesh"]
-    data = meshes.make_mesh(
-        name,
-        mesh.vertices - prepared["origin"].astype(np.float32),
-        prepared["faces"],
-        prepared["colors"],
-        normals=prepared["normals"],
-        face_splat=mesh.face_splat,
-        display=prepared.get("display"),
-    )
+    arrays = {"normals": prepared["normals"], "face_splat": mesh.face_splat}
+    arrays["display"] = prepared.get("display")
+    vertices = mesh.vertices - prepared["origin"].astype(np.float32)
+    if onto is None:
+        data = meshes.make_mesh(name, vertices, prepared["faces"], prepared["colors"], **arrays)
+    else:
+        data = onto
+        if data.name != name:
+            data.name = name
+        if mesh.binding is not None:
+            versions.set_positions(data, vertices)
+        remaking.fill(data, prepared["faces"], prepared["colors"], **arrays)
     if mesh.binding is not None:
         priors.store(data, mesh.binding)
     if prepared["lit"]:
-        data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
+        remaking.set_material(data, materials.lit(self_shadow=prepared["self_shadow"]))
     else:
         harmonics = prepared["harmonics"]
         if harmonics is not None:
             meshes.store_harmonics(data, harmonics)
-        data.materials.append(materials.unlit(terms=meshes.terms_of(harmonics)))
+        remaking.set_material(data, materials.unlit(terms=meshes.terms_of(harmonics)))
     mark(
         data,
         up=mesh.up,
@@ -268,6 +302,8 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
     )
     if mesh.origin.any():
         data[WORLD] = mesh.origin.tolist()
+    elif WORLD in data:
+        del data[WORLD]
     return data
 
 
@@ -314,7 +350,7 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
         colors,
         face_splat=owner,
         harmonics=_harmonics_of(data, faces, owner),
-        up=np.array(facts[UP]),
+        up=frame.up_of(obj),  # the rotation may have been applied to the mesh
         blending=blending,
         origin=np.array(facts.get(WORLD, (0, 0, 0)), np.float64),
     )

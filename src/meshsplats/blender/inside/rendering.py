@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import versions, written
+from meshsplats.blender.inside import notes, versions, written
 from meshsplats.blender.inside.host import bpy
 
 _FEW = 16
@@ -22,6 +24,11 @@ _FEWER = 8
 def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
     """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view
     transform. Colours that are ``linear`` light are encoded for display (sRGB)."""
+    with _told(scene):
+        _exact(scene, engine, linear)
+
+
+def _exact(scene: Any, engine: str, linear: bool) -> None:
     _common(scene, engine, "Standard" if linear else "Raw")
     cycles = scene.cycles
     cycles.samples = 1
@@ -55,31 +62,32 @@ def lit_settings(
         raytracing: EEVEE traces rays for mirrors and glass.
         exposure: in stops.
     """
-    if denoise and not versions.can_denoise():
-        samples, denoise = 4 * samples, False
-    _common(scene, engine, "Standard")
-    scene.view_settings.exposure = exposure
-    cycles = scene.cycles
-    cycles.samples = samples
-    cycles.use_adaptive_sampling = False
-    # The mean over a pixel, as in ``render``: wider filters blur the detail of splats.
-    cycles.pixel_filter_type = "BOX"
-    cycles.filter_width = 1.0
-    cycles.max_bounces = max(bounces, 8)
-    cycles.diffuse_bounces = bounces
-    cycles.glossy_bounces = max(bounces, 4)
-    cycles.transmission_bounces = max(bounces, 8)
-    cycles.caustics_reflective = False
-    cycles.caustics_refractive = False
-    cycles.use_denoising = denoise
-    versions.set_if_there(cycles, denoising_input_passes="RGB_ALBEDO_NORMAL", denoising_quality="HIGH")
-    # The light tree skips lights behind a triangle, though its smoothed normal may face them.
-    cycles.use_light_tree = False
-    # Denoised, rays that have lost most of their light may end at random, which halves the time.
-    _layers(scene, limit, least=_FEW if denoise else limit)
-    scene.eevee.taa_render_samples = samples
-    scene.render.filter_size = 1.5
-    versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=raytracing)
+    with _told(scene):
+        if denoise and not versions.can_denoise():
+            samples, denoise = 4 * samples, False
+        _common(scene, engine, "Standard")
+        scene.view_settings.exposure = exposure
+        cycles = scene.cycles
+        cycles.samples = samples
+        cycles.use_adaptive_sampling = False
+        # The mean over a pixel, as in ``render``: wider filters blur the detail of splats.
+        cycles.pixel_filter_type = "BOX"
+        cycles.filter_width = 1.0
+        cycles.max_bounces = max(bounces, 8)
+        cycles.diffuse_bounces = bounces
+        cycles.glossy_bounces = max(bounces, 4)
+        cycles.transmission_bounces = max(bounces, 8)
+        cycles.caustics_reflective = False
+        cycles.caustics_refractive = False
+        cycles.use_denoising = denoise
+        versions.set_if_there(cycles, denoising_input_passes="RGB_ALBEDO_NORMAL", denoising_quality="HIGH")
+        # The light tree skips lights behind a triangle, though its smoothed normal may face them.
+        cycles.use_light_tree = False
+        # Denoised, rays that have lost most of their light may end at random, which halves the time.
+        _layers(scene, limit, least=_FEW if denoise else limit)
+        scene.eevee.taa_render_samples = samples
+        scene.render.filter_size = 1.5
+        versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=raytracing)
 
 
 def preview_settings(scene: Any) -> None:
@@ -87,6 +95,45 @@ def preview_settings(scene: Any) -> None:
     as the light on splats was denoised when it was baked; more rays may end early."""
     versions.set_if_there(scene.cycles, denoising_input_passes="RGB", denoising_quality="FAST")
     scene.cycles.min_transparent_bounces = min(scene.cycles.min_transparent_bounces, _FEWER)
+
+
+def layers_alone(scene: Any, limit: int) -> None:
+    """Lets rays pass ``limit`` layers, in a file whose other settings are the artist's."""
+    if scene.cycles.transparent_max_bounces < limit:
+        with _told(scene):
+            scene.cycles.transparent_max_bounces = limit
+
+
+def splats_alone(scene: Any) -> None:
+    """Images of new files show what is rendered, nothing else, and all of it."""
+    scene.render.use_compositing = False
+    scene.render.use_sequencer = False
+    scene.render.use_border = False
+
+
+@contextmanager
+def _told(scene: Any) -> Iterator[None]:
+    """A note says which of the settings that matter most to an artist were changed meanwhile."""
+    before = _main_settings(scene)
+    yield
+    after = _main_settings(scene)
+    changes = [f"{name} {value} to {after[name]}" for name, value in before.items() if value != after[name]]
+    if changes:
+        notes.add(f"render settings changed: {', '.join(changes)}")
+
+
+def _main_settings(scene: Any) -> dict[str, Any]:
+    cycles, view = scene.cycles, scene.view_settings
+    return {
+        "view": view.view_transform,
+        "look": view.look,
+        "exposure": round(view.exposure, 3),
+        "Cycles samples": cycles.samples,
+        "EEVEE samples": scene.eevee.taa_render_samples,
+        "bounces": cycles.max_bounces,
+        "transparent bounces": cycles.transparent_max_bounces,
+        "denoising": "on" if cycles.use_denoising else "off",
+    }
 
 
 def _layers(scene: Any, limit: int, least: int | None = None) -> None:
@@ -100,9 +147,6 @@ def _common(scene: Any, engine: str, view: str) -> None:
     scene.render.engine = versions.engine_name(engine)
     scene.render.dither_intensity = 0
     scene.display_settings.display_device = "sRGB"
-    scene.render.use_compositing = False
-    scene.render.use_sequencer = False
-    scene.render.use_border = False
     scene.view_settings.view_transform = view
     scene.view_settings.look = "None"
     scene.view_settings.exposure = 0

@@ -129,6 +129,7 @@ def build(
         away = float(np.linalg.norm(camera.center - subject.center))
         reach = 2 * (away + subject.reach) + 1000 * subject.radius * (options.light is not None)
         made.append(stage.add_camera(camera, camera.name or f"view_{i:04d}", rotation, reach, home))
+    rendering.splats_alone(scene)
     light = options.light
     if light is None:
         background = np.array(options.background or (0, 0, 0))

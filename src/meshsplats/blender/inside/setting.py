@@ -8,8 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, meshes, objects, rendering, scene, stage, views
+from meshsplats.blender.inside import (
+    baking,
+    exporting,
+    meshes,
+    notes,
+    objects,
+    rendering,
+    scene,
+    stage,
+    versions,
+    views,
+)
 from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.layers import bounce_limit
 from meshsplats.blender.options import CAREFUL, FAST, LIGHTS, LightOptions
 from meshsplats.blender.subject import ground_height, lowest
 from meshsplats.cameras.framing import scene_bounds
@@ -20,6 +32,8 @@ _AWAY = 2.5
 """Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
 _START_CAMERA = (7.3589, -6.9258, 4.9583)
 """Where the camera stands that Blender starts with."""
+_RENDERED = ("MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD")
+"""Types of objects that images show."""
 _ROOM = 1.1
 """Half the height of an image, in radii of the subject that the camera is moved to."""
 
@@ -29,7 +43,7 @@ def set_up(
 ) -> LightOptions:
     """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
     camera that sees all of them at the scene's resolution, or a place from within. Replaces those of an
-    earlier call. ``fast``: light for a preview.
+    earlier call, but for a camera that was moved or animated since. ``fast``: light for a preview.
 
     Returns:
         The light.
@@ -46,9 +60,11 @@ def set_up(
     for obj in objs:
         places, normals, size = baking.places_of(obj)
         low = ground_height(low, places[:, 2], normals[:, 2], size)
-    stage.clear()
+    stage.clear(view)
     viewer = None
-    if camera:
+    if camera and view.camera is not None and stage.MADE in view.camera:
+        viewer = np.array(view.camera.matrix_world.translation)
+    elif camera:
         width, height = view.render.resolution_x, view.render.resolution_y
         within = views.opening(objs)
         if within is None:
@@ -67,6 +83,30 @@ def set_up(
         rendering.preview_settings(view)
     baking.bake(view, objs, samples=(FAST if fast else CAREFUL).samples)
     return light
+
+
+def set_up_render(scene: Any, objs: list[Any], lit: bool, *, chosen: bool = False) -> None:
+    """Sets up the render for the splat meshes ``objs``; in a saved file that renders other objects, too, only
+    the layers that rays pass, unless the artist has ``chosen`` more."""
+    if chosen or not _has_others(scene):
+        objects.render_settings(scene, objs, lit)
+        return
+    versions.enable_cycles()
+    rendering.layers_alone(scene, bounce_limit(objects.count_layers(objs)) if lit else 1024)
+    button = "Lit" if lit else "Exact"
+    notes.add(f"this file has other objects, so its render settings stay: {button} in the panel sets them")
+
+
+def _has_others(scene: Any) -> bool:
+    """Whether the file was saved, and images show other objects than splats and what was made for them."""
+    return bool(bpy.data.filepath) and any(
+        obj.type in _RENDERED
+        and not obj.hide_render
+        and objects.is_lit(obj) is None
+        and stage.MADE not in obj
+        and not exporting.is_helper(obj)
+        for obj in scene.objects
+    )
 
 
 def hide_start_scene(scene: Any) -> list[str]:

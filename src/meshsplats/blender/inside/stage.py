@@ -4,18 +4,22 @@ collections."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame, materials, versions
+from meshsplats.blender.inside import frame, materials, notes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.camera import Camera
 
 GREY = (0.6, 0.6, 0.6)
 """Linear colour of the ground."""
 MADE = "meshsplats_stage"
-"""Property of the collections that were made here."""
+"""Property of what was made here: True of collections, of objects the name that they were given, of worlds
+what they look like. Duplicates and what the artist has renamed have other names."""
+POSE = "meshsplats_pose"
+"""Property of the cameras that were made here: where they were put."""
 FADES = (1.5, 10.0)
 """Distances between which the ground fades, in radii of the subject."""
 
@@ -29,12 +33,59 @@ def collection(name: str, *, lasting: bool = False) -> Any:
     return made
 
 
-def clear() -> None:
-    """Removes the collections made here from the scene, with everything in them."""
-    for old in [c for c in bpy.context.scene.collection.children_recursive if c.get(MADE)]:
-        for obj in list(old.objects):
+def clear(scene: Any = None) -> None:
+    """Removes what was made here from the scene: collections, objects and world. What the artist has put into
+    these collections goes to the collection of the scene, as do cameras that were moved or animated, and the
+    world of the artist stays in the file; notes say so."""
+    scene = scene or bpy.context.scene
+    kept = []
+    for obj in [o for o in scene.objects if MADE in o]:
+        if is_artists(obj):
+            kept.append(obj)
+        else:
             bpy.data.objects.remove(obj)
+    for old in [c for c in scene.collection.children_recursive if c.get(MADE)]:
+        for obj in list(old.objects):
+            old.objects.unlink(obj)
+            if not obj.users_collection:
+                scene.collection.objects.link(obj)
+                kept += [] if obj in kept else [obj]
+        for child in list(old.children):
+            with suppress(RuntimeError):  # is there already
+                scene.collection.children.link(child)
         bpy.data.collections.remove(old)
+    if kept:
+        notes.add(f"kept what is yours: {', '.join(obj.name for obj in kept)}")
+    world = scene.world
+    if world is None:
+        return
+    if world.get(MADE) != _look(world):
+        if not world.use_fake_user:
+            notes.add(f"your world {world.name} stays in the file, without a scene")
+        world.use_fake_user = True
+    elif world.users - world.use_fake_user <= 1:
+        bpy.data.worlds.remove(world)
+
+
+def is_artists(obj: Any) -> bool:
+    """Whether ``obj`` is not, or no longer, what was made here: it was renamed or duplicated, or is a camera
+    that was moved or animated."""
+    if obj.get(MADE) != obj.name:
+        return True
+    return obj.type == "CAMERA" and MADE in obj and _was_moved(obj)
+
+
+def _was_moved(camera: Any) -> bool:
+    if any(part.animation_data is not None for part in (camera, camera.data)) or camera.constraints:
+        return True
+    pose = [value for row in camera.matrix_basis for value in row]
+    return not np.allclose(pose, list(camera.get(POSE, pose)), rtol=1e-5, atol=1e-6)
+
+
+def _ours(obj: Any, home: Any) -> Any:
+    home.objects.link(obj)
+    obj[MADE] = obj.name
+    return obj
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
@@ -52,8 +103,8 @@ def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, ho
     data.clip_end = reach
     obj = bpy.data.objects.new(name, data)
     obj.matrix_world = Matrix(frame.camera_pose(camera, rotation).tolist())
-    home.objects.link(obj)
-    return obj
+    obj[POSE] = [value for row in obj.matrix_basis for value in row]
+    return _ours(obj, home)
 
 
 def aim(scene: Any, camera: Camera, obj: Any, factor: int = 1) -> None:
@@ -89,8 +140,18 @@ def add_sun(
     obj = bpy.data.objects.new(name, data)
     obj.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
     obj.location = (direction * 5).tolist()
-    home.objects.link(obj)
-    return obj
+    return _ours(obj, home)
+
+
+def _show(world: Any) -> None:
+    world[MADE] = _look(world)
+    bpy.context.scene.world = world
+
+
+def _look(world: Any) -> str:
+    """The name of ``world`` and its nodes: an artist changes either."""
+    nodes = () if world.node_tree is None else world.node_tree.nodes
+    return f"{world.name}: {' '.join(sorted(node.bl_idname for node in nodes))}"
 
 
 def even_world(light: Sequence[float], seen: Sequence[float] | None = None) -> Any:
@@ -108,7 +169,7 @@ def even_world(light: Sequence[float], seen: Sequence[float] | None = None) -> A
         tree.links.new(lit.outputs[0], mix.inputs[1])
         tree.links.new(_background(tree, seen).outputs[0], mix.inputs[2])
         tree.links.new(mix.outputs[0], out.inputs["Surface"])
-    bpy.context.scene.world = world
+    _show(world)
     return world
 
 
@@ -139,7 +200,7 @@ def environment_world(path: str, strength: float, rotation: float) -> Any:
     tree.links.new(turn.outputs[0], texture.inputs["Vector"])
     tree.links.new(texture.outputs[0], light.inputs["Color"])
     tree.links.new(light.outputs[0], out.inputs["Surface"])
-    bpy.context.scene.world = world
+    _show(world)
     return world
 
 
@@ -184,14 +245,11 @@ def add_glass_ball(center: np.ndarray, radius: float, home: Any) -> Any:
     mesh.shade_smooth()
     obj = bpy.data.objects.new("Glass ball", mesh)
     obj.location = center.tolist()
-    home.objects.link(obj)
     mesh.materials.append(materials.glass())
-    return obj
+    return _ours(obj, home)
 
 
 def _faces(name: str, corners: Sequence[Sequence[float]], faces: Sequence[Sequence[int]], home: Any) -> Any:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(corners, [], faces)
-    obj = bpy.data.objects.new(name, mesh)
-    home.objects.link(obj)
-    return obj
+    return _ours(bpy.data.objects.new(name, mesh), home)

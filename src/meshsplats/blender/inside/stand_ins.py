@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     target.visible_diffuse = target.visible_shadow = False
     target.visible_volume_scatter = True  # Cycles leaves out what no ray at all can see
     target.hide_select = False
+    target.driver_remove("hide_render")
     target.hide_render = target.hide_viewport = True
     obj[baking.POINTS] = target
     index_of = obj.data.attributes.get(baking.POINT) or obj.data.attributes.new(baking.POINT, "INT", "POINT")
@@ -80,7 +82,45 @@ def _child(obj: Any, mesh: Any, home: Any) -> Any:
     child.display_type = "BOUNDS"  # viewports draw the edges of wires over the splats
     child.hide_select = True
     home.objects.link(child)
+    _tie(child)
     return child
+
+
+def _tie(child: Any) -> None:
+    """Has images leave out ``child`` whenever they leave out its splats. A driver works in animations, and
+    where the extension is missing; of viewports it does not, as they do not evaluate what is hidden."""
+    driver = child.driver_add("hide_render").driver
+    driver.type = "SUM"  # no expression, which files from elsewhere may not run
+    variable = driver.variables.new()
+    variable.targets[0].id = child.parent
+    variable.targets[0].data_path = "hide_render"
+
+
+def follow(scene: Any) -> None:
+    """Moves what was made for splats to the collections that they were moved to, so that it is excluded and
+    hidden with these, and hides it in viewports where they are hidden."""
+    for obj in [o for o in scene.objects if _hangs(o)]:
+        mine, wanted = _homes(obj), _homes(obj.parent)
+        for home in wanted - mine:
+            home.objects.link(obj)
+        for home in mine - wanted:
+            home.objects.unlink(obj)
+        if obj == baking.points_of(obj.parent):
+            continue
+        obj.hide_viewport = obj.parent.hide_viewport
+        if obj.hide_get() != obj.parent.hide_get():
+            with suppress(RuntimeError):  # not in this view layer
+                obj.hide_set(obj.parent.hide_get())
+        if obj.animation_data is None or not obj.animation_data.drivers:  # of an earlier release
+            _tie(obj)
+
+
+def _hangs(obj: Any) -> bool:
+    return bool(obj.get(STAND_IN)) and obj.parent is not None and bool(obj.parent.users_collection)
+
+
+def _homes(obj: Any) -> set[Any]:
+    return set(obj.users_collection)
 
 
 def shape(data: Any) -> str:
@@ -113,11 +153,13 @@ def is_current(obj: Any, *, counts_only: bool = False) -> bool:
 
 
 def remove_strays(scene: Any) -> None:
-    """Removes what was made here for splats of ``scene`` that were deleted, or joined with others."""
+    """Removes what was made here for splats of ``scene`` that were deleted, or joined with others. The rest
+    goes where its splats are (``follow``)."""
     for obj in [o for o in scene.objects if o.get(STAND_IN)]:
         owner = obj.get(OWNER, obj.parent)
         if owner is None or obj.parent != owner or not owner.users_collection:
             _delete(obj)
+    follow(scene)
 
 
 def _delete(obj: Any) -> None:

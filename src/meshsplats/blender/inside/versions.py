@@ -10,7 +10,7 @@ from meshsplats.blender.inside.host import bpy
 
 OLDEST = (4, 2, 0)
 
-_CUSTOM_NORMAL = "custom_normal"
+CUSTOM_NORMAL = "custom_normal"
 """Blender's own name for the attribute that replaces a mesh's normals, from 4.5 on."""
 
 
@@ -92,11 +92,11 @@ def set_normals(mesh: Any, normals: np.ndarray) -> None:
             mesh.update(calc_edges=True)
         mesh.normals_split_custom_set_from_vertices(normals)
         return
-    attribute = mesh.attributes.get(_CUSTOM_NORMAL)
+    attribute = mesh.attributes.get(CUSTOM_NORMAL)
     if attribute is None or (attribute.data_type, attribute.domain) != ("FLOAT_VECTOR", "POINT"):
         if attribute is not None:
             mesh.attributes.remove(attribute)
-        attribute = mesh.attributes.new(_CUSTOM_NORMAL, "FLOAT_VECTOR", "POINT")
+        attribute = mesh.attributes.new(CUSTOM_NORMAL, "FLOAT_VECTOR", "POINT")
     attribute.data.foreach_set("vector", normals.ravel())
     if len(mesh.edges):  # else they would be made
         mesh.update()

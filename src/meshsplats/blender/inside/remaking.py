@@ -1,0 +1,192 @@
+"""Other colours and another shading for a mesh that there is, or a part of it: what an artist has added to it
+stays, such as vertex groups, shape keys, UV maps, attributes and materials."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.inside import baking, materials, meshes, priors, sorted_copies, versions
+
+_OWN = {
+    *(meshes.COLOR, meshes.DISPLAY, meshes.MADE, meshes.NORMAL, meshes.SPLAT, sorted_copies.CENTER),
+    *(materials.LIGHT, baking.POINT, *priors.ATTRIBUTES.values()),
+}
+"""Attributes that MeshSplats makes, besides the harmonics."""
+_BLENDERS = {"position", "material_index", "sharp_face", "sharp_edge", versions.CUSTOM_NORMAL}
+"""Attributes that Blender makes by itself."""
+_KEYS = {"BYTE_COLOR": "color_srgb", "FLOAT_COLOR": "color", "FLOAT_VECTOR": "vector", "FLOAT2": "vector"}
+"""Properties that hold the values of an attribute of each type; of all others, it is ``value``."""
+_WIDTHS = {
+    **{"BYTE_COLOR": 4, "FLOAT_COLOR": 4, "FLOAT_VECTOR": 3, "FLOAT2": 2},
+    **{"QUATERNION": 4, "INT16_2D": 2, "INT32_2D": 2, "FLOAT4X4": 16},
+}
+"""Numbers of each value; 1 for all other types."""
+_TYPES = {"BOOLEAN": bool, "INT": np.int32, "INT8": np.int8, "INT16_2D": np.int16, "INT32_2D": np.int32}
+_NAMES = "Splats"
+"""How the names of our materials begin; what an artist has renamed is the artist's."""
+
+
+def fits(data: Any, vertices: np.ndarray, faces: np.ndarray, away: float | None) -> bool:
+    """Whether the mesh ``data`` has the triangles ``faces`` (f, 3), in whatever winding, and the ``vertices``
+    (v, 3), ``away`` from their places at most; None: anywhere."""
+    if len(data.vertices) != len(vertices) or len(data.loops) != 3 * len(data.polygons):
+        return False
+    corners = versions.corners(data).reshape(-1, 3)
+    if corners.shape != faces.shape or not (np.sort(corners, axis=1) == np.sort(faces, axis=1)).all():
+        return False
+    return away is None or bool((np.abs(versions.positions(data) - vertices) <= away).all())
+
+
+def fill(
+    data: Any,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    *,
+    normals: np.ndarray | None = None,
+    face_splat: np.ndarray | None = None,
+    display: np.ndarray | None = None,
+) -> None:
+    """Gives the mesh ``data``, which ``fits``, what ``meshes.make_mesh`` makes of the same arguments, and
+    takes away what it has of MeshSplats else."""
+    _wind(data, faces)
+    if normals is None and meshes.NORMAL in data.attributes and versions.CUSTOM_NORMAL in data.attributes:
+        data.attributes.remove(data.attributes[versions.CUSTOM_NORMAL])
+    arrays = {
+        meshes.COLOR: ("FLOAT_COLOR", "POINT", colors),
+        meshes.DISPLAY: ("FLOAT_COLOR", "POINT", display),
+        meshes.MADE: ("FLOAT_COLOR", "POINT", None if display is None else colors),
+        meshes.NORMAL: ("FLOAT_VECTOR", "POINT", normals),
+        meshes.SPLAT: ("INT", "FACE", face_splat),
+    }
+    kept = {name: (kind, domain) for name, (kind, domain, values) in arrays.items() if values is not None}
+    for name in [attribute.name for attribute in data.attributes if _is_own(attribute.name)]:
+        attribute = data.attributes[name]
+        if name != sorted_copies.CENTER and kept.get(name) != (attribute.data_type, attribute.domain):
+            data.attributes.remove(attribute)
+    for name, (kind, domain, values) in arrays.items():
+        if values is not None:
+            attribute = data.attributes.get(name) or data.attributes.new(name, kind, domain)
+            flat = np.ascontiguousarray(values, _TYPES.get(kind, np.float32)).ravel()
+            attribute.data.foreach_set(_KEYS.get(kind, "value"), flat)
+    data.color_attributes.active_color = data.color_attributes[meshes.COLOR]
+    data.color_attributes.render_color_index = data.color_attributes.find(meshes.COLOR)
+    data.update()
+    if normals is not None:
+        versions.set_normals(data, normals)
+
+
+def set_material(data: Any, material: Any) -> None:
+    """Puts ``material`` in the place of all materials of MeshSplats that ``data`` has, or else in the first
+    one, whose material gets a place of its own at the end. Faces keep the artist's materials."""
+    slots = data.materials
+    ours = [i for i, other in enumerate(slots) if other is not None and other.name.startswith(_NAMES)]
+    if not ours:
+        if len(slots) and slots[0] is not None:
+            slots.append(slots[0])
+        ours = [0]
+    if not len(slots):
+        slots.append(material)
+        return
+    slots[ours[0]] = material
+    if len(ours) == 1:
+        return
+    # Joined with others.
+    index = np.zeros(len(data.polygons), np.int32)
+    data.polygons.foreach_get("material_index", index)
+    index[np.isin(index, ours)] = ours[0]
+    data.polygons.foreach_set("material_index", index)
+    for i in reversed(ours[1:]):
+        slots.pop(index=i)
+
+
+def part(data: Any, faces: np.ndarray) -> None:
+    """Leaves of the mesh ``data`` of triangles those in ``faces`` (f,) bool, in their order, with the
+    vertices that they use."""
+    import bmesh
+
+    used = np.zeros(len(data.vertices), bool)
+    used[versions.corners(data).reshape(-1, 3)[faces].ravel()] = True
+    edited = bmesh.new()
+    try:
+        edited.from_mesh(data)
+        gone = [face for face, keep in zip(edited.faces, faces.tolist(), strict=True) if not keep]
+        alone = [vertex for vertex, keep in zip(edited.verts, used.tolist(), strict=True) if not keep]
+        bmesh.ops.delete(edited, geom=gone, context="FACES")
+        bmesh.ops.delete(edited, geom=[vertex for vertex in alone if vertex.is_valid], context="VERTS")
+        edited.to_mesh(data)
+    finally:
+        edited.free()
+
+
+def added(obj: Any) -> list[str]:
+    """What an artist has added to the mesh of ``obj`` that belongs to its vertices, corners or faces."""
+    data, found = obj.data, []
+    if len(obj.vertex_groups) and any(vertex.groups for vertex in data.vertices):
+        found.append("vertex groups")
+    if data.shape_keys is not None:
+        found.append("shape keys")
+    layers = {layer.name for layer in data.uv_layers}
+    if layers:
+        found.append("UV maps")
+    left_out = layers | _BLENDERS
+    names = [
+        attribute.name
+        for attribute in data.attributes
+        if attribute.name not in left_out
+        and not attribute.name.startswith(".")
+        and not _is_own(attribute.name)
+    ]
+    if names:
+        found.append(f"attributes ({', '.join(names)})")
+    index = np.zeros(len(data.polygons), np.int32)
+    data.polygons.foreach_get("material_index", index)
+    if index.any():
+        found.append("materials of faces")
+    return found
+
+
+def take_properties(data: Any, old: Any) -> None:
+    """Gives ``data`` the custom properties and further materials of the mesh ``old``, which it replaces."""
+    for name in old.keys():  # noqa: SIM118 - no dictionary
+        if name not in data and not name.startswith("meshsplats"):
+            data[name] = old[name]
+    for material in old.materials:
+        if material is not None and not material.name.startswith(_NAMES):
+            data.materials.append(material)
+
+
+def _is_own(name: str) -> bool:
+    return name in _OWN or name.startswith(meshes.HARMONICS)
+
+
+def _wind(data: Any, faces: np.ndarray) -> None:
+    """Winds the triangles of ``data``, which ``fits``, as ``faces`` (f, 3) are: what belongs to corners goes
+    with their vertices."""
+    old = versions.corners(data).reshape(-1, 3)
+    rows = np.flatnonzero((old != faces).any(axis=1))
+    if not len(rows):
+        return
+    place = (old[rows][:, None, :] == faces[rows][:, :, None]).argmax(axis=2)
+    source = np.arange(old.size).reshape(-1, 3)
+    source[rows] = 3 * rows[:, None] + place
+    # A corner's edge leads to the next corner: it is the one that the third corner does not touch.
+    edges = np.arange(old.size).reshape(-1, 3)
+    edges[rows] = 3 * rows[:, None] + (np.roll(place, 1, axis=1) + 1) % 3
+    before = np.empty(old.size, np.int32)
+    data.loops.foreach_get("edge_index", before)
+    data.loops.foreach_set("edge_index", before[edges.ravel()])
+    for attribute in data.attributes:
+        kind = attribute.data_type
+        if attribute.domain == "CORNER" and not attribute.name.startswith(".corner_") and kind != "STRING":
+            values = np.empty((old.size, _WIDTHS.get(kind, 1)), _TYPES.get(kind, np.float32)).ravel()
+            key = _KEYS.get(kind, "value")
+            attribute.data.foreach_get(key, values)
+            attribute.data.foreach_set(key, values.reshape(old.size, -1)[source.ravel()].ravel())
+    versions.set_corners(data, faces)
+
+
+def copied(data: Any) -> Any:
+    """``data`` where it has one user, which then owns what is changed; else a copy."""
+    return data if data.users == 1 else data.copy()
