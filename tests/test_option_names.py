@@ -21,9 +21,10 @@ NOT_OURS = {
     "errors.py": {"--index-url"},  # pip
     "formats/usd/extraction.py": {"--flatten"},  # usdcat
     "formats/mesh_formats.py": {"--lit"},  # the table of docs/files.md
+    "formats/meshes.py": {"--colors"},  # of bake: a whole command to type, whoever says it
     "blender/launch.py": {"--version", "--background", "--factory-startup", "--python-exit-code", "--python"},
 }
-"""Flags of other programs, and of a page."""
+"""Flags of other programs, of a page, and of another command."""
 STILL = {
     "blender/__init__.py": {"--max-triangles"},
     "blender/launch.py": {"--executable", "--engine"},
