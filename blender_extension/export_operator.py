@@ -23,11 +23,32 @@ FORMATS = [
 SPLAT_FORMATS = [(suffix, f"*{suffix}", "A format of splat files") for suffix in written_suffixes()]
 
 
+OTHERS = (
+    *(
+        ".3mf",
+        ".abc",
+        ".blend",
+        ".dae",
+        ".fbx",
+        ".gltf",
+        ".obj",
+        ".stl",
+        ".usd",
+        ".usda",
+        ".usdz",
+        ".x3d",
+        ".xyz",
+    ),
+    *(".ksplat", ".splat", ".spz", ".sog", ".ply", ".npz", ".glb", ".usdc"),
+    *(".exr", ".jpg", ".jpeg", ".png", ".webp", ".txt", ".zip"),
+)
+"""Endings of files that a name may ask for; any other end, as in room.final, is part of the name."""
+
+
 def other_suffix(path):
-    """What the name ``path`` ends with if that looks like a suffix, and not like a number as in ball.001;
-    else ''."""
+    """The ending of ``path`` if it is one of ``OTHERS``, else ''."""
     suffix = os.path.splitext(path)[1]
-    return suffix if suffix[1:2].isalpha() and suffix[1:].isalnum() else ""
+    return suffix if suffix.lower() in OTHERS else ""
 
 
 class Export(ExportHelper):

@@ -235,7 +235,8 @@ def _names(inputs: Sequence[Path]) -> list[str]:
         alike = {i for i, name in enumerate(names) if count[name.casefold()] > 1} - whole
         if not alike:
             return names
-        whole |= alike
+        archives = {i for i in alike if inputs[i].suffix.lower() == ".zip"}
+        whole |= archives or alike  # a.glb of a.ply keeps its name beside that of a.zip
 
 
 def without_results(

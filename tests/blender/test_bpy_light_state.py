@@ -22,6 +22,8 @@ def test_whatever_lights_splats_makes_another_state():
     obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
     other = objects.add(objects.prepare(mesh, False), "other", scene.collection)
     sun = stage.add_sun(np.array([0.5, 0, 0.9]), 3.0, 1.0, 0.01, scene.collection).data
+    lamp = stage.add_sun(np.array([0.5, 0, 0.9]), 3.0, 1.0, 0.01, scene.collection, name="lamp")
+    lamp.parent = obj
     material = stage.add_ground(np.zeros(3), 1.0, False, scene.collection).data.materials[0]
     ground = next(node for node in material.node_tree.nodes if node.type == "BSDF_DIFFUSE")
     sky = stage.even_world((0.2, 0.2, 0.2)).node_tree
@@ -42,6 +44,7 @@ def test_whatever_lights_splats_makes_another_state():
 
     changes = {
         "angle of the sun": lambda: setattr(sun, "angle", 0.3),
+        "lamp on the splats": lambda: setattr(lamp.data, "energy", 5),
         "colour of the ground": lambda: setattr(ground.inputs[0], "default_value", (1, 0, 0, 1)),
         "sky image": lambda: sky.links.new(image.outputs[0], background.inputs[0]),
         "turned sky": lambda: setattr(turn.inputs["Rotation"], "default_value", (0, 0, 1)),
@@ -62,3 +65,18 @@ def test_whatever_lights_splats_makes_another_state():
     bevel.show_expanded = not bevel.show_expanded
     other.data.materials.clear()  # as baking its light changes nodes
     assert light_state.state(scene, obj) == before, "none of these changes light"
+
+
+def test_what_was_baked_is_known_at_once(monkeypatch):
+    """A scene whose state takes long is looked at now and then; but a bake is news."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    obj = objects.add(objects.prepare(convert(ball_splats(50)[0]), False), "ball", scene.collection)
+    sun = stage.add_sun(np.array([0.5, 0, 0.9]), 3.0, 1.0, 0.01, scene.collection)
+    monkeypatch.setattr(light_state, "_LONG", -1)
+    monkeypatch.setattr(light_state, "_REST", 1e9)
+    before = light_state.renewed(scene, obj)
+    sun.data.energy = 7
+    assert light_state.latest(scene, obj) == before
+    after = light_state.renewed(scene, obj)
+    assert after == light_state.latest(scene, obj) == light_state.state(scene, obj) != before

@@ -74,6 +74,14 @@ def test_the_world_of_the_artist_stays_in_the_file(empty):
     assert len(bpy.data.worlds) == 3
 
 
+def test_the_world_of_the_start_file_is_nothing_to_tell():
+    bpy.ops.wm.read_factory_settings()
+    notes.take()
+    stage.clear()
+    stage.even_world((0.5, 0.5, 0.5))
+    assert notes.take() == []
+
+
 @pytest.mark.parametrize("settings", [rendering.exact_settings, rendering.lit_settings])
 def test_compositing_and_render_region_are_left_alone(empty, settings):
     names = ("use_compositing", "use_sequencer", "use_border")
@@ -140,5 +148,6 @@ def test_unknown_formats_are_not_exported(tmp_path):
             bpy.ops.export_scene.meshsplats(filepath=str(tmp_path / "q.xyz"))
         with pytest.raises(RuntimeError, match=r"\.ksplat is none .*\.spz"):
             bpy.ops.export_scene.meshsplats_splats(filepath=str(tmp_path / "q.ksplat"))
-        bpy.ops.export_scene.meshsplats(filepath=str(tmp_path / "ball.001"))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.001.glb", "ball.ply"]
+        for name in ("ball.001", "room.final"):
+            bpy.ops.export_scene.meshsplats(filepath=str(tmp_path / name))
+    assert {path.name for path in tmp_path.iterdir()} == {"ball.001.glb", "ball.ply", "room.final.glb"}

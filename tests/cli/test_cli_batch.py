@@ -225,6 +225,14 @@ def test_names_do_not_depend_on_the_case_of_letters(tmp_path):
     assert [job.outputs[0].name for job in made] == ["Same.ply.glb", "same.sog.glb", "a.glb"]
 
 
+def test_archives_take_no_names_from_files(tmp_path):
+    """What a.ply became keeps its name when an a.zip comes beside it."""
+    paths = [tmp_path / name for name in ("a.ply", "a.zip", "b.ply", "b.spz", "b.zip", "c.zip")]
+    made = jobs(paths, tmp_path, ["glb"], preview=False, sidecars=False)
+    names = [job.outputs[0].name for job in made]
+    assert names == ["a.glb", "a.zip.glb", "b.ply.glb", "b.spz.glb", "b.zip.glb", "c.glb"]
+
+
 @pytest.mark.slow
 def test_results_in_the_folder_of_the_inputs_are_no_inputs(scans):
     os.remove("scans/broken.ply")

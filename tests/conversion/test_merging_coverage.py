@@ -62,7 +62,7 @@ class TestCoveredShares:
                 left *= 1 - min(parts.opacities[i], 1 - 1e-4) * np.exp(-exponents)
             assert found[g] == pytest.approx((1 - left).sum() * (6 / 240) ** 2 / (2 * np.pi), rel=0.03)
 
-    def test_batches_and_threads_change_no_bit(self, monkeypatch):
+    def test_batches_change_rounding_and_threads_nothing(self, monkeypatch):
         rng = np.random.default_rng(1)
         group = np.sort(np.concatenate([np.arange(40), rng.integers(0, 40, 200)]))
         parts = parts_of(group, rng.normal(size=(240, 3)), [1, 1, 1], rng.uniform(0, 1, 240))
@@ -70,7 +70,16 @@ class TestCoveredShares:
         whole = covered_shares(parts, wholes, 1)
         for rows in (1, 7, 100):
             monkeypatch.setattr("meshsplats.conversion.merging_coverage.AT_ONCE", rows)
-            np.testing.assert_array_equal(covered_shares(parts, wholes, 2), whole)
+            batches = covered_shares(parts, wholes, 2)
+            np.testing.assert_allclose(batches, whole, rtol=1e-12)
+            np.testing.assert_array_equal(batches, covered_shares(parts, wholes, 1))
+
+    @pytest.mark.parametrize("size", [0.3, 1 / 3, 0.7, 1e-9])
+    def test_needles_on_the_diagonal_are_finite(self, size):
+        needle = size * np.array([[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 0]])
+        parts = Parts(np.array([0]), np.zeros((1, 3)), needle[None], np.array([0.9]))
+        (found,) = covered_shares(parts, wholes_of([(0, 0, 0)], [(1, 1)]), 1)
+        assert 0 <= found <= 1
 
 
 def sheet(opacity: float, side: int = 60) -> ms.GaussianCloud:
@@ -103,6 +112,17 @@ def test_a_sheet_stays_without_holes(opacity, share):
     merged = middle_alpha(simplify(cloud, len(cloud) // share))
     assert np.quantile(merged, 0.05) > (0.82 if opacity > 0.95 else 0.62)
     assert merged.mean() > (0.89 if opacity > 0.95 else 0.76)
+
+
+@pytest.mark.parametrize("opacity", [0.8, 0.9])
+def test_merging_again_makes_no_solid_surface_of_others(opacity):
+    """Chained, as levels of tiles are, merging does not widen splats more than at once."""
+    cloud = sheet(opacity)
+    chained = cloud
+    for share in (4, 16, 64):
+        chained, direct = simplify(chained, len(cloud) // share), simplify(cloud, len(cloud) // share)
+        areas = [np.prod(np.sort(c.scales, axis=1)[:, 1:], axis=1).sum() for c in (chained, direct)]
+        assert areas[0] == pytest.approx(areas[1], rel=0.3)
 
 
 def test_faint_splats_keep_covariance_and_mass():

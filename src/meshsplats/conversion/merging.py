@@ -49,8 +49,9 @@ DENSE = 0.9
 may cover more than it does: their opacities add up to less than this."""
 
 SOLID, SOLID_SHARE = 0.98, 0.95
-"""Splats of at least the first opacity that have at least the second share of all mass are a surface sampled
-by opaque splats..."""
+"""Splats of at least the first opacity, but less than 1, that have at least the second share of all mass are
+a surface sampled by opaque splats. Merged ones that are so opaque get 1, so that no cloud becomes such a
+surface by merging..."""
 SOLID_COVER = 1.4
 """... and cover this multiple of their area: through gaps between merged ones shows what is behind all."""
 
@@ -95,7 +96,7 @@ def simplify(
 
     Raises:
         ValueError: ``count`` or ``low_pass`` out of range.
-        MemoryError: the work does not fit; it takes about 600 bytes a splat.
+        MemoryError: the work does not fit; it takes about 600 bytes a splat, and 80 MB a thread.
     """
     need(GaussianCloud, cloud=cloud)
     need_all(Camera, cameras=cameras, optional=True)
@@ -281,7 +282,8 @@ def _depths(masses: np.ndarray, drawn: np.ndarray) -> np.ndarray:
 
 def _are_solid(cloud: GaussianCloud, masses: np.ndarray) -> bool:
     """Whether nearly all of ``cloud`` is opaque, as where splats were made of points or of a mesh."""
-    return float(masses[cloud.opacities >= SOLID].sum()) >= SOLID_SHARE * float(masses.sum())
+    opaque = (cloud.opacities >= SOLID) & (cloud.opacities < 1)
+    return float(masses[opaque].sum()) >= SOLID_SHARE * float(masses.sum())
 
 
 def _matrices(covariances: np.ndarray) -> np.ndarray:
@@ -315,7 +317,7 @@ def _merged(
     depth = _depths(mass, _drawn(scales, width, cloud.kernel))
     dense = depth > DENSE
     if dense.any():
-        inside = groups.order[dense[own[groups.order]]]
+        inside = groups.order[dense[own[groups.order]] & (part.opacities[groups.order] >= MIN_OPACITY)]
         filtered = 0.0 if cloud.kernel == "antialiased" else np.square(low_pass[rows[inside]])
         parts = Parts(
             (np.cumsum(dense) - 1)[own[inside]],
@@ -334,7 +336,8 @@ def _merged(
     fields["means"][changed] = means
     fields["quaternions"][changed] = quaternions_of(axes)
     fields["scales"][changed] = scales
-    fields["opacities"][changed] = opacity_of(depth)
+    opacity = opacity_of(depth)
+    fields["opacities"][changed] = np.where(opacity >= SOLID, 1, opacity)
     for k in range(cloud.sh.shape[1]):
         fields["sh"][changed, k] = groups.averages(cloud.sh[rows, k])
     return replace(result, **fields)

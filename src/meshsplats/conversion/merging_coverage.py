@@ -19,7 +19,7 @@ GRID = 12
 REACH = 3.0
 """Half the side of this square, in standard deviations of the merged splat."""
 AT_ONCE = 20_000
-"""Splats whose samples are in memory together."""
+"""Splats whose samples are in memory together, for each thread: 80 MB."""
 MOST_OPAQUE = 1 - 1e-4
 """Opacity of splats in these products, at most."""
 
@@ -58,14 +58,25 @@ def covered_shares(parts: Parts, wholes: Wholes, threads: int) -> np.ndarray:
         rows = slice(starts[first], starts[last])
         part = Parts(*(column[rows] for column in parts))
         part = part._replace(group=part.group - first)
-        return _shares(part, starts[first:last] - starts[first], Wholes(*(w[first:last] for w in wholes)))
+        return _shares(part, Wholes(*(column[first:last] for column in wholes)))
 
     with ThreadPoolExecutor(threads) as pool:
         return np.concatenate(list(pool.map(of_range, cuts, [*cuts[1:], len(wholes.means)])))
 
 
-def _shares(parts: Parts, starts: np.ndarray, wholes: Wholes) -> np.ndarray:
-    """``covered_shares`` of groups whose parts begin at ``starts``."""
+def _shares(parts: Parts, wholes: Wholes) -> np.ndarray:
+    """``covered_shares`` of a few groups; each may have any number of parts."""
+    logs = np.zeros((len(wholes.means), GRID, GRID))
+    for first in range(0, len(parts.group), AT_ONCE):
+        some = Parts(*(column[first : first + AT_ONCE] for column in parts))
+        groups, starts = np.unique(some.group, return_index=True)
+        logs[groups] += np.add.reduceat(_logs(some, wholes), starts, axis=0)
+    covered: np.ndarray = -np.expm1(logs).sum(axis=(1, 2)) * (2 * REACH / GRID) ** 2
+    return covered / (2 * np.pi)
+
+
+def _logs(parts: Parts, wholes: Wholes) -> np.ndarray:
+    """(n, GRID, GRID) logarithms of what each part lets through at the samples of its group."""
     group = parts.group
     plane, sizes = wholes.axes[group][:, :, :2], wholes.sizes[group]
     middle = np.einsum("ni,nia->na", parts.means - wholes.means[group], plane)
@@ -74,12 +85,10 @@ def _shares(parts: Parts, starts: np.ndarray, wholes: Wholes) -> np.ndarray:
     steps = REACH * ((np.arange(GRID) + 0.5) / GRID * 2 - 1)
     x = steps * sizes[:, :1] - middle[:, :1]
     y = steps * sizes[:, 1:] - middle[:, 1:]
-    # The exponent is a sum of terms of x, of y and of both: (n, GRID, GRID), the largest array here.
     exponents = (-xy / determinant)[:, None, None] * x[:, :, None] * y[:, None, :]
     exponents += (0.5 * yy / determinant)[:, None, None] * (x * x)[:, :, None]
     exponents += (0.5 * xx / determinant)[:, None, None] * (y * y)[:, None, :]
-    opacities = np.minimum(parts.opacities, MOST_OPAQUE)[:, None, None]
-    logs = np.log1p(-opacities * np.exp(-np.minimum(exponents, 60)))
-    left = np.exp(np.add.reduceat(logs, starts, axis=0))
-    covered: np.ndarray = (1 - left).sum(axis=(1, 2)) * (2 * REACH / GRID) ** 2
-    return covered / (2 * np.pi)
+    # Those of a needle seen end on, along a diagonal, cancel to less than 0.
+    profile = np.exp(-np.clip(exponents, 0, 60))
+    logs: np.ndarray = np.log1p(-np.minimum(parts.opacities, MOST_OPAQUE)[:, None, None] * profile)
+    return logs

@@ -116,7 +116,7 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
                     levels.show(chain, level, where)
             show(obj.data, smoothed(target.data))
     for obj in chosen:
-        obj[STATE] = light_state.state(scene, obj)
+        obj[STATE] = light_state.renewed(scene, obj)
     return len(chosen)
 
 

@@ -27,6 +27,8 @@ _LONG = 0.02
 """Seconds: what takes as long delays the window."""
 _REST = 30
 """After which multiple of its time a state that takes long is looked for again."""
+_STAND_IN = "meshsplats_stand_in"
+"""``stand_ins.STAND_IN``."""
 _known: dict[tuple[str, str], tuple[float, float, str]] = {}
 """When they began, how long they took, and what was found."""
 
@@ -37,7 +39,7 @@ def state(scene: Any, obj: Any) -> str:
     parts: list[Any] = [_numbers(obj.matrix_world)]
     used: dict[str, Any] = {}
     for other in sorted(scene.objects, key=lambda other: other.name):
-        if _is_rendered(other) and other != obj and other.parent != obj:
+        if _is_rendered(other) and other != obj and not (other.parent == obj and other.get(_STAND_IN)):
             parts += _object(other, used)
     parts += [part for material in used.values() for part in _block(material)]
     if scene.world is not None:
@@ -55,6 +57,12 @@ def latest(scene: Any, obj: Any) -> str:
     took = time.monotonic() - now
     _known[key] = (now, took, found)
     return found
+
+
+def renewed(scene: Any, obj: Any) -> str:
+    """``state``, which ``latest`` then knows."""
+    _known.pop((scene.name, obj.name), None)
+    return latest(scene, obj)
 
 
 def _is_rendered(obj: Any) -> bool:

@@ -79,7 +79,7 @@ def fill(
 
 def set_material(data: Any, material: Any) -> None:
     """Puts ``material`` in the place of all materials of MeshSplats that ``data`` has, or else in the first
-    one, whose material gets a place of its own at the end. Faces keep the artist's materials."""
+    one, whose material moves to the end. Faces keep the numbers of their materials."""
     slots = data.materials
     ours = [i for i, other in enumerate(slots) if other is not None and other.name.startswith(_NAMES)]
     if not ours:

@@ -60,7 +60,8 @@ def clear(scene: Any = None) -> None:
     if world is None:
         return
     if world.get(MADE) != _look(world):
-        if not world.use_fake_user:
+        starts = not bpy.data.filepath and world.name == "World"  # as Blender starts with
+        if not (world.use_fake_user or starts):
             notes.add(f"your world {world.name} stays in the file, without a scene")
         world.use_fake_user = True
     elif world.users - world.use_fake_user <= 1:

@@ -107,7 +107,8 @@ def follow(scene: Any) -> None:
             home.objects.unlink(obj)
         if obj == baking.points_of(obj.parent):
             continue
-        obj.hide_viewport = obj.parent.hide_viewport
+        if obj.hide_viewport != obj.parent.hide_viewport:  # each assignment is an update
+            obj.hide_viewport = obj.parent.hide_viewport
         if obj.hide_get() != obj.parent.hide_get():
             with suppress(RuntimeError):  # not in this view layer
                 obj.hide_set(obj.parent.hide_get())
