@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from meshsplats import _toml as toml
 from meshsplats._files.atomic import refuse_existing
 from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, OverwritingError
 from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
@@ -144,6 +143,8 @@ def check_mesh_endings(*kinds: str) -> None:
 def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:
     """The options in the configuration file at ``path``; None if there is none, or of another command than
     ``name``."""
+    from meshsplats import _toml as toml  # Python 3.10 has no parser of its own
+
     try:
         record = toml.load(path)
         return dict(record["options"]) if name in (None, record["command"]) else None
