@@ -24,23 +24,9 @@ SPLAT_FORMATS = [(suffix, f"*{suffix}", "A format of splat files") for suffix in
 
 
 OTHERS = (
-    *(
-        ".3mf",
-        ".abc",
-        ".blend",
-        ".dae",
-        ".fbx",
-        ".gltf",
-        ".obj",
-        ".stl",
-        ".usd",
-        ".usda",
-        ".usdz",
-        ".x3d",
-        ".xyz",
-    ),
-    *(".ksplat", ".splat", ".spz", ".sog", ".ply", ".npz", ".glb", ".usdc"),
-    *(".exr", ".jpg", ".jpeg", ".png", ".webp", ".txt", ".zip"),
+    *(".3mf", ".abc", ".blend", ".dae", ".fbx", ".glb", ".gltf", ".npz", ".obj", ".ply", ".stl", ".x3d"),
+    *(".usd", ".usda", ".usdc", ".usdz", ".xyz", ".ksplat", ".sog", ".splat", ".spz"),
+    *(".exr", ".jpeg", ".jpg", ".png", ".webp", ".txt", ".zip"),
 )
 """Endings of files that a name may ask for; any other end, as in room.final, is part of the name."""
 

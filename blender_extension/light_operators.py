@@ -18,10 +18,10 @@ DARK = 0.1
 def is_dark(scene):
     """Whether images of ``scene`` have neither a lamp nor a sky that lights anything; what glows does not
     count."""
-    for obj in scene.objects:
-        shown = not obj.hide_render and not all(home.hide_render for home in obj.users_collection)
-        if obj.type == "LIGHT" and shown and obj.data.energy > 0:
-            return False
+    from meshsplats.blender.inside.light_state import is_rendered
+
+    if any(obj.type == "LIGHT" and is_rendered(obj) and obj.data.energy > 0 for obj in scene.objects):
+        return False
     world = scene.world
     if world is None:
         return True

@@ -11,19 +11,12 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 import bmesh
-from _blender_extension import registered
 from _blender_scenes import ball_splats
 
 from meshsplats import bind, orbit, psnr, render, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender.inside import exporting, objects, sources
 from meshsplats.conversion.recovery import recover_splats
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with registered() as module:
-        yield module
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
-from _blender_extension import registered
 from _blender_scenes import ball_splats
 
 from meshsplats import save_gaussians
@@ -24,12 +23,6 @@ CHANGES = (
     ("scene", "stage", {"lights": "studio"}),
     ("scene", "bake_light", {}),
 )
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with registered() as module:
-        yield module
 
 
 @pytest.fixture

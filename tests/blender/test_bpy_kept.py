@@ -9,17 +9,10 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 import bmesh
-from _blender_extension import registered
 from _blender_scenes import ball_splats
 
 from meshsplats import save_gaussians
 from meshsplats.blender.inside import objects, versions
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with registered() as module:
-        yield module
 
 
 @pytest.fixture

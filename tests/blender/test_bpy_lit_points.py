@@ -13,7 +13,6 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 if bpy.app.version < (5, 3, 0):
     pytest.skip("Blender draws splats since 5.3", allow_module_level=True)
 
-from _blender_extension import registered
 from _blender_scenes import ball_splats
 from _splat_points import splat_points
 
@@ -31,12 +30,6 @@ from meshsplats.blender.inside import (
 )
 from meshsplats.blender.inside import splat_points as reader
 from meshsplats.colors import linear_to_srgb
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with registered() as module:
-        yield module
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
-from _blender_extension import registered
 from _blender_scenes import ball_splats
 from mathutils import Matrix
 
@@ -35,12 +34,6 @@ from meshsplats.conversion import merging_views
 from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with registered() as module:
-        yield module
 
 
 @pytest.fixture

@@ -39,7 +39,7 @@ def state(scene: Any, obj: Any) -> str:
     parts: list[Any] = [_numbers(obj.matrix_world)]
     used: dict[str, Any] = {}
     for other in sorted(scene.objects, key=lambda other: other.name):
-        if _is_rendered(other) and other != obj and not (other.parent == obj and other.get(_STAND_IN)):
+        if is_rendered(other) and other != obj and not (other.parent == obj and other.get(_STAND_IN)):
             parts += _object(other, used)
     parts += [part for material in used.values() for part in _block(material)]
     if scene.world is not None:
@@ -65,7 +65,8 @@ def renewed(scene: Any, obj: Any) -> str:
     return latest(scene, obj)
 
 
-def _is_rendered(obj: Any) -> bool:
+def is_rendered(obj: Any) -> bool:
+    """Whether ``obj`` is in images: neither it nor all of its collections are hidden there."""
     return not obj.hide_render and not all(home.hide_render for home in obj.users_collection)
 
 
@@ -76,7 +77,7 @@ def _object(obj: Any, used: dict[str, Any]) -> list[Any]:
     if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
         parts: list[Any] = [obj.name, _numbers(obj.matrix_world)]
         for inner in obj.instance_collection.all_objects:
-            parts += _object(inner, used) if _is_rendered(inner) else []
+            parts += _object(inner, used) if is_rendered(inner) else []
         return parts
     if obj.type not in _SHAPES:
         return []
