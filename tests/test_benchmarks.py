@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from conftest import script
+from _local import script
 
 pytest.importorskip("resource", reason="the benchmarks measure memory as POSIX systems count it")
 

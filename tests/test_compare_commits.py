@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from conftest import script
+from _local import script
 
 tool = script("tools/compare_commits.py")
 

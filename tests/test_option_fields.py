@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
-from conftest import script
+from _local import script
 
 from meshsplats._options import (
     Advanced,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _gpu import need_gpu
-from conftest import shared_data
+from _local import shared_data
 
 import meshsplats as ms
 from meshsplats.cameras.framing import STRAY, UNSEEN, scene_bounds, warn_of_strays, warn_of_unseen

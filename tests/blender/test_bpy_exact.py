@@ -12,7 +12,7 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import cameras, random_mesh, sheets
-from conftest import shared_data
+from _local import shared_data
 
 from meshsplats import convert, load_gaussians, orbit, render
 from meshsplats.blender import SceneOptions, draw

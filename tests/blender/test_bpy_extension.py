@@ -20,7 +20,7 @@ from meshsplats.formats.splat_formats import splat_suffixes
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import ball_splats, random_mesh
-from conftest import SHARED, script
+from _local import SHARED, script
 
 from meshsplats import convert, load_mesh, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh

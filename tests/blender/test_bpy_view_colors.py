@@ -11,7 +11,7 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _eevee import draw_by_eevee
-from conftest import shared_data
+from _local import shared_data
 
 from meshsplats import convert, load_gaussians, orbit, render, save_mesh
 from meshsplats.blender import SceneOptions, draw

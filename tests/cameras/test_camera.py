@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _local import make_link
 from _splats import few_splats
-from conftest import make_link
 
 from meshsplats import _toml as toml
 from meshsplats._words import naming

@@ -10,8 +10,8 @@ import sys
 import numpy as np
 import pytest
 from _glb import read_glb
+from _local import make_link, words_of
 from _splats import few_splats
-from conftest import make_link, words_of
 from PIL import Image
 
 import meshsplats

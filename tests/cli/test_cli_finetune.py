@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _glb import read_glb
+from _local import words_of
 from _photographs import write_photographs
-from conftest import words_of
 from PIL import Image
 
 from meshsplats import _toml as toml

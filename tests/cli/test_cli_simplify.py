@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
+from _local import shared_data
 from _splats import few_splats
-from conftest import shared_data
 
 from meshsplats import _toml as toml
 from meshsplats import load_gaussians, orbit, save_cameras, save_gaussians, simplify

@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 

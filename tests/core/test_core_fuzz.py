@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 
 import pytest
-from conftest import script
+from _local import script
 
 fuzz_core = script("tests/fuzz/fuzz_core.py")
 

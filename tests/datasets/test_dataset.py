@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _datasets import save, simple_colmap, write_colmap
-from conftest import make_link, shared_data
+from _local import make_link, shared_data
 from PIL import Image
 
 import meshsplats as ms

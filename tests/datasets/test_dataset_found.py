@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _datasets import rotation, save, simple_colmap, write_colmap, write_json
-from conftest import make_link, shared_data
+from _local import make_link, shared_data
 from PIL import Image
 
 import meshsplats as ms

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 
 from meshsplats import GaussianCloud, SplatMesh, convert, load_gaussians, load_mesh, orbit, render, save_mesh
 from meshsplats._arrays import subsample

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 
 import meshsplats as ms
 from meshsplats import DataWarning, GaussianCloud

@@ -5,7 +5,7 @@ import stat
 import sys
 
 import pytest
-from conftest import make_link
+from _local import make_link
 
 from meshsplats._files.atomic import atomic_path, refuse_existing
 

@@ -9,7 +9,7 @@ import warnings
 
 import numpy as np
 import pytest
-from conftest import make_link, shared_data
+from _local import make_link, shared_data
 from PIL import Image
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, orbit, render, save_mesh

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from _glb import edit_glb
 from _gltf_meshes import TRIANGLE, gltf, instanced, skinned
+from _local import shared_data
 from _meshes import random_mesh
 from _splat_files import random_splats
-from conftest import shared_data
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
 from meshsplats.colors import linear_to_srgb

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _glb import edit_glb
+from _local import make_link
 from _meshes import fan_mesh, random_mesh
-from conftest import make_link
 from test_mesh_foreign import TRIANGLE, gltf
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh

@@ -14,11 +14,11 @@ import pytest
 from _glb import read_glb, write_glb
 from _gltf_meshes import TRIANGLE
 from _gltf_meshes import gltf as mesh_gltf
+from _local import shared_data
 from _meshes import assert_same, random_mesh
 from _splat_encoders import compressed_ply, dot_splat, splat_accessors, spz, streamed_sog
 from _splat_encoders import gltf as splat_gltf
 from _splat_files import random_splats, splat_table, write_ply
-from conftest import shared_data
 
 from meshsplats import (
     DataWarning,

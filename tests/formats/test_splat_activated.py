@@ -7,8 +7,8 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from _local import shared_data
 from _splat_files import random_splats, splat_table, write_ply
-from conftest import shared_data
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians, save_gaussians, stream_gaussians
 from meshsplats.cli import main

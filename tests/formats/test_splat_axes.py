@@ -7,9 +7,9 @@ import struct
 import _splat_encoders as encode
 import numpy as np
 import pytest
+from _local import shared_data
 from _splat_files import random_splats, splat_table, write_ply
 from _splats import harmonics_of_3dgs
-from conftest import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 

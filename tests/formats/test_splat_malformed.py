@@ -6,9 +6,9 @@ import os
 
 import numpy as np
 import pytest
+from _local import make_link
 from _splat_files import Table, random_splats, splat_table, write_ply
 from _splats import refused
-from conftest import make_link
 
 from meshsplats import FileFormatError, load_gaussians, load_mesh
 from meshsplats.formats.sniff import identify

@@ -7,8 +7,8 @@ import warnings
 
 import numpy as np
 import pytest
+from _local import shared_data
 from _splat_files import Table, assert_same_cloud, expected_cloud, random_splats, splat_table, write_ply
-from conftest import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 import pytest
 from _glb import read_glb, write_glb
-from conftest import shared_data
+from _local import shared_data
 
 import meshsplats as ms
 from meshsplats._geometry import rotation_rows

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import make_link
+from _local import make_link
 from PIL import Image
 
 import meshsplats as ms

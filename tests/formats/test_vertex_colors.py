@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _local import shared_data
 from _priors import CUBE, CUBE_FACES, bumpy, cube, rotation
-from conftest import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
 

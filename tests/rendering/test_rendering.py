@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _local import shared_data
 from _rendering import (
     EXTRAS,
     assert_close,
@@ -19,7 +20,6 @@ from _rendering import (
     soup,
     turned,
 )
-from conftest import shared_data
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 

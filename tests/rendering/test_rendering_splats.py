@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _local import shared_data
 from _rendering import (
     assert_close,
     assert_same_bits,
@@ -15,7 +16,6 @@ from _rendering import (
     splats,
     turned,
 )
-from conftest import shared_data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

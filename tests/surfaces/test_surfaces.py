@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from _glb import read_glb
+from _local import shared_data
 from _meshes import unit_ball
-from conftest import shared_data
 
 from meshsplats import (
     GaussianCloud,

@@ -8,8 +8,8 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
+from _local import script
 from _pages import cloud_fixture, mesh_fixture  # noqa: F401
-from conftest import script
 from test_controls import NO_WEBGPU
 
 from meshsplats.viewer.page import make_page

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 
 from meshsplats._geometry import quaternions_of
 from meshsplats.cameras.files import load_cameras, save_cameras

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import shared_data
+from _local import shared_data
 from test_finding_cameras import moved
 
 from meshsplats.cameras.framing import guess_up

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _gpu import assert_same_image, both, need_gpu
+from _local import shared_data
 from _rendering import EXTRAS, camera, fan, grid_faces, layers, soup, turned
-from conftest import shared_data
 
 from meshsplats import Camera, SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.errors import DeviceError

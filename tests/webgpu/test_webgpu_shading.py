@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _gpu import assert_same_image, both, need_gpu
+from _local import shared_data
 from _rendering import camera
-from conftest import shared_data
 from test_webgpu_render import random_fans
 
 from meshsplats import SplatMesh, convert, load_gaussians, orbit, render

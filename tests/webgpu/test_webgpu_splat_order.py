@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _gpu import assert_same_image, both, need_gpu
+from _local import shared_data
 from _rendering import EXTRAS, camera, layers, turned
-from conftest import shared_data
 from test_splat_order import SCENES, crossed, view_of
 from test_webgpu_gradients import CPU, GPU, bits, descend, large_fan, of_mesh, random_gradient, renderer_of
 from test_webgpu_gradients import assert_same_gradients as assert_same_gradients_of
