@@ -18,7 +18,7 @@ from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints import standing
-from meshsplats.viewpoints.finding import find_cameras, first_impression, unusual_up
+from meshsplats.viewpoints.finding import BY_COARSENESS, find_cameras, first_impression, unusual_up
 from meshsplats.viewpoints.standing import (
     STOOD,
     UPS,
@@ -174,6 +174,22 @@ def test_cameras_and_info_say_how_it_stands():
     assert find_cameras(chair(), 4, up=USUAL).up.tolist() == USUAL
     assert unusual_up(replace(chair(), up=np.array(USUAL))) is None
     assert unusual_up(upright(chair())) is None
+
+
+@pytest.mark.parametrize("up", range(1, len(UPS)))
+def test_what_shows_its_coarse_side_was_photographed_another_way_up(up):
+    """A cube stands on any side; the one that lay on the ground is coarse."""
+    box = boxes(((0, 0, 0), (0.4, 0.4, 0.4)))
+    height = box.means @ np.array(UPS[up])
+    below = height < 0.9 * height.min()
+    box = replace(box, scales=box.scales * np.where(below, 5, 1)[:, None].astype(np.float32))
+    assert not tips_over(box)
+    found = find_cameras(box, 3)
+    assert (found.kind, found.up.tolist(), found.up_confidence) == ("object", list(UPS[up]), standing.SEEN)
+    told = unusual_up(box)
+    assert told is not None
+    assert (told.up.tolist(), told.reason) == (list(UPS[up]), BY_COARSENESS)
+    assert find_cameras(box, 3, up=USUAL).kind == "ring"
 
 
 class Telling(SceneReading):

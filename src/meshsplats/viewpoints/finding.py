@@ -35,7 +35,7 @@ from meshsplats.viewpoints.kind import (
 from meshsplats.viewpoints.relief import Relief, find_relief
 from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
-from meshsplats.viewpoints.standing import find_stance, tips_over
+from meshsplats.viewpoints.standing import SEEN, find_stance, finer_stance, tips_over
 from meshsplats.viewpoints.upright import find_upright
 from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, Checked, choose_views
 
@@ -57,6 +57,7 @@ WIDER = 1.5
 """...and how much more it shows, at most, than the view that it is a variation of: a narrow view is one
 because there is noise around it."""
 BY_STANCE = "as the object stands (likely): with the usual -y it would tip over"
+BY_COARSENESS = "as the object was photographed (likely): with the usual -y its coarse side is above"
 BY_FLOORS = "as floors or ground are level (likely)"
 """What shows another way up than the usual one."""
 
@@ -248,12 +249,13 @@ def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> UnusualUp | 
         return None
     given, usual = _told_up(cloud, None)
     few = len(cloud) < FEWEST_OF_PLACE
-    if not tips_over(cloud) and (few or surely_object(cloud, usual, threads)):
+    if not tips_over(cloud) and surely_object(cloud, usual, threads):
         return None
     outside = _from_outside(cloud, _key(cloud, given), usual, threads)
     if outside.kind == "object":
         stands = outside.up_confidence > 0 and not np.array_equal(outside.up, usual)
-        return UnusualUp(outside.up, BY_STANCE) if stands else None
+        reason = BY_STANCE if tips_over(cloud) else BY_COARSENESS
+        return UnusualUp(outside.up, reason) if stands else None
     # A landscape is flat the usual way up, and its ground may slope.
     if outside.kind in ("relief", "aerial") or few or not cloud.opacities.any():
         return None
@@ -299,6 +301,10 @@ def _from_outside(cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int 
         kind, confidence = ("relief", relief.confidence) if relief else kind_from_outside(cloud, up, threads)
         if kind == "object" and key[1] is None:
             up, sure = find_stance(cloud, threads) if len(cloud) >= FEWEST else (up, 0.0)
+        if kind is None and key[1] is None and (stance := finer_stance(cloud, threads)) is not None:
+            as_it_stands, surer = kind_from_outside(cloud, stance, threads)
+            if as_it_stands == "object":
+                kind, confidence, up, sure = as_it_stands, surer, stance, SEEN
         seen = _Outside(relief, kind, confidence, up, sure)
         known = _outsides[cloud] = key, seen
     return known[1]

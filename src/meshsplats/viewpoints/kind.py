@@ -68,13 +68,18 @@ def _fineness(cloud: GaussianCloud, coarse: float, cameras: Sequence[Camera], th
 
 
 def surely_object(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> bool:
-    """Whether a glance at few splats, each wider as it stands for others, says that a scene is an object."""
+    """Whether a glance at few splats says that a scene is an object."""
     if _is_landscape(cloud, up):
         return False
+    return glance(cloud, up, threads) >= SURELY_FINE
+
+
+def glance(cloud: GaussianCloud, up: np.ndarray, threads: int | None = None) -> float:
+    """``fineness_outside`` of few of the splats, each wider as it stands for others."""
     few = subsample_of(cloud, FEW_SPLATS)
     wider = (len(cloud) / len(few)) ** 0.5
     few = replace(few, scales=few.scales * np.float32(wider))
-    return _fineness(few, wider * _coarse(len(cloud)), _dome(cloud, up), threads) >= SURELY_FINE
+    return _fineness(few, wider * _coarse(len(cloud)), _dome(cloud, up), threads)
 
 
 def _is_landscape(cloud: GaussianCloud, up: np.ndarray) -> bool:

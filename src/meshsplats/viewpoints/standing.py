@@ -12,7 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, Bounds, scene_bounds
 from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.viewpoints.kind import subsample_of
+from meshsplats.viewpoints.kind import FINE, fineness_outside, glance, subsample_of
 from meshsplats.viewpoints.sample import AllSplats, fibonacci
 from meshsplats.viewpoints.thinning import without_harmonics
 
@@ -44,6 +44,10 @@ object to one side, share of its variance that this explains, and cosine to a di
 ALONE = 0.5
 """Greatest growth of that logarithm from above to the sides, as a share of that from the sides to below: of
 what was seen from its front alone, splats grow all the way to its back."""
+CLEARLY = 0.03
+"""How much finer an object is from around it, at least, the way up that it was photographed."""
+NEARLY = 0.05
+"""What a glance at few splats may be wrong by."""
 SEEN, STOOD, AS_USUAL = 0.5, 0.4, 0.4
 """How sure up is if coarse splats and the base tell it, if the base alone does, and if the usual way up has
 a wide base."""
@@ -127,6 +131,17 @@ def find_stance(cloud: GaussianCloud, threads: int | None = None) -> tuple[np.nd
         np.array(up) for up, base in zip(UPS[1:], others, strict=True) if base.firm and base.height >= TALL
     ]
     return (firm[0], STOOD) if len(firm) == 1 else (usual, 0.0)
+
+
+def finer_stance(cloud: GaussianCloud, threads: int | None = None) -> np.ndarray | None:
+    """(3,) that of ``UPS`` with which a scene is an object that is none the usual way up: upside down or
+    lying, it shows the coarse side that nobody photographed. None where there is none."""
+    usual, *others = (glance(cloud, np.array(up), threads) for up in UPS)
+    best = int(np.argmax(others))
+    if others[best] < max(usual + CLEARLY, FINE - NEARLY):
+        return None
+    up = np.array(UPS[1 + best])
+    return up if fineness_outside(cloud, up, threads) >= FINE else None
 
 
 def _told_by(bounds: Bounds) -> bool:
