@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from types import ModuleType
 
@@ -13,5 +14,8 @@ def extension() -> Iterator[ModuleType]:
     """The extension, registered while the tests of a file run."""
     from _blender_extension import registered
 
-    with registered() as module:
+    from meshsplats.blender.inside import light_state
+
+    with registered() as module, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(light_state, "_LONG", math.inf)  # the panel asks at once, on busy machines too
         yield module

@@ -24,7 +24,7 @@ _WHOLE = 300_000
 _SOME = 500
 _LIT = "meshsplats_lit"
 _LONG = 0.02
-"""Seconds: what takes as long delays the window."""
+"""Processor seconds: what takes as long delays the window."""
 _REST = 30
 """After which multiple of its time a state that takes long is looked for again."""
 _STAND_IN = "meshsplats_stand_in"
@@ -49,12 +49,12 @@ def state(scene: Any, obj: Any) -> str:
 
 def latest(scene: Any, obj: Any) -> str:
     """``state``, for the panel, which asks whenever it is drawn: of a large scene, now and then."""
-    key, now = (scene.name, obj.name), time.monotonic()
+    key, now, begun = (scene.name, obj.name), time.monotonic(), time.thread_time()
     when, took, found = _known.get(key, (0.0, 0.0, ""))
     if took > _LONG and now - when < _REST * took:
         return found
     found = state(scene, obj)
-    took = time.monotonic() - now
+    took = time.thread_time() - begun
     _known[key] = (now, took, found)
     return found
 
