@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
-from meshsplats._kinds import need_numbers
+from meshsplats._kinds import need, need_numbers
 from meshsplats.choices import MAX_SIDE
 
 NEAR_SHARE = 0.002
@@ -24,6 +24,8 @@ MAX_SKEW = 1e-2
 """How far a rotation may be from orthonormal; less than that is taken for rounding."""
 OPENGL = np.array([1.0, -1.0, -1.0])
 """Turns OpenGL's y and z axes, up and backwards, to those of OpenCV, and back."""
+_MAX_NAME = 1000
+"""Length of a name that camera files may have."""
 
 
 def checked_side(name: str, value: Any) -> int:
@@ -41,6 +43,8 @@ class Camera:
     Concretely, a world point p is at ``X = world_to_camera[:3, :3] @ p + world_to_camera[:3, 3]`` in the
     camera's frame and in the image at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the
     top left corner; the centre of pixel (row, col) is at (col + 0.5, row + 0.5).
+
+    The matrix is copied: what is written into the caller's array later does not move the camera.
     """
 
     world_to_camera: np.ndarray
@@ -60,6 +64,7 @@ class Camera:
     """Depth z of the near plane, scene units: nothing nearer is drawn. None: a small share of the distance to
     the scene, ``with_near_plane``."""
     name: str = ""
+    """Up to 1,000 characters."""
 
     def __post_init__(self) -> None:
         matrix = checked_array("world_to_camera", self.world_to_camera, np.float64, (4, 4))
@@ -73,7 +78,7 @@ class Camera:
             )
         if np.linalg.det(rotation) < 0:
             raise ValueError("world_to_camera must not mirror: its rotation has determinant -1")
-        object.__setattr__(self, "world_to_camera", matrix)
+        object.__setattr__(self, "world_to_camera", matrix.copy())
         for name in ("fx", "fy", "near"):
             if name == "near" and self.near is None:
                 continue
@@ -88,6 +93,9 @@ class Camera:
             object.__setattr__(self, name, value)
         for name in ("width", "height"):
             object.__setattr__(self, name, checked_side(name, getattr(self, name)))
+        need(str, name=self.name)
+        if len(self.name) > _MAX_NAME:
+            raise ValueError(f"name must have up to {_MAX_NAME:,} characters, got {len(self.name):,}")
 
     @property
     def center(self) -> np.ndarray:
@@ -163,8 +171,12 @@ class Camera:
             (n, 2) x and y in pixels from the image's top left corner, NaN for points that are not beyond the
             near plane, or not in front of a camera without one; and (n,) depth z in the camera's frame. Both
             are float32 for float32 points, else float64.
+
+        Raises ValueError for points of another shape; ``point[None]`` are those of a single one.
         """
         points = np.asarray(points)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points must have shape (n, 3), got {points.shape}")
         if points.dtype != np.float32:
             points = points.astype(np.float64, copy=False)
         matrix = self.world_to_camera.astype(points.dtype, copy=False)

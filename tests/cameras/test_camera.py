@@ -424,6 +424,27 @@ def test_projection_worked_out_by_hand():
     np.testing.assert_array_equal(camera.in_image(positions), [True, False, False])
 
 
+def test_points_of_another_shape_are_refused():
+    camera = Camera(np.eye(4), 10, 10, 8, 8, 16, 16)
+    for shape in ((3,), (4, 2), (1, 2, 3)):
+        with pytest.raises(ValueError, match=r"points must have shape \(n, 3\)"):
+            camera.project(np.ones(shape))
+
+
+def test_an_array_that_is_changed_later_does_not_move_the_camera():
+    pose = np.eye(4)
+    camera = Camera(pose, 10, 10, 8, 8, 16, 16)
+    pose[2, 3] = 5
+    np.testing.assert_array_equal(camera.world_to_camera, np.eye(4))
+
+
+def test_names_that_no_camera_file_may_have_are_refused():
+    with pytest.raises(TypeError, match="name must be a str, got 3, an int"):
+        Camera(np.eye(4), 10, 10, 8, 8, 16, 16, name=3)
+    with pytest.raises(ValueError, match="name must have up to 1,000 characters, got 1,001"):
+        Camera(np.eye(4), 10, 10, 8, 8, 16, 16, name="n" * 1001)
+
+
 def test_sees_what_projects_into_the_image():
     """Focal length 10, 40 x 20 pixels, principal point (15, 10), near 1: at depth 2, x from -3 to 5 and y
     from -2 to 2."""
