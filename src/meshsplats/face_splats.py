@@ -13,6 +13,16 @@ _OPEN = 1e-10
 """Share of the identity in the moments of a splat's motion."""
 
 
+def check_ascending(face_splat: np.ndarray | None) -> None:
+    """Raises ValueError unless ``face_splat`` (f,) are indices of splats, ascending, or None."""
+    if (
+        face_splat is not None
+        and len(face_splat)
+        and (face_splat[0] < 0 or (face_splat[1:] < face_splat[:-1]).any())
+    ):
+        raise ValueError("face_splat must be ascending indices >= 0")
+
+
 @dataclass(frozen=True, eq=False)
 class FaceSplats:
     """The splats of a mesh, counted 0 to s - 1 in the order of their triangles, which lie side by side.

@@ -13,7 +13,7 @@ from meshsplats._arrays import checked_array, chosen_rows
 from meshsplats._kinds import need_all, need_choice
 from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
-from meshsplats.face_splats import FaceSplats
+from meshsplats.face_splats import FaceSplats, check_ascending
 from meshsplats.mesh_joining import joined_meshes
 from meshsplats.order import Order, checked_order
 from meshsplats.spherical_harmonics import TERMS, degree_of, turned_harmonics
@@ -140,7 +140,7 @@ class SplatMesh:
             object.__setattr__(self, name, value)
 
         set_("origin", checked_array("origin", self.origin, np.float64, (3,)))
-        self._check_ascending()
+        check_ascending(self.face_splat)
         group = self.depth_group
         if group is not None and f and group.min() < -1:
             raise ValueError(f"depth_group must be >= 0, or -1 for none, got {group.min()}")
@@ -168,16 +168,11 @@ class SplatMesh:
             if (face != face[:, :1]).any():
                 raise ValueError("all corners of a triangle must be bound to one face of the base")
 
-    def _check_ascending(self) -> None:
-        splat = self.face_splat
-        if splat is not None and len(splat) and (splat[0] < 0 or (splat[1:] < splat[:-1]).any()):
-            raise ValueError("face_splat must be ascending indices >= 0")
-
     def count_splats(self, name: str) -> int:
         """Count of splats, for the array ``name`` that has a row for each. ValueError without splats."""
         if self.face_splat is None:
             raise ValueError(f"{name} has a row for each splat: give face_splat, too")
-        self._check_ascending()
+        check_ascending(self.face_splat)
         return len(self.splats)
 
     def _check_harmonics(self, harmonics: np.ndarray) -> None:

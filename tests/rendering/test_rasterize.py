@@ -358,6 +358,28 @@ def test_vertices_changed_in_place():
         total.backward()
 
 
+def test_indices_and_arrays_that_change_before_the_backward_pass_are_those_of_the_image():
+    mesh, view = soup(14), camera()
+    colors = torch.from_numpy(mesh.colors)
+
+    def gradient(change) -> torch.Tensor:
+        points = torch.from_numpy(mesh.vertices).clone().requires_grad_()
+        faces, splat = torch.from_numpy(mesh.faces).clone(), np.arange(len(mesh.faces), dtype=np.int32)
+        group, background = np.full(len(mesh.faces), -1, np.int32), np.zeros(3, np.float32)
+        options = {"face_splat": splat, "depth_group": group, "background": background, "order": "splat"}
+        total = rasterize(points, faces, colors, view, **options).color.square().sum()
+        if change:
+            faces.copy_(faces.flip(0))
+            splat[:], group[:], background[:] = 0, 0, 1
+        total.backward()
+        return points.grad
+
+    assert torch.equal(gradient(True), gradient(False))
+
+
+META = torch.zeros(1, 3, dtype=torch.int32, device="meta")
+
+
 def test_empty_mesh():
     points, colors = torch.zeros(0, 3, requires_grad=True), torch.zeros(0, 4, requires_grad=True)
     image = rasterize(points, np.zeros((0, 3), np.int32), colors, camera(), background=(0.5, 0.25, 0))
@@ -382,6 +404,15 @@ def test_empty_mesh():
         ({"background": (np.nan, 0, 0)}, "background must be finite"),
         ({"world_to_camera": torch.eye(3)[None]}, "world_to_camera must have shape"),
         ({"world_to_camera": torch.full((1, 4, 4), torch.nan)}, "world_to_camera must be finite"),
+        ({"world_to_camera": torch.zeros(1, 4, 4)}, "number 0 flattens space"),
+        (
+            {"face_splat": np.array([1, 0]), "faces": np.array([[0, 1, 2]] * 2)},
+            "face_splat must be ascending",
+        ),
+        ({"faces": META}, r"faces must be on the CPU, got a tensor on meta: give faces\.cpu\(\)"),
+        ({"face_splat": META}, "face_splat must be on the CPU"),
+        ({"background": META}, "background must be on the CPU"),
+        ({"world_to_camera": torch.zeros(1, 4, 4, device="meta")}, "world_to_camera must be on the CPU"),
         ({"cameras": []}, "at least one camera"),
         ({"cameras": [camera(4, 4), camera(4, 5)]}, "one size"),
         ({"samples": 0}, "samples"),

@@ -66,6 +66,10 @@ def rasterize(
     ``render(device="gpu")``. Tensors stay on the CPU. The tape of the last image stays on the GPU; the
     backward pass renders others once more. Results have the same bits in every run on one device.
 
+    Values are not checked: where some are NaN, triangles are left out, so an image may be finite although all
+    positions are NaN. Tensors must not be changed between the forward and the backward pass, which torch
+    checks for; indices and NumPy arrays are copied.
+
     Args:
         vertices: (v, 3) float32 world positions.
         faces: (f, 3) int32 vertex indices.
@@ -88,8 +92,9 @@ def rasterize(
         device: 'cpu' or 'gpu'.
 
     Raises:
-        ValueError: tensors of other types, shapes or devices; faces with indices of missing vertices; options
-            out of range; a filter without ``face_splat``, or for splats that share vertices.
+        ValueError: tensors of other types, shapes or devices; faces with indices of missing vertices; a
+            ``face_splat`` that does not ascend; a singular pose; options out of range; a filter without
+            ``face_splat``, or for splats that share vertices.
         RuntimeError: from torch, for a second derivative.
         MissingDependencyError: no GPU, or no library for it.
         DeviceError: the GPU failed, or did not finish.

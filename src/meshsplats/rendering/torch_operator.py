@@ -11,7 +11,7 @@ import numpy as np
 from meshsplats._kinds import described
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
-from meshsplats.face_splats import FaceSplats
+from meshsplats.face_splats import FaceSplats, check_ascending
 from meshsplats.mesh import Triangles
 from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
@@ -49,6 +49,8 @@ class Optional(NamedTuple):
 
 
 _NOTHING = np.zeros((0, 0), np.float32)
+_MOST_STRETCH = 1e12
+"""Condition number from which on a pose flattens space."""
 
 
 class _Constant(NamedTuple):
@@ -93,10 +95,10 @@ def images_of(
             raise ValueError(
                 f"world_to_camera must have shape ({len(views)}, 4, 4), got {tuple(poses.shape)}"
             )
-        if not bool(torch.isfinite(poses).all()):
-            raise ValueError("world_to_camera must be finite")
+        _check_poses(poses)
     faces = _faces(scene.faces, len(vertices))
     face_splat = _per_face("face_splat", scene.face_splat, len(faces))
+    check_ascending(face_splat)
     if harmonics is not None:
         _check_harmonics(harmonics, FaceSplats(faces, face_splat, len(vertices)))
     constant = _Constant(
@@ -251,6 +253,24 @@ def _check(name: str, tensor: torch.Tensor, shape: str, fits: Callable[[torch.Si
         )
 
 
+def _need_cpu(name: str, value: object) -> None:
+    if isinstance(value, torch.Tensor) and value.device.type != "cpu":
+        raise ValueError(f"{name} must be on the CPU, got a tensor on {value.device}: give {name}.cpu()")
+
+
+def _check_poses(poses: torch.Tensor) -> None:
+    _need_cpu("world_to_camera", poses)
+    linear = poses.detach()[:, :3, :3].double().numpy()
+    if not bool(torch.isfinite(poses).all()):
+        raise ValueError("world_to_camera must be finite")
+    singular = np.linalg.cond(linear) > _MOST_STRETCH
+    if singular.any():
+        raise ValueError(
+            f"world_to_camera must be rotations with a shift, number {int(singular.argmax())} flattens space"
+            " (a singular matrix)"
+        )
+
+
 def _check_harmonics(harmonics: torch.Tensor, splats: FaceSplats) -> None:
     if splats.face_splat is None:
         raise ValueError("harmonics are of splats: give face_splat, too")
@@ -269,8 +289,15 @@ def _array(tensor: torch.Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
+def _indices(name: str, indices: torch.Tensor | np.ndarray) -> np.ndarray:
+    """A copy, C-contiguous: the backward pass reads the indices again, and theirs may have changed by then.
+    It takes a hundredth of the time of an image."""
+    _need_cpu(name, indices)
+    return np.array(indices.numpy() if isinstance(indices, torch.Tensor) else indices, order="C")
+
+
 def _faces(faces: torch.Tensor | np.ndarray, vertices: int) -> np.ndarray:
-    array = np.ascontiguousarray(faces.numpy() if isinstance(faces, torch.Tensor) else faces)
+    array = _indices("faces", faces)
     if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"faces must be (f, 3) int32, got {array.shape} {array.dtype}")
     if len(array) and (array.min() < 0 or array.max() >= vertices):
@@ -283,7 +310,7 @@ def _faces(faces: torch.Tensor | np.ndarray, vertices: int) -> np.ndarray:
 def _per_face(name: str, indices: torch.Tensor | np.ndarray | None, faces: int) -> np.ndarray | None:
     if indices is None:
         return None
-    array = np.ascontiguousarray(indices.numpy() if isinstance(indices, torch.Tensor) else indices)
+    array = _indices(name, indices)
     if array.shape != (faces,) or not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"{name} must be ({faces},) int32, got {array.shape} {array.dtype}")
     return array.astype(np.int32, copy=False)
@@ -292,10 +319,12 @@ def _per_face(name: str, indices: torch.Tensor | np.ndarray | None, faces: int) 
 def _background(
     background: Sequence[float] | np.ndarray | torch.Tensor, count: int, size: tuple[int, int]
 ) -> torch.Tensor:
+    _need_cpu("background", background)
+    # An array is copied as indices are; torch itself checks a tensor.
     tensor = (
         background
         if isinstance(background, torch.Tensor)
-        else torch.as_tensor(np.asarray(background, np.float32))
+        else torch.from_numpy(np.array(background, np.float32))
     )
     if tuple(tensor.shape) not in ((3,), (*size, 3), (count, *size, 3)):
         raise ValueError(
