@@ -4,7 +4,8 @@
     python benchmarks/viewers/alpha.py SPLATS [SPLATS ...] --node-folder FOLDER [--max-triangles N]
 
 PSNR of the stock loader's images from an orbit, on white, means over views: first against the sorted image of
-the same mesh at 2 x 2 samples a pixel, then against the splats at degree 0, look 'area'. Beside them the
+the same mesh at 2 x 2 samples a pixel, then against the splats at degree 0, look 'area', then against the
+sorted image, both averaged over areas of 4 x 4 pixels. Beside them the
 figures of `viewer_images`, from which the choice is made, and the choice's share of the processor time of a
 conversion with it.
 """
@@ -23,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
 from _common import Report, Stopwatch, areas, arguments, images, mean_psnr
 
 import meshsplats as ms
-from meshsplats.evaluation.viewers import choose_alpha
+from meshsplats.evaluation.viewers import area_means, choose_alpha
 from meshsplats.rendering.viewers import viewer_images
 
 
@@ -83,7 +84,8 @@ def measure(path: Path, args: argparse.Namespace, folder: Path) -> list[str]:
     cells = [path.stem if path.is_file() else path.name, f"{len(mesh.faces):,}"]
     for name in ("blend", "mask", "default"):
         shown = drawn_images(folder / name, len(cameras))
-        cells.append(f"{mean_psnr(shown, sorted_):.1f} / {mean_psnr(shown, truths):.1f}")
+        far = mean_psnr([*map(area_means, shown)], [*map(area_means, sorted_)])
+        cells.append(f"{mean_psnr(shown, sorted_):.1f} / {mean_psnr(shown, truths):.1f} / {far:.1f}")
     cells.append(choice.alpha + (f" {choice.cutoff:g}" if choice.alpha == "mask" else ""))
     ways = zip(*simulated, strict=True)
     cells.append(" / ".join(f"{mean_psnr(shown, sorted_):.1f}" for shown in ways))

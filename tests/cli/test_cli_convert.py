@@ -413,8 +413,8 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     chosen = next(line for line in lines if line.startswith("alpha: "))
     figures = re.fullmatch(
-        r"alpha: mask with cutoff (0\.\d), (.*) dB from the sorted image in viewers that do not sort;"
-        r" blend: (.*) dB \(--alpha blend for ray tracers and Blender's own importer\)",
+        r"alpha: mask with cutoff (0\.\d), (.*) dB from the sorted image in viewers that do not sort,"
+        r" seen from afar; blend: (.*) dB \(--alpha blend for ray tracers and Blender's own importer\)",
         chosen,
     )
     assert figures is not None
