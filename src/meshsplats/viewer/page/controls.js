@@ -2,6 +2,8 @@
 
 const STEP = 0.05; // radians of an arrow key
 const ZOOM = 0.85; // of a press of +
+// controls that arrows and Home move
+const WITH_ARROWS = "[type=radio], [type=range], [role=slider]", MOVES = /^(Arrow|Home)/;
 
 export function connect(stage, pilot, least) {
   const touches = new Map(), keys = new Set();
@@ -58,10 +60,17 @@ export function connect(stage, pilot, least) {
     Home: "home", "[": "previous", "]": "next", 1: "mesh", 2: "both", 3: "splats", 4: "surface",
     b: "blended", o: "opaque", x: "wireframe", h: "plain",
   };
+  // A list takes letters for itself: one that was used by mouse or touch gives the keys back to the scene.
+  let pressed = null;
+  document.addEventListener("pointerdown", event => { pressed = event.target; }, true);
+  document.addEventListener("change", event => {
+    if (event.target === pressed && pressed.matches("select")) stage.focus({ preventScroll: true });
+  });
   document.addEventListener("keydown", event => {
+    pressed = null;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target.closest("input, select, textarea, summary, button, a, [role=slider]")) return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (event.target.matches("select") || event.target.matches(WITH_ARROWS) && MOVES.test(key)) return;
     const { view } = pilot;
     if (once[key]) {
       if (!event.repeat) pilot.command(once[key]);
