@@ -235,6 +235,47 @@ def test_a_double_click_centres_what_is_there(page, mesh, cameras):
     assert np.linalg.norm(rays - along[:, None] * after[1], axis=1).min() < 0.02
 
 
+def test_a_double_click_centres_nothing_that_is_cropped_away(page):
+    page.choose("#crop-y0", "199")
+    before = pose(page)
+    page.run(
+        "document.querySelector('#stage').dispatchEvent(new MouseEvent('dblclick',"
+        " {clientX: 70, clientY: 90, bubbles: true}))"
+    )
+    after = pose(page)
+    assert moved(before, after) == 0
+
+
+def test_keys_work_after_a_control_was_used(page):
+    """But for those that the control uses itself."""
+
+    def style() -> str:
+        return page.run("document.querySelector('[name=style]:checked').value")
+
+    page.run("document.body.classList.remove('plain'); document.querySelector('#toggle').click()")
+    for selector in ("#home", "[name=content][value=both]", "#exposure", "#fly", "#help summary"):
+        page.run(f"document.querySelector({selector!r}).focus()")
+        assert page.run(f"document.activeElement.matches({selector!r})")
+        for key, chosen in (("x", "wireframe"), ("b", "blended")):
+            page.key(key)
+            assert style() == chosen, selector
+    page.run("document.querySelector('#exposure').focus()")
+    before = pose(page)
+    page.key("ArrowRight")
+    page.key("Home")
+    page.run("document.querySelector('#cameras').focus()")
+    page.key("x")
+    assert style() == "blended"
+    assert moved(before, pose(page)) == 0
+    page.run(  # the list by mouse
+        "(list => { list.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}));"
+        " list.dispatchEvent(new Event('change', {bubbles: true})); })(document.querySelector('#cameras'))"
+    )
+    page.key("x")
+    assert style() == "wireframe"
+    page.run("document.querySelector('#toggle').click()")
+
+
 @pytest.mark.slow
 def test_cameras_by_list_buttons_and_keys(page, cameras):
     assert page.run("[...document.querySelectorAll('#cameras option')].map(o => o.textContent)") == [
@@ -427,6 +468,28 @@ def test_the_crop_box_hides_what_is_outside_and_shows_its_edges(page, mesh):
     page.still(PATIENCE)
     assert np.array_equal(page.screenshot(), whole)
     assert page.text("#cropText") == ""
+
+
+def test_the_crop_line_is_that_of_the_commands(browser, write_page):
+    """In the coordinates of the world, and without a bound where a slider is at its end."""
+    cloud = make_scene(300)
+    means = cloud.means.copy()
+    means[0] = means.max(axis=0) + np.array([90, 0, 90])  # far beyond the sliders' ends
+    cloud = replace(cloud, means=means, origin=np.array([500_000.0, 4_500_000.0, 100.0]))
+    address = write_page(ms.convert(cloud), "crop-line", splats=cloud)
+    page = open_page(browser, address)
+    for end, mark in ((0, "60"), (1, "150")):
+        page.choose(f"#crop-y{end}", mark)
+        page.still(PATIENCE)
+        option, *box = page.text("#cropText").split()
+        assert option == "--crop"
+        left = len(cropped(cloud, [float(number) for number in box]))
+        assert 0 < left < len(cloud)
+        assert page.statistics()["splats"] == f"{left} of {len(cloud)}"
+    assert page.run("document.querySelector('#crop-x0').getAttribute('aria-valuetext')") == "no bound"
+    assert float(page.run("document.querySelector('#crop-y0').getAttribute('aria-valuetext')")) > 4_499_000
+    assert float(page.statistics()["position"].split()[0]) > 499_000
+    page.close()
 
 
 # ---- The page around the image

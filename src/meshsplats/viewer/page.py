@@ -132,6 +132,7 @@ def make_page(
         "up": up.tolist(),
         "center": bounds.center.tolist(),
         "radius": bounds.radius,
+        "origin": mesh.origin.tolist(),
         "extent": _extent(mesh),
         "cameras": [_described(camera) for camera in views],
         "triangles": {"fine": len(mesh.faces)} | ({} if coarse is None else {"coarse": len(coarse.faces)}),

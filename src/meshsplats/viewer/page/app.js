@@ -198,7 +198,7 @@ class App {
   // Centres the nearest visible vertex at a point of the stage, in CSS pixels.
   pick(x, y) {
     const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight), { mesh } = this;
-    const found = nearestVertex(mesh, pinhole, x, y, PICK);
+    const found = nearestVertex(mesh, this.kept?.[this.resting].triangles, pinhole, x, y, PICK);
     if (!found) return;
     const target = this.view.copy();
     target.distance = found.depth;
@@ -261,7 +261,7 @@ class App {
       this.changed();
       this.#refine();
     });
-    this.crop = new CropBox(settings.extent, this.levels, this.splats, kept => {
+    this.crop = new CropBox(settings, this.levels, this.splats, kept => {
       this.kept = kept;
       this.cropped = true; // the renderers hear of it before the next frame, never within one
       this.changed();

@@ -110,12 +110,21 @@ export function project(pinhole, point) {
   return [pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy, z];
 }
 
+// Coordinates of a point in the world, as text: decimals as fine as `step`.
+export function inWorld(point, origin, step) {
+  const digits = Math.min(100, Math.max(0, Math.ceil(-Math.log10(step))));
+  return point.map((value, k) => String(Number((origin[k] + value).toFixed(digits))));
+}
+
 // The nearest vertex of a mesh, {point, depth}, that is not nearly transparent and lies within `reach` pixels
-// of a point of the image.
-export function nearestVertex({ vertices, colors }, pinhole, x, y, reach) {
+// of a point of the image; where the mesh is cropped, of the `triangles` that are left.
+export function nearestVertex({ vertices, colors, faces }, triangles, pinhole, x, y, reach) {
   const { rows: [a, b, c], fx, fy, cx, cy } = pinhole;
+  const left = triangles && new Uint8Array(vertices.length / 3);
+  for (const t of triangles ?? []) for (const v of faces.subarray(3 * t, 3 * t + 3)) left[v] = 1;
   let depth = Infinity, found = -1;
   for (let v = 0, i = 0; v < vertices.length / 3; v++, i += 3) {
+    if (left && !left[v]) continue;
     const X = vertices[i], Y = vertices[i + 1], Z = vertices[i + 2];
     const z = c[0] * X + c[1] * Y + c[2] * Z + c[3];
     if (!(z > pinhole.near) || z >= depth || colors[4 * v + 3] < 0.2) continue;

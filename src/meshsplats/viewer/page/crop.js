@@ -1,14 +1,16 @@
 // The crop box: which fans, triangles and splats have their centres in it, its sliders and its outline.
 
-import { project } from "./camera.js";
+import { inWorld, project } from "./camera.js";
 
 const STEPS = 200;
+const UNBOUNDED = "1e39"; // farther away than float32 reaches; commands take no infinity
 
 export class CropBox {
-  // extent: [[x, y, z], [x, y, z]], where the sliders end. levels: meshes by name, to which others may be
-  // added later, followed by `again`. changed(kept) as in SortedRenderer.crop.
-  constructor(extent, levels, splats, changed) {
-    Object.assign(this, { extent, levels, splats, changed });
+  // settings: extent, [[x, y, z], [x, y, z]], where the sliders end; origin, [x, y, z] in the world, to which
+  // the scene is relative. levels: meshes by name, to which others may be added later, followed by `again`.
+  // changed(kept) as in SortedRenderer.crop.
+  constructor({ extent, origin }, levels, splats, changed) {
+    Object.assign(this, { extent, origin, levels, splats, changed });
     this.marks = [[0, 0, 0], [STEPS, STEPS, STEPS]];
     this.inputs = [];
     const grid = document.querySelector("#crop .six");
@@ -57,11 +59,19 @@ export class CropBox {
     this.changed(this.active ? this.#kept() : null);
   }
 
+  // Of one end of an axis: whether its slider is at its end, where it does not bound the scene.
+  #free(end, axis) { return this.marks[end][axis] === end * STEPS; }
+
+  // Says where the box ends, to a hundredth of a slider's step.
   #tell() {
-    const numbers = this.corners.flat().map(value => Number(value.toPrecision(4)));
-    this.inputs.forEach((input, i) => input.setAttribute(
-      "aria-valuetext", String(numbers[(i % 2) * 3 + (i >> 1)])));
-    document.getElementById("cropText").textContent = this.active ? `--crop ${numbers.join(" ")}` : "";
+    const [low, high] = this.extent, step = Math.max(...low.map((value, k) => high[k] - value)) / STEPS;
+    const numbers = this.corners.map(corner => inWorld(corner, this.origin, step / 100));
+    this.inputs.forEach((input, i) => input.setAttribute("aria-valuetext",
+      this.#free(i % 2, i >> 1) ? "no bound" : numbers[i % 2][i >> 1]));
+    const bounds = numbers.map((corner, end) =>
+      corner.map((number, k) => this.#free(end, k) ? (end ? "" : "-") + UNBOUNDED : number));
+    document.getElementById("cropText").textContent =
+      this.active ? `--crop ${bounds.flat().join(" ")}` : "";
   }
 
   #kept() {
@@ -74,11 +84,11 @@ export class CropBox {
     return kept;
   }
 
-  // Indices of the points (3 each) in the box. A slider at its end does not bound the scene.
+  // Indices of the points (3 each) in the box.
   #within(points) {
     const [from, to] = this.corners, kept = [];
-    const low = from.map((value, k) => this.marks[0][k] === 0 ? -Infinity : value);
-    const high = to.map((value, k) => this.marks[1][k] === STEPS ? Infinity : value);
+    const low = from.map((value, k) => this.#free(0, k) ? -Infinity : value);
+    const high = to.map((value, k) => this.#free(1, k) ? Infinity : value);
     for (let i = 0; i < points.length / 3; i++) {
       const x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
       if (x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1] && z >= low[2] && z <= high[2])

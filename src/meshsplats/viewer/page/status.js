@@ -1,5 +1,7 @@
 // The line of the state of the image, and statistics.
 
+import { inWorld } from "./camera.js";
+
 export const element = id => document.getElementById(id);
 export const number = value => Math.round(value).toLocaleString("en");
 
@@ -32,7 +34,7 @@ export function report(app, state, exact, passes, scale, level) {
     "exact frame": app.exactTook === undefined ? "–" : `${number(app.exactTook)} ms`,
     "graphics": (exact ? app.exact?.name : app.sorted?.name) ?? "",
     "first picture": `${number(Number(document.body.dataset.firstPicture))} ms`,
-    position: point(view.position),
+    position: inWorld(view.position, settings.origin, 1e-4 * settings.radius).join(" "),
     direction: point(view.forward),
     ...settings.statistics,
   };
