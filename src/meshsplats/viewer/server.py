@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import os
+import re
 import secrets
 import sys
 import webbrowser
@@ -12,6 +13,8 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 HOST = "127.0.0.1"
+_THIS_MACHINE = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d*)?", re.IGNORECASE)
+"""Of the header Host, with any port: a tunnel has its own."""
 
 
 def open_page(url: str) -> bool:
@@ -37,8 +40,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, *, body: bool) -> None:
         # A page elsewhere whose name was made to lead here asks with its own name.
-        host = self.headers.get("Host", "")
-        known = host in (f"{HOST}:{self.server.server_port}", f"localhost:{self.server.server_port}")
+        known = _THIS_MACHINE.fullmatch(self.headers.get("Host", ""))
         if not known or not hmac.compare_digest(self.path.encode(), self.server.path.encode()):
             self.send_error(404)
             return
