@@ -25,14 +25,14 @@ from meshsplats.rendering.viewers import viewer_images
 CUTOFFS = (0.1, CUTOFF, 0.3)
 """Cutoffs of 'mask' that are tried. Each is the best on some scene; 0.5 was on none of ten."""
 CUTOFF_GAIN = 0.75
-"""A cutoff other than the usual one must gain this much, dB: a smaller gain may be a loss against the splats,
-or in larger images."""
-MASK_GAIN = 1.0
+"""A cutoff other than the usual one must gain this much, dB, pixel by pixel: a smaller gain may be a loss
+against the splats, or in larger images."""
+MASK_GAIN = 0.5
 """'mask' must gain this much, dB: its edges are hard, and it never wins where a viewer sorts."""
 AREA = 4
-"""Side in pixels of the areas whose mean colours are compared. What is drawn late and shows through the front
-is wrong in all of an area, the grain of hard edges is not: with 'blend', a truck and the face of a robot are
-missing in images that pixel by pixel are up to 2 dB nearer to the sorted one."""
+"""Side in pixels of the areas whose mean colours tell 'mask' from 'blend'. What is drawn late and shows
+through the front is wrong in all of an area, the grain of hard edges is not: with 'blend', a truck and the
+face of a robot are missing in images that pixel by pixel are up to 2 dB nearer to the sorted one."""
 SIDE = 400
 """Side in pixels of the images."""
 VIEWS = 4
@@ -153,16 +153,24 @@ def area_means(image: np.ndarray) -> np.ndarray:
 
 def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int | None = None) -> AlphaChoice:
     """``choose_alpha`` by these views, at least one, each with what a viewer draws of the scene there."""
-    errors = np.zeros(1 + len(CUTOFFS))
+    near, far = np.zeros((2, 1 + len(CUTOFFS)))
     for number, (mesh, view) in enumerate(views, 1):
         truth = render(mesh, view, samples=2, threads=threads).color.clip(0, 1)
-        images = viewer_images(mesh, view, (None, *CUTOFFS), threads=threads)
-        errors += [np.square(area_means(image - truth)).mean() for image in images]
-        blend, *masks = np.minimum(-10 * np.log10(np.maximum(errors / number, 1e-30)), _MOST)
+        differences = [
+            image - truth for image in viewer_images(mesh, view, (None, *CUTOFFS), threads=threads)
+        ]
+        near += [np.square(difference, dtype=np.float64).mean() for difference in differences]
+        far += [np.square(area_means(difference)).mean() for difference in differences]
+        blend, *masks = _decibels(far / number)
         if number > 1 and abs(max(masks) - blend) > CLEAR:
             break
-    best = int(np.argmax(masks))
-    if masks[best] <= masks[CUTOFFS.index(CUTOFF)] + CUTOFF_GAIN:
+    sharp = _decibels(near[1:])
+    best = int(np.argmax(sharp))
+    if sharp[best] <= sharp[CUTOFFS.index(CUTOFF)] + CUTOFF_GAIN:
         best = CUTOFFS.index(CUTOFF)
     chosen: Alpha = "mask" if masks[best] > blend + MASK_GAIN else "blend"
     return AlphaChoice(chosen, CUTOFFS[best], round(float(blend), 2), round(float(masks[best]), 2))
+
+
+def _decibels(errors: np.ndarray) -> np.ndarray:
+    return np.minimum(-10 * np.log10(np.maximum(errors, 1e-30)), _MOST)
