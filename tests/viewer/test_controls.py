@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import re
+import threading
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
@@ -639,6 +641,39 @@ def test_a_damaged_page_says_so(browser, write_page, mesh, tmp_path):
     page.wait("document.body.dataset.state === 'failed'", PATIENCE)
     assert len(page.text("#messageText")) > 10
     page.close()
+
+
+def test_a_page_whose_script_does_not_run_says_so(browser, write_page, mesh):
+    def spoken(page: Page) -> str:
+        page.run("document.getAnimations().forEach(each => each.finish())")
+        words = page.run("document.querySelector('#loading').innerText")
+        page.close()
+        return words
+
+    address = write_page(mesh, "without-script")
+    text = Path(unquote(urlparse(address).path)).read_text(encoding="utf-8")
+
+    class Strict(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Security-Policy", "script-src 'self'")
+            self.end_headers()
+            self.wfile.write(text.encode())
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Strict) as server:
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+        page = browser.page(f"http://127.0.0.1:{server.server_port}", WIDTH, HEIGHT)
+        assert page.run("getComputedStyle(document.querySelector('#blocked')).opacity") == "0"  # not at once
+        assert "the server forbids scripts" in spoken(page)
+        server.shutdown()
+    page = browser.page("about:blank#off", WIDTH, HEIGHT)
+    page.send("Emulation.setScriptExecutionDisabled", value=True)
+    page.send("Page.navigate", url=address)
+    page.wait("location.protocol === 'file:' && document.readyState === 'complete'")
+    assert spoken(page) == "This page draws its scene with JavaScript, which is switched off."
 
 
 def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):

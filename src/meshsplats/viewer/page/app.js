@@ -418,6 +418,7 @@ class App {
 }
 
 async function main() {
+  element("blocked").remove();
   const text = id => element(id)?.textContent.trim();
   const settings = JSON.parse(text("settings"));
   const paint = () => new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)));
