@@ -146,6 +146,7 @@ def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
         "with_masks": sum(photo.mask is not None for photo in photos),
         "bytes_in_memory": dataset.memory,
         **_cameras([view.camera for view in dataset.views], dataset.origin),
+        "up_by_cameras": _rounded(guess_up(None, [view.upright for view in dataset.views])),
     }
     if layout.name == "COLMAP" and (points := count_points(layout.source)) is not None:
         found["points"] = points

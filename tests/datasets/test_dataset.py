@@ -91,6 +91,39 @@ def test_images_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, monk
     assert all(view.load().color.dtype == np.uint8 for view in dataset.train)
 
 
+@pytest.mark.parametrize(
+    ("orientation", "edge"), [(1, "top"), (2, "top"), (3, "bottom"), (4, "bottom"), (6, "left"), (8, "right")]
+)
+def test_up_is_the_edge_that_exif_says(tmp_path, orientation, edge):
+    """Pixels and cameras stay as they are stored."""
+    folder = simple_colmap(tmp_path, 2)
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    for path in sorted((folder / "images").iterdir()):
+        Image.open(path).save(path, exif=exif)
+    view = load_dataset(folder, test_every=0).train[0]
+    right, down = view.camera.world_to_camera[:2, :3]
+    up = {"top": -down, "bottom": down, "left": -right, "right": right}[edge]
+    assert np.allclose(view.upright.up, up)
+    assert (view.camera.width, view.camera.height) == (12, 8)
+    # A point on the axis through the upright image's middle of the upper edge is on that edge as stored.
+    upright = view.upright
+    point = upright.center + np.linalg.inv(upright.world_to_camera[:3, :3]) @ [
+        (upright.width / 2 - upright.cx) / upright.fx,
+        -upright.cy / upright.fy,
+        1,
+    ]
+    (x, y), _ = (part[0] for part in view.camera.project(point[None]))
+    assert (x, y) == pytest.approx({"top": (6, 0), "bottom": (6, 8), "left": (0, 4), "right": (12, 4)}[edge])
+
+
+def test_broken_exif_is_no_matter(tmp_path):
+    folder = simple_colmap(tmp_path, 2)
+    for path in sorted((folder / "images").iterdir()):
+        Image.open(path).save(path, exif=b"Exif\0\0MM\0*\xff\xff\xff\xff\0\1")
+    assert [view.turn for view in load_dataset(folder).views] == [0, 0]
+
+
 def test_masks_of_a_subject_cut_it_out(tmp_path):
     folder = simple_colmap(tmp_path, 3)
     rng = np.random.default_rng(0)

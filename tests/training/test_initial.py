@@ -10,9 +10,9 @@ from _balls import ball_view, cameras_around
 
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.silhouettes import has_silhouettes
-from meshsplats.datasets.views import View, ViewImage
+from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.rendering import render
-from meshsplats.training import hull, initial
+from meshsplats.training import hull, initial, starting_fans, train_config
 from meshsplats.training.hull import carve, in_silhouettes
 from meshsplats.training.initial import (
     colored,
@@ -70,6 +70,19 @@ def test_silhouettes_of_nothing_in_common_are_refused(ball):
     assert carve(views, 500) is None
     with pytest.raises(ValueError, match="cameras and masks do not fit"):
         starting_patches(views, 500)
+
+
+def test_up_is_as_the_photographs_were_held(ball):
+    """Whichever way they are stored."""
+
+    def on_its_side(view: View) -> View:
+        image = view.load()
+        turned = ViewImage(*(np.ascontiguousarray(np.rot90(a, -1)) for a in (image.color, image.alpha)))
+        return View(replace(view, turn=1).upright, turned, turn=3)
+
+    config = train_config(steps=1, start_splats=50, max_splats=100)
+    stored = Dataset(tuple(on_its_side(view) for view in ball))
+    assert np.allclose(starting_fans(stored, config).up, [0, 0, 1])
 
 
 def test_silhouettes_need_alpha_that_leaves_something_out(ball, room):

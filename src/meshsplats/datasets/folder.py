@@ -137,8 +137,10 @@ def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
 
 
 def _views(train: list[Taken], test: list[Taken]) -> Views:
-    flat = ([View(c, source) for views in part for c, source in views] for part in (train, test))
-    return next(flat), next(flat)
+    def flat(part: list[Taken]) -> list[View]:
+        return [View(camera, photo, turn=photo.turn) for views in part for camera, photo in views]
+
+    return flat(train), flat(test)
 
 
 def load_dataset(

@@ -184,6 +184,8 @@ class PhotoFile:
     store: ImageCache = field(repr=False)
     cut_out: bool = False
     """Whether the mask is the subject's outline: what is outside is clear."""
+    turn: int = 0
+    """``Header.turn`` of the photograph."""
 
     def load(self) -> ViewImage:
         image = self.store.find(self)
@@ -284,6 +286,8 @@ class Album:
             width, height = header.width, header.height
             if small is None:
                 width, height = (max(1, round(side / self.downscale)) for side in (width, height))
+            # Smaller copies may lack EXIF data.
+            turn = header.turn if full in (None, path) else read_header(full).turn
             mask = self._mask(frame, full, label, masks)
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
@@ -292,8 +296,8 @@ class Album:
             for pinhole in pinholes(lens):
                 cut_out = mask is not None and self.masks == "subject"
                 has_alpha = header.has_alpha or cut_out
-                source = PhotoFile(frame.name, path, lens, pinhole, mask, has_alpha, self.store, cut_out)
-                taken.append((_camera(frame, pinhole, label), source))
+                photo = (frame.name, path, lens, pinhole, mask, has_alpha, self.store, cut_out, turn)
+                taken.append((_camera(frame, pinhole, label), PhotoFile(*photo)))
             result.append(taken)
         return result
 

@@ -37,14 +37,14 @@ WAYS_OF_VIEWS = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "f
 def cameras_named(
     cameras: Path | None, data: Path | None, missing: Missing = "few", origin: Origin = (0, 0, 0)
 ) -> list[Camera] | None:
-    """The cameras in a file, or those of the training views of a data set, relative to ``origin`` (3,); None
-    if neither is named. ``missing``: as in ``load_dataset``."""
+    """The cameras in a file, or those of the training views of a data set, as they were held, relative to
+    ``origin`` (3,); None if neither is named. ``missing``: as in ``load_dataset``."""
     from meshsplats.cameras.files import load_cameras
     from meshsplats.datasets.folder import load_dataset
 
     if data is not None:
         dataset = load_dataset(data, missing=missing, origin=origin)
-        return [view.camera for view in dataset.train or dataset.views]
+        return [view.upright for view in dataset.train or dataset.views]
     return None if cameras is None else load_cameras(cameras, origin=origin)
 
 

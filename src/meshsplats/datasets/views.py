@@ -84,6 +84,9 @@ class View:
     source: ViewImage | ImageSource
     background: tuple[float, float, float] = WHITE
     """RGB in [0, 1] over which ``image`` shows images with alpha."""
+    turn: int = 0
+    """Quarter turns clockwise after which the image is upright, as of a photograph that was taken with the
+    camera held upright and stored on its side."""
 
     def __repr__(self) -> str:
         return f"View({self.name!r}, {self.camera.width} x {self.camera.height})"
@@ -92,6 +95,24 @@ class View:
     def name(self) -> str:
         """The image's name, relative to the data set."""
         return self.camera.name
+
+    @property
+    def upright(self) -> Camera:
+        """The camera as it was held: with its image upright, after ``turn``."""
+        camera = self.camera
+        for _ in range(self.turn % 4):
+            matrix = camera.world_to_camera[[1, 0, 2, 3]] * [[-1], [1], [1], [1]]
+            camera = replace(
+                camera,
+                world_to_camera=matrix,
+                fx=camera.fy,
+                fy=camera.fx,
+                cx=camera.height - camera.cy,
+                cy=camera.cx,
+                width=camera.height,
+                height=camera.width,
+            )
+        return camera
 
     def load(self) -> ViewImage:
         """The image as stored: read or rendered now, or from the cache. ValueError if its size is not

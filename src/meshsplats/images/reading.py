@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import re
+import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,9 @@ MAX_PIXELS = 1 << 26
 """Images of more pixels than this (67 million) are refused: a small file can claim any size."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 """Formats that Pillow may read here. Others start programs, or hold no photographs."""
+_ORIENTATION = 0x112
+_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
+"""``Header.turn`` by EXIF's orientation; 0 for others."""
 _HEIF = re.compile(rb"....ftyp(heic|heix|heim|heis|hevc|hevx|mif1|msf1)", re.DOTALL)
 """How HEIF files begin, as iPhones take photographs."""
 
@@ -29,12 +34,15 @@ class Header:
     width: int
     height: int
     has_alpha: bool
+    turn: int = 0
+    """Quarter turns clockwise after which the image, as it is stored, is upright: EXIF's orientation, without
+    its mirroring."""
 
 
 def read_header(path: Path) -> Header:
     """Size and kind of an image, without its pixels. FileFormatError if it is none, or too large."""
     with _opened(path) as image:
-        return Header(image.width, image.height, _has_alpha(image))
+        return Header(image.width, image.height, _has_alpha(image), _turn(image))
 
 
 def load_image(path: str | os.PathLike[str], data: bytes | None = None) -> np.ndarray:
@@ -111,6 +119,18 @@ def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:
             " Make it smaller"
         )
     return image
+
+
+def _turn(image: Any) -> int:
+    # Pillow turns the pixels of these formats itself, and looks for EXIF behind the pixels if none is before.
+    if image.format in ("TIFF", "HEIF") or "exif" not in image.info:
+        return 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # EXIF that is broken says nothing
+        try:
+            return _TURNS.get(image.getexif().get(_ORIENTATION), 0)
+        except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error):
+            return 0
 
 
 def _has_alpha(image: Any) -> bool:

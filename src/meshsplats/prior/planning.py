@@ -66,7 +66,7 @@ class PriorTraining:
         """Reads the files and prepares the run. ``earlier``: checkpoint of a run that is resumed."""
         base = self.laying.load_base(self.source)
         dataset = self._dataset(base, config, earlier)
-        up = guess_up(_grey_mesh(base), [view.camera for view in dataset.train])
+        up = guess_up(_grey_mesh(base), [view.upright for view in dataset.train])
         laying = self.laying
         prior = bind(
             replace(base, up=up),

@@ -103,6 +103,8 @@ class PhotographOptions:
             say(
                 "masks leave most pixels out, which may become anything: ``masks`` subject cuts out an object"
             )
+        if any(view.turn for view in dataset.train):
+            say("up: as the photographs were held, by their EXIF data")
         points = load_points(folder, origin=dataset.origin)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 

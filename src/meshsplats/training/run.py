@@ -173,7 +173,7 @@ def starting_fans(
     found = len(joined.points)
     chosen = np.linspace(0, found - 1, min(found, config.max_splats)).astype(int)
     mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
-    up = guess_up(cameras=[view.camera for view in views])
+    up = guess_up(cameras=[view.upright for view in views])
     harmonics = None
     if config.sh_degree:
         harmonics = np.zeros((len(chosen), TERMS[config.sh_degree - 1], 3), np.float32)

@@ -195,7 +195,7 @@ def _cameras(
     threads: int | None,
 ) -> list[Camera]:
     if photographs is not None:
-        return [view.camera for view in photographs.views]
+        return [view.upright for view in photographs.views]
     if options.cameras is not None:
         return load_cameras(options.cameras, origin=scene.origin)
     beside = cameras_beside(source, scene.origin)
