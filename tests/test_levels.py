@@ -231,10 +231,16 @@ def test_a_chain_without_the_command_line(tmp_path):
     )
     assert begun == [(0, 400), (1, 100)]
     assert json.loads((tmp_path / "chain" / "levels.json").read_text()) == table
+    (tmp_path / "chain" / "mine.txt").write_text("mine")
     assert (table["source"], [row["screen_size"] for row in table["levels"]]) == ("scene", [64, 32])
     assert load_mesh(tmp_path / "chain" / "level_1.npz").up[2] == 1
     make_chain(cloud, tmp_path / "chain", replace(options, levels=1))  # in place of the older one
-    assert not (tmp_path / "chain" / "level_1.npz").exists()
+    left = sorted(path.name for path in (tmp_path / "chain").iterdir())
+    assert left == ["level_0.npz", "levels.json", "mine.txt"]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "levels.json").write_text("{}")
+    with pytest.raises(FileExistsError, match=r"not the table .*: give another folder"):
+        make_chain(cloud, tmp_path / "other", options)
 
 
 def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):

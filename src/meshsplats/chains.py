@@ -14,7 +14,8 @@ from typing import Any
 
 from meshsplats._files.atomic import replace_folder, write_json
 from meshsplats._kinds import as_path
-from meshsplats.evaluation.level_tables import TABLE
+from meshsplats.errors import FileFormatError
+from meshsplats.evaluation.level_tables import TABLE, load_table
 from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.file_options import ChainOptions
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
@@ -58,16 +59,26 @@ def check_folder(folder: Path, *, resume: bool = False, replace_old: bool = Fals
     that of an interrupted run.
 
     Raises:
-        FileExistsError: it exists and is not to be replaced or holds something else, or a partial one is
-            left.
+        FileExistsError: it exists and is not to be replaced or is no chain, or a partial one is left.
         FileNotFoundError: there is nothing to resume.
         OSError: it cannot be written.
     """
     unfinished = partial_folder(folder)
-    if folder.exists() and not (folder / TABLE).is_file():
-        raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
+    _check_older(folder)
     check_resumption(folder, unfinished, CONFIGURATION, resume=resume, replace_old=replace_old)
     check_outputs([folder], replace_old or resume)
+
+
+def _check_older(folder: Path) -> None:
+    """FileExistsError if ``folder`` exists and is no chain."""
+    if not folder.exists():
+        return
+    if not (folder / TABLE).is_file():
+        raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
+    try:
+        load_table(folder / TABLE)
+    except FileFormatError as error:
+        raise FileExistsError(f"{error}: give another folder") from None
 
 
 def begin_folder(folder: Path) -> Path:
@@ -91,7 +102,8 @@ def make_chain(
     on_level: OnLevel = lambda number, level: nullcontext(),
 ) -> dict[str, Any]:
     """Makes the chain of ``cloud`` in ``partial_folder(folder)`` and renames that to ``folder``, in place of
-    an older one. Levels that are finished there are kept. Returns the table of ``levels.json``.
+    an older one, of which files that are none of the chain stay. Levels that are finished there are kept.
+    Returns the table of ``levels.json``.
 
     Args:
         cloud: the splats.
@@ -102,9 +114,11 @@ def make_chain(
         place: makes of a mesh the one that is written.
         on_level: entered for each level that is made; what it gives is shown the progress.
 
-    Raises Interrupted after Ctrl-C in a level, whose predecessors stay, and what ``plan_levels`` raises.
+    Raises Interrupted after Ctrl-C in a level, whose predecessors stay, FileExistsError for a ``folder`` that
+    is no chain, and what ``plan_levels`` raises.
     """
     folder = as_path("folder", folder)
+    _check_older(folder)
     chosen, unfinished = options or ChainOptions(), partial_folder(folder)
     chain = planned(chosen, len(cloud))
     unfinished.mkdir(exist_ok=True)
@@ -131,7 +145,10 @@ def make_chain(
     for record in records:
         record.unlink()
     write_json(unfinished / TABLE, table)
-    replace_folder(unfinished, folder)
+    _check_older(folder)
+    older = load_table(folder / TABLE)["levels"] if folder.exists() else []
+    own = {TABLE, CONFIGURATION, *(row["file"] for row in older)}
+    replace_folder(unfinished, folder, own.__contains__)
     return table
 
 

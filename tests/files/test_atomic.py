@@ -7,7 +7,7 @@ import sys
 import pytest
 from _local import make_link
 
-from meshsplats._files.atomic import atomic_path, refuse_existing
+from meshsplats._files.atomic import atomic_path, refuse_existing, replace_folder
 
 as_root = hasattr(os, "geteuid") and os.geteuid() == 0
 posix = pytest.mark.skipif(sys.platform == "win32", reason="permissions of POSIX")
@@ -60,6 +60,18 @@ def test_a_new_file_follows_the_umask(tmp_path, umask, mode):
 
 
 @posix
+def test_a_folder_takes_the_place_of_one_that_a_killed_run_has_moved(tmp_path):
+    for folder, name in ((".site.old", "mine"), (".site.old", "old"), ("site", "old"), ("new", "new")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / name).write_text(folder)
+    replace_folder(tmp_path / "new", tmp_path / "site", lambda name: name in ("old", "new"))
+    assert {path.name: path.read_text() for path in (tmp_path / "site").iterdir()} == {
+        "mine": ".site.old",
+        "new": "new",
+    }
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
 def test_a_replaced_file_keeps_its_permissions(tmp_path):
     target = tmp_path / "a.npz"
     target.write_bytes(b"")

@@ -37,7 +37,7 @@ from meshsplats.tiles import tileset as tilesets
 from meshsplats.tiles.building import TileOptions, TilesetSummary, build_tiles
 from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen_error, tiles_mesh
 from meshsplats.tiles.journal import Journal
-from meshsplats.tiles.tileset import Tileset
+from meshsplats.tiles.tileset import Tileset, is_tile_file
 
 
 @pytest.fixture(scope="module")
@@ -377,6 +377,32 @@ def test_what_a_run_refuses(splats, tileset, tmp_path):
     ]:
         with pytest.raises(ValueError, match=message):
             build_tiles(source, tmp_path / "new", options, replace_old=True)
+
+
+def test_files_of_others_beside_the_tiles_stay(splats, tmp_path, monkeypatch):
+    out, page = tmp_path / "site", "<!doctype html>"
+    build_tiles(stream_gaussians(splats), out, SMALL)
+    ours = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert all(map(is_tile_file, ours))
+    mine = {"index.html", "js/app.js", next(name for name in ours if "/" in name).replace("glb", "txt")}
+    for name in mine:
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text(page)
+    monkeypatch.setattr(building, "BUCKET", 1 << 20)
+    coarse = TileOptions(max_triangles=1 << 20)
+    assert build_tiles(stream_gaussians(splats), out, coarse, replace_old=True).tiles == 1
+    left = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert left == {"tileset.json", "root.glb"} | mine
+    assert {(out / name).read_text() for name in mine} == {page}
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
+def test_a_tileset_of_another_program_is_not_replaced(splats, tmp_path):
+    (tmp_path / "tileset.json").write_text(json.dumps({"asset": {"version": "1.1"}, "geometricError": 1}))
+    (tmp_path / "data.b3dm").write_text("b3dm")
+    with pytest.raises(FileExistsError, match="a tileset of another program: give another folder"):
+        build_tiles(stream_gaussians(splats), tmp_path, SMALL, replace_old=True)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_one_is_no_plural():

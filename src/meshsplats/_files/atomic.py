@@ -32,16 +32,32 @@ _waiting: list[_Finished] | None = None
 """Finished files that wait for others; see ``together``."""
 
 
-def replace_folder(finished: Path, target: Path) -> None:
-    """Renames the folder ``finished`` to ``target``, in place of an older one."""
-    if not target.exists():
-        os.rename(finished, target)
-        return
+def replace_folder(finished: Path, target: Path, is_own: Callable[[str], bool]) -> None:
+    """Renames the folder ``finished`` to ``target``, in place of an older one, of which the files that are
+    not its own stay: ``is_own`` tells by the path in the folder, with slashes."""
     old = target.with_name(f".{target.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    os.rename(target, old)
+    if target.exists():
+        _hand_over(old, target, is_own)  # what a run left that was killed here
+        os.rename(target, old)
     os.rename(finished, target)
-    shutil.rmtree(old)
+    _hand_over(old, target, is_own)
+
+
+def _hand_over(old: Path, target: Path, is_own: Callable[[str], bool]) -> None:
+    """Removes the folder ``old`` after moving what is not its own to ``target``; a file whose name is taken
+    there stays, with its folder."""
+    for folder, folders, files in os.walk(old, topdown=False):
+        place = Path(folder)
+        links = [name for name in folders if (place / name).is_symlink()]
+        for path in (place / name for name in (*files, *links)):
+            inside = path.relative_to(old)
+            if is_own(inside.as_posix()):
+                path.unlink()
+            elif not os.path.lexists(target / inside):
+                (target / inside).parent.mkdir(parents=True, exist_ok=True)
+                os.rename(path, target / inside)
+        with suppress(OSError):
+            place.rmdir()
 
 
 @contextmanager

@@ -42,7 +42,7 @@ from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, harmonics_degree, stored_survey
 from meshsplats.tiles.options import TileOptions
-from meshsplats.tiles.tileset import Node, Tileset, tile_path, write_tilesets
+from meshsplats.tiles.tileset import Node, Tileset, is_ours, is_tile_file, tile_path, write_tilesets
 
 JOURNAL = Path("work", "journal.jsonl")
 """Inside the folder of an unfinished tileset."""
@@ -100,7 +100,8 @@ def build_tiles(
         folder: of the tileset.
         options: what it should be like.
         resume: go on with an interrupted run of the same splats and options.
-        replace_old: replace a tileset, and begin again where an earlier run left a partial one.
+        replace_old: replace a tileset that ``build_tiles`` has written, of which files that are none of its
+            tiles stay, and begin again where an earlier run left a partial one.
         threads: at most this many; all processors by default.
         workers: build the cells of the octree, each in a task; this process by default. All of them have the
             folder at the same path.
@@ -110,7 +111,7 @@ def build_tiles(
         Counts of the tileset.
 
     Raises:
-        FileExistsError: the folder or a partial one exists.
+        FileExistsError: the folder or a partial one exists, or with ``replace_old`` one of another program.
         FileNotFoundError: there is nothing to resume.
         ValueError: options out of range, or other ones than the interrupted run had; no splat to convert.
         OSError: a full disk; what is done stays, for ``resume``.
@@ -133,7 +134,7 @@ def build_tiles(
         _check_folders(target, unfinished, resume, replace_old)
         build = _Build(source, unfinished, chosen, conversion, threads, workers, on_progress)
         summary = build.run()
-        replace_folder(unfinished / "tileset", target)
+        replace_folder(unfinished / "tileset", target, is_tile_file)
         shutil.rmtree(unfinished)
     return summary
 
@@ -148,6 +149,8 @@ def _check_folders(target: Path, unfinished: Path, resume: bool, replace_old: bo
     if target.exists():
         if not (target / "tileset.json").is_file():
             raise FileExistsError(f"{target} is there and holds no tileset.json: give another folder")
+        if not is_ours(target):
+            raise FileExistsError(f"{target} holds a tileset of another program: give another folder")
         if not (replace_old or resume):
             raise FileExistsError(f"{target} exists: give another folder, or ``force`` to replace it")
     check_resumption(target, unfinished, JOURNAL, resume=resume, replace_old=replace_old)

@@ -36,6 +36,8 @@ GROW = 1e-6
 _MAX_BYTES = 64 << 20
 _MAX_TILES = 1 << 22
 _MAX_DEPTH = 64
+_TILE_FILE = re.compile(r"([0-7]+/)*(tileset\.json|(root|[0-7]+)\.glb)")
+"""Paths of ``tile_path`` and of tileset files."""
 _PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
 
 
@@ -60,6 +62,19 @@ class Node:
 def tile_path(key: str) -> str:
     """Name of the GLB of a tile in the folder of the tileset."""
     return "/".join([*_folders(key), f"{key[len(_group(key)) :] or 'root'}.glb"])
+
+
+def is_tile_file(path: str) -> bool:
+    """Whether a tileset of ours has a file of this name: its path in the folder, with slashes."""
+    return _TILE_FILE.fullmatch(path) is not None
+
+
+def is_ours(folder: Path) -> bool:
+    """Whether ``build_tiles`` has written the tileset.json in ``folder``."""
+    try:
+        return isinstance(_load(folder / NAME)["extras"]["meshsplats"], dict)
+    except (FileFormatError, KeyError, TypeError):
+        return False
 
 
 def write_tilesets(
