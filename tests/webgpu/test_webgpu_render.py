@@ -234,6 +234,27 @@ def test_a_fan_of_opaque_triangles_has_no_seam():
     assert set(np.unique(image.alpha)) == {0.0, 1.0}
 
 
+@pytest.mark.parametrize("name", ["vertices", "colors", "faces"])
+def test_a_mesh_that_was_changed_in_place_is_drawn_as_it_is_now(name):
+    mesh = soup(4)
+    render(mesh, camera(), device="gpu")
+    array = getattr(mesh, name)
+    array[:] = np.roll(array, 1)
+    assert_same_image(*both(mesh, camera()))
+
+
+def test_the_mesh_of_the_last_call_stays_on_the_gpu():
+    mesh = soup(4)
+    assert gpu_engine().renderer_of(mesh) is gpu_engine().renderer_of(mesh)
+
+
+def test_a_forked_process_says_how_to_start_others(monkeypatch):
+    render(soup(4), camera(), device="gpu")
+    monkeypatch.setattr("os.getpid", lambda: -1)
+    with pytest.raises(DeviceError, match="get_context\\('spawn'\\)"):
+        render(soup(4), camera(), device="gpu")
+
+
 def test_no_triangles_and_none_in_view():
     empty = SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 4)))
     behind = soup(1, z=-50)

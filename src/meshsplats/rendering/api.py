@@ -98,7 +98,7 @@ def render(
 
     ``device="gpu"`` draws the same image on the best GPU of the machine (extra ``gpu``): a few samples
     differ, where two triangles are within rounding of one depth. It never falls back to the CPU. The mesh of
-    the last call stays on the GPU.
+    the last call stays on the GPU, until its arrays change.
 
     Args:
         mesh: the triangles.
@@ -122,7 +122,7 @@ def render(
             mesh without ``face_splat`` or whose splats share vertices.
         MemoryError: the scene does not fit.
         MissingDependencyError: no GPU, or no library for it.
-        DeviceError: the GPU failed, or did not finish.
+        DeviceError: the GPU failed, or did not finish; this process was forked from one that uses it.
     """
     need(SplatMesh, mesh=mesh, instead={"GaussianCloud": "render_splats draws splats, convert makes a mesh"})
     need(Camera, camera=camera)

@@ -53,6 +53,7 @@ class Device:
         self.binding_limit = max(CORE_BINDING, largest // 16 * 16)
         limits = CORE_LIMITS | {name: max(CORE_LIMITS[name], self.binding_limit) for name in sizes}
         self.device: Any = adapter.request_device_sync(required_limits=limits)
+        self._process = os.getpid()
         self.budgets = SOFTWARE_BUDGETS if self.info["adapter_type"] == "CPU" else (BUDGET,)
         self._pipelines: dict[tuple[Any, ...], Any] = {}
         self._modules: dict[tuple[Any, ...], Any] = {}
@@ -69,6 +70,15 @@ class Device:
                 layout=wgpu.AutoLayoutMode.auto, compute={"module": self._modules[key], "entry_point": entry}
             )
         return self._pipelines[name]
+
+    def check_process(self) -> None:
+        """Raises DeviceError in a process that was forked from the one that opened the device: drivers wait
+        there forever."""
+        if os.getpid() != self._process:
+            raise DeviceError(
+                "this process was forked from one that uses the GPU, and no driver works in both: start"
+                " processes with multiprocessing.get_context('spawn')"
+            )
 
     @property
     def name(self) -> str:
