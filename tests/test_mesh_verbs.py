@@ -8,8 +8,9 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from _priors import bumpy
+from _rendering import splats
 
-from meshsplats import Camera, SplatMesh, render
+from meshsplats import Camera, SplatMesh, convert, look_at, render
 from meshsplats.binding import ArrayField, Binding
 from meshsplats.prior.laying import bind
 
@@ -326,6 +327,54 @@ def test_a_rigid_motion_of_mesh_and_camera_changes_nothing(seed):
     assert np.quantile(np.abs(before.color - after.color), 0.99) < 1e-3
     turned = before.normals @ rotation.T
     assert np.quantile(np.abs(turned - after.normals), 0.99) < 1e-3
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_a_transformed_mesh_is_seen_as_its_transformed_splats_are(mirror):
+    """A turn, a scale, a shift and a mirror, of splats whose colours depend on the view."""
+    cloud = splats(3, 12, sizes=(0.1, 0.4), z=6)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = 2 * turn(5) @ np.diag([mirror, 1, 1]), (1, -2, 0.5)
+    mesh = convert(cloud)
+    moved = mesh.transformed(matrix)
+    towards = cloud.transformed(matrix)
+    camera = look_at(
+        towards.means.mean(axis=0) + (0, 0, -10), towards.means.mean(axis=0), width=48, height=40
+    )
+    expected = render(convert(towards), camera, samples=2).color
+    assert np.quantile(np.abs(render(moved, camera, samples=2).color - expected), 0.98) < 2e-3
+    np.testing.assert_allclose(moved.up, matrix[:3, :3] @ mesh.up / 2, atol=1e-6)
+    twice = moved.transformed(np.linalg.inv(matrix))
+    np.testing.assert_allclose(twice.vertices, mesh.vertices, atol=1e-5)
+    np.testing.assert_allclose(twice.harmonics, mesh.harmonics, atol=1e-5)
+
+
+def test_normals_base_and_corners_of_a_mirrored_mesh_stay_outside():
+    mesh = bind(bumpy(), triangles=1, layers=2, spacing=0.1).mesh
+    moved = mesh.transformed(np.diag([-2.0, 2, 2]))
+    np.testing.assert_allclose(moved.normals, mesh.normals * (-1, 1, 1), atol=1e-6)
+    np.testing.assert_allclose(moved.binding.positions(), moved.vertices, atol=1e-5)
+
+    def across(of: SplatMesh) -> np.ndarray:
+        a, b, c = (of.vertices[of.faces[:, k]] for k in range(3))
+        return unit(np.cross(b - a, c - a))
+
+    np.testing.assert_allclose(across(moved), across(mesh) * (-1, 1, 1), atol=1e-4)
+    assert mesh.transformed(np.diag([1.0, 2, 1])).binding is None
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.eye(2), "shape"),
+        (np.diag([1.0, 1, 0]), "singular"),
+        (np.full((3, 3), np.nan), "not finite"),
+        (np.ones((4, 4)), "last row"),
+    ],
+)
+def test_maps_that_are_none_are_refused(matrix, message):
+    with pytest.raises(ValueError, match=message):
+        fans().transformed(matrix)
 
 
 def test_centres_are_weighted_by_opacity():

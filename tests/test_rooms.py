@@ -20,6 +20,7 @@ FLOORS = (
     (
         *("_json", "_options", "_words", "binding", "camera", "cluster", "draw_order", "gaussians"),
         "mesh_joining",
+        "mesh_moving",
     ),
     ("_option_values", "base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),

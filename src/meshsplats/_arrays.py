@@ -116,7 +116,7 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
         sides = ", ".join("n" if s is None else str(s) for s in shape)
         wanted = f"({sides},)" if len(shape) == 1 else f"({sides})"
         raise ValueError(f"{name} must have shape {wanted}, got {given.shape}")
-    if np.dtype(dtype).kind == "i":
+    if np.dtype(dtype).kind in "iu":
         if given.dtype.kind == "f":
             raise TypeError(f"{name} must hold integers, got dtype {given.dtype}")
         limits = np.iinfo(np.dtype(dtype))
@@ -137,3 +137,16 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
                     f"{name} must be finite, row {int(bad.argmax())} is not ({int(bad.sum())} such rows)"
                 )
     return array
+
+
+def checked_attributes(attributes: Mapping[str, ArrayLike], rows: int) -> dict[str, np.ndarray]:
+    """``attributes`` by name as float32 arrays (rows,) or (rows, c). The errors of ``checked_array``."""
+    checked = {}
+    for name, value in attributes.items():
+        ndim = np.ndim(value)
+        if ndim not in (1, 2):
+            raise ValueError(
+                f"attribute {name!r} must have one row for each vertex, got shape {np.shape(value)}"
+            )
+        checked[name] = checked_array(f"attribute {name!r}", value, np.float32, (rows, None)[:ndim])
+    return checked

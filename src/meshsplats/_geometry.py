@@ -192,3 +192,22 @@ def morton_codes(points: np.ndarray, low: np.ndarray, side: float, levels: int) 
     steps = (points.astype(np.float64) - low) * ((1 << levels) / side)
     cells = np.clip(steps, 0, (1 << levels) - 1).astype(np.uint64)
     return _interleaved(cells)
+
+
+def affine_parts(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(3, 3) linear part and (3,) shift, float64, of a map (4, 4), (3, 4) or (3, 3).
+
+    Raises ValueError for another shape or last row, and for a matrix that is singular or not finite.
+    """
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape not in ((3, 3), (3, 4), (4, 4)):
+        raise ValueError(f"the transform must have shape (4, 4), (3, 4) or (3, 3), got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise ValueError("the transform is not finite")
+    if len(matrix) == 4 and (matrix[3] != (0, 0, 0, 1)).any():
+        raise ValueError(f"the last row of the transform must be 0 0 0 1, got {matrix[3].tolist()}")
+    linear = matrix[:3, :3]
+    stretch = np.linalg.svd(linear, compute_uv=False)
+    if stretch[2] <= 1e-12 * stretch[0]:
+        raise ValueError("the transform flattens space (a singular matrix)")
+    return linear, np.zeros(3) if matrix.shape == (3, 3) else matrix[:3, 3]

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from meshsplats._arrays import checked_array, chosen_rows
-from meshsplats._geometry import quaternion_product, quaternions_of, rotation_rows
+from meshsplats._geometry import affine_parts, quaternion_product, quaternions_of, rotation_rows
 from meshsplats._kinds import need_all, need_choice
 from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
@@ -27,7 +27,8 @@ def constant_harmonics(colors: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class GaussianCloud:
-    """N Gaussians. Arrays are float32 and C-contiguous; the constructor checks and converts them.
+    """N Gaussians. Arrays are float32 and C-contiguous; the constructor checks and converts them. Those that
+    need no conversion are kept, not copied: what is written into them later is in the splats, unchecked.
 
     Concretely, splat i is ``opacities[i] * exp(-0.5 * |diag(1 / scales[i]) R_i^T (x - means[i])|^2)`` with
     ``R_i`` the rotation of ``quaternions[i]``.
@@ -179,7 +180,7 @@ class GaussianCloud:
 
         Raises ValueError for another shape or last row, and for a matrix that is singular or not finite.
         """
-        a, shift = _affine(matrix)
+        a, shift = affine_parts(matrix)
         reverses_axes = (np.abs(a) == np.eye(3)).all()
         moved = self._mirrored(np.diag(a)) if reverses_axes else self._mapped(a)
         mapped = a @ self.origin + 0.0
@@ -211,8 +212,6 @@ class GaussianCloud:
 
     def _mapped(self, a: np.ndarray) -> GaussianCloud:
         u, stretch, vt = np.linalg.svd(a)
-        if stretch[2] <= 1e-12 * stretch[0]:
-            raise ValueError("the transform flattens space (a singular matrix)")
         orthogonal = u @ vt
         # A Gaussian is symmetric, so a mirror turns its axes as the rotation does that is its negative.
         proper = orthogonal * np.sign(np.linalg.det(orthogonal))
@@ -238,18 +237,6 @@ class GaussianCloud:
         if (point == self.origin).all():
             return self
         return replace(self, means=relative(self.means, self.origin, point), origin=point)
-
-
-def _affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(3, 3) linear part and (3,) shift, float64, of a map (4, 4), (3, 4) or (3, 3)."""
-    matrix = np.asarray(matrix, np.float64)
-    if matrix.shape not in ((3, 3), (3, 4), (4, 4)):
-        raise ValueError(f"the transform must have shape (4, 4), (3, 4) or (3, 3), got {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise ValueError("the transform is not finite")
-    if len(matrix) == 4 and (matrix[3] != (0, 0, 0, 1)).any():
-        raise ValueError(f"the last row of the transform must be 0 0 0 1, got {matrix[3].tolist()}")
-    return matrix[:3, :3], np.zeros(3) if matrix.shape == (3, 3) else matrix[:3, 3]
 
 
 def shared_up(ups: Sequence[np.ndarray | None]) -> np.ndarray | None:

@@ -9,14 +9,15 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, chosen_rows
+from meshsplats._arrays import checked_array, checked_attributes, chosen_rows
 from meshsplats._kinds import need_all, need_choice
 from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats, check_ascending
 from meshsplats.mesh_joining import joined_meshes
+from meshsplats.mesh_moving import moved_mesh, transformed_mesh
 from meshsplats.order import Order, checked_order
-from meshsplats.spherical_harmonics import TERMS, degree_of, turned_harmonics
+from meshsplats.spherical_harmonics import TERMS, degree_of
 
 Blending = Literal["display", "linear"]
 
@@ -56,7 +57,8 @@ class Triangles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SplatMesh:
-    """V vertices and F triangles. The constructor checks and converts the arrays (C-contiguous).
+    """V vertices and F triangles. The constructor checks and converts the arrays (C-contiguous). Those that
+    need no conversion are kept, not copied: what is written into them later is in the mesh, unchecked.
 
     Concretely, ``colors[faces[j, k]]`` is the straight (not premultiplied) RGBA at corner k of triangle j;
     inside a triangle RGBA is interpolated with perspective-correct barycentric weights.
@@ -144,23 +146,15 @@ class SplatMesh:
         group = self.depth_group
         if group is not None and f and group.min() < -1:
             raise ValueError(f"depth_group must be >= 0, or -1 for none, got {group.min()}")
-        length = float(np.linalg.norm(self.up))
+        length = float(np.linalg.norm(self.up.astype(np.float64)))
         if length == 0:
             raise ValueError("up must not be the zero vector")
         # Not rescaled within 1e-6 of unit length: files round-trip bit for bit.
-        set_("up", self.up if abs(length - 1) <= 1e-6 else self.up / np.float32(length))
+        set_("up", self.up if abs(length - 1) <= 1e-6 else (self.up / length).astype(np.float32))
         need_choice(Blending, blending=self.blending)
         set_("filter_px2", checked_filter(self.filter_px2, self.face_splat))
         checked_order(self.order, self.face_splat)
-        attributes = {}
-        for name, value in self.attributes.items():
-            ndim = np.ndim(value)
-            if ndim not in (1, 2):
-                raise ValueError(
-                    f"attribute {name!r} must have one row for each vertex, got shape {np.shape(value)}"
-                )
-            attributes[name] = checked_array(f"attribute {name!r}", value, np.float32, (v, None)[:ndim])
-        set_("attributes", MappingProxyType(attributes))
+        set_("attributes", MappingProxyType(checked_attributes(self.attributes, v)))
         if self.binding is not None:
             if len(self.binding.vertex_face) != v:
                 raise ValueError(f"binding must bind {v} vertices, it binds {len(self.binding.vertex_face)}")
@@ -190,6 +184,12 @@ class SplatMesh:
                 "harmonics are of splats, but two splats share a vertex: give every splat its own vertices,"
                 " or harmonics=None"
             )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"attributes": dict(self.attributes)}  # a view of a dictionary cannot be copied
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, attributes=MappingProxyType(state["attributes"]))
 
     def __repr__(self) -> str:
         parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} triangles"]
@@ -387,7 +387,8 @@ class SplatMesh:
         """The mesh with its vertices at (v, 3) ``vertices``, as after an edit, a pose or a simulation.
 
         What has a direction turns with the splats (without ``face_splat``, with the triangles): normals and
-        harmonics, by the rotation that fits best how the corners of a splat have moved.
+        harmonics, by the rotation that fits best how the corners of a splat have moved. So this is for
+        motions; ``transformed`` mirrors.
 
         Args:
             vertices: the new positions, relative to ``origin``.
@@ -396,15 +397,22 @@ class SplatMesh:
 
         Raises ValueError for another number of vertices, or positions that are not finite.
         """
-        vertices = checked_array("vertices", vertices, np.float32, (len(self.vertices), 3))
-        harmonics = self.harmonics
-        old = self.normals if normals is None else None
-        if old is not None or harmonics is not None:
-            splats = self.splats
-            rotations = splats.rotations(self.vertices, vertices)
-            normals = normals if old is None else splats.turned(old, rotations)
-            harmonics = None if harmonics is None else turned_harmonics(harmonics, rotations)
-        return replace(self, vertices=vertices, normals=normals, harmonics=harmonics, binding=binding)
+        return moved_mesh(self, vertices, normals, binding)
+
+    def transformed(self, matrix: np.ndarray) -> SplatMesh:
+        """The mesh after the affine map ``matrix`` of the world: moved, turned, scaled, mirrored.
+
+        Concretely, a vertex v goes to A v + t, ``origin`` to A times it. Colours seen from direction d become
+        those seen from U^T d, where U is the orthogonal factor of A, and ``up`` turns by U. A mirror reverses
+        the order of the corners, so that normals stay outside. A binding to a base stays, but for one with
+        layers above it and a map that is no similarity.
+
+        Args:
+            matrix: (4, 4) [[A, t], [0, 1]], (3, 4) [A, t], or (3, 3) A.
+
+        Raises ValueError for another shape or last row, and for a matrix that is singular or not finite.
+        """
+        return transformed_mesh(self, matrix)
 
     def prune(self, min_opacity: float) -> SplatMesh:
         """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the

@@ -433,6 +433,20 @@ def test_shells_lie_at_their_distance_and_grow_with_the_base():
         bind(base, layers=2, spacing=float("nan"))
 
 
+@pytest.mark.parametrize("lift", [None, -0.05])
+def test_shells_of_a_mirrored_base_stay_on_their_side(lift):
+    base, mirror = cube(), np.array([-1, 1, 1], np.float32)
+    prior = bind(base, layers=3, spacing=-0.05)
+    posed = prior.pose(base.vertices * mirror, lift=lift)
+    np.testing.assert_allclose(posed.vertices, prior.mesh.vertices * mirror, atol=1e-6)
+    np.testing.assert_allclose(posed.normals, prior.mesh.normals * mirror, atol=1e-6)
+    np.testing.assert_allclose(posed.binding.positions(), posed.vertices, atol=1e-6)
+    back = MeshPrior(posed).pose(base.vertices)
+    np.testing.assert_allclose(back.vertices, prior.mesh.vertices, atol=1e-6)
+    turned = prior.pose(base.vertices * (-1, -1, 1), lift=lift)
+    np.testing.assert_allclose(turned.vertices, prior.mesh.vertices * (-1, -1, 1), atol=1e-6)
+
+
 def test_another_topology_is_refused():
     prior = bind(cube())
     with pytest.raises(ValueError, match="the base has 8 vertices, got positions of 7"):

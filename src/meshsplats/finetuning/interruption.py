@@ -19,6 +19,9 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(f"stopped after step {step}")
         self.step, self.signal = step, number
 
+    def __reduce__(self) -> tuple[type[Interrupted], tuple[int, int]]:
+        return type(self), (self.step, self.signal)  # BaseException keeps the message alone
+
 
 class StopSignals:
     """Context manager that stores the first SIGINT or SIGTERM in ``received`` instead of ending the process.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,10 @@ from meshsplats.mesh import SplatMesh
 LIFT = 2e-5
 """Distance between two layers of exported meshes, relative to the diagonal of the base's bounding box: enough
 for the float32 positions of ray tracers and engines, and too small to be visible."""
+_FLAT = 1e-5
+"""Least thickness of a base, relative to its length, that tells a mirror from a turn."""
+_ROUNDING = 1e-4
+"""Error of an affine map, relative to the size of the base."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +76,17 @@ class MeshPrior:
         """The splats on a posed base.
 
         Every vertex is the barycentric combination of the posed corners of its face, which layers above 0
-        have moved along the posed base's normals.
+        have moved along the posed base's normals. Where an affine map mirrors the whole base, its triangles
+        are seen from behind: normals and layers then are on the other side of them, and colours that depend
+        on the view are mirrored.
 
         Args:
             vertices: (n, 3) posed positions of the base's vertices, relative to the origin of the mesh; the
                 stored ones by default.
-            lift: distance between layers in scene units. By default that of the prior, scaled with the base:
-                by the square root of the ratio of its areas. With 0 the layers are coplanar, and this
-                project's renderer blends them in their order (``depth_group``); for other programs use
-                ``export_lift``.
+            lift: distance between layers in scene units, negative inwards. By default that of the prior,
+                scaled with the base: by the square root of the ratio of its areas. With 0 the layers are
+                coplanar, and this project's renderer blends them in their order (``depth_group``); for other
+                programs use ``export_lift``.
 
         Returns:
             The mesh with the posed base's shading normals, and a binding to the posed base.
@@ -96,10 +102,22 @@ class MeshPrior:
             if len(positions) != len(binding.base_vertices):
                 count = len(binding.base_vertices)
                 raise ValueError(f"the base has {count:,} vertices, got positions of {len(positions):,}")
-        posed = binding.moved(positions, binding.lift if lift is None else lift)
+        mirror = None if vertices is None else _mirror(binding.base_vertices, positions)
+        side = 1 if mirror is None else -1
+        posed = binding.moved(positions, side * (binding.lift if lift is None else lift))
         if lift is None and binding.lift and binding.area > 0:
-            posed = binding.moved(positions, binding.lift * (posed.area / binding.area) ** 0.5)
-        return self.mesh.moved(posed.positions(), normals=posed.normals(), binding=posed)
+            posed = binding.moved(positions, posed.lift * (posed.area / binding.area) ** 0.5)
+        normals = side * posed.normals()
+        if mirror is None:
+            return self.mesh.moved(posed.positions(), normals=normals, binding=posed)
+        return replace(
+            self.mesh.transformed(mirror),
+            vertices=posed.positions(),
+            normals=normals,
+            binding=posed,
+            up=self.mesh.up,
+            origin=self.mesh.origin,
+        )
 
     def in_file(self, path: str | os.PathLike[str]) -> SplatMesh:
         """The mesh for the format of ``path``: for other programs than this one, which reads .npz, coplanar
@@ -123,6 +141,18 @@ class MeshPrior:
                 f"the edited base has other triangles ({int(differ.sum()):,} of {len(found):,}; the first is"
                 f" number {first}, {found[first].tolist()} instead of {expected[first].tolist()}): {advice}"
             )
+
+
+def _mirror(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
+    """(3, 3) linear part of the affine map of the points ``before`` (n, 3) to ``after`` where there is one
+    and it mirrors, else None. Points in a plane are mirrored by a turn, too, so they are not."""
+    old, new = (
+        points.astype(np.float64) - points.mean(axis=0, dtype=np.float64) for points in (before, after)
+    )
+    matrix, _, rank, _ = np.linalg.lstsq(old, new, rcond=_FLAT)
+    if rank < 3 or np.linalg.det(matrix) >= 0 or np.linalg.cond(matrix) > 1 / _FLAT:
+        return None
+    return matrix.T if np.abs(old @ matrix - new).max() <= _ROUNDING * np.abs(new).max() else None
 
 
 def load_prior(path: str | os.PathLike[str]) -> MeshPrior:

@@ -1,0 +1,61 @@
+"""Moving meshes: vertices to new positions, and all of a mesh by an affine map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from meshsplats._arrays import checked_array
+from meshsplats._geometry import affine_parts
+from meshsplats.spherical_harmonics import moved_harmonics, turned_harmonics
+
+_ALIKE = 1e-6
+"""Largest difference between the stretches of a similarity, relative."""
+Mesh = TypeVar("Mesh", bound=Any)
+"""``SplatMesh``, which imports this module."""
+
+
+def moved_mesh(mesh: Mesh, vertices: np.ndarray, normals: np.ndarray | None, binding: Any) -> Mesh:
+    """``SplatMesh.moved``."""
+    vertices = checked_array("vertices", vertices, np.float32, (len(mesh.vertices), 3))
+    harmonics = mesh.harmonics
+    old = mesh.normals if normals is None else None
+    if old is not None or harmonics is not None:
+        splats = mesh.splats
+        rotations = splats.rotations(mesh.vertices, vertices)
+        normals = normals if old is None else splats.turned(old, rotations)
+        harmonics = None if harmonics is None else turned_harmonics(harmonics, rotations)
+    return replace(mesh, vertices=vertices, normals=normals, harmonics=harmonics, binding=binding)
+
+
+def transformed_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """``SplatMesh.transformed``."""
+    a, shift = affine_parts(matrix)
+    u, stretch, vt = np.linalg.svd(a)
+    mirrors = np.linalg.det(a) < 0
+
+    def mapped(points: np.ndarray) -> np.ndarray:
+        return (points @ a.T + shift).astype(np.float32)  # float64 until then
+
+    normals = mesh.normals
+    if normals is not None:
+        normals = normals @ np.linalg.inv(a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    binding = mesh.binding
+    if binding is not None:
+        similar = stretch[0] <= stretch[2] * (1 + _ALIKE)
+        lift = binding.lift * float(stretch.mean()) * (-1 if mirrors else 1)
+        kept = similar or not binding.lift
+        binding = binding.moved(mapped(binding.base_vertices), lift) if kept else None
+    return replace(
+        mesh,
+        vertices=mapped(mesh.vertices),
+        faces=mesh.faces[:, [0, 2, 1]] if mirrors else mesh.faces,
+        normals=normals,
+        harmonics=None if mesh.harmonics is None else moved_harmonics(mesh.harmonics, a),
+        up=u @ vt @ mesh.up,
+        binding=binding,
+        origin=a @ mesh.origin + 0.0,
+    )
