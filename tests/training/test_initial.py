@@ -9,8 +9,9 @@ import pytest
 from _balls import ball_view, cameras_around
 
 from meshsplats.datasets.points import ScenePoints
-from meshsplats.datasets.silhouettes import has_silhouettes
+from meshsplats.datasets.silhouettes import has_alpha, has_silhouettes, with_clear_pixels_masked
 from meshsplats.datasets.views import Dataset, View, ViewImage
+from meshsplats.errors import DataWarning
 from meshsplats.rendering import render
 from meshsplats.training import hull, initial, starting_fans, train_config
 from meshsplats.training.hull import carve, in_silhouettes
@@ -94,10 +95,38 @@ def test_silhouettes_need_alpha_that_leaves_something_out(ball, room):
     assert not has_silhouettes([replace(view, source=full)])
 
 
+def test_clear_corners_of_a_photograph_are_no_silhouette(room):
+    """They do not count; the others stay as they are."""
+
+    def cornered(view: View) -> View:
+        image = view.load()
+        alpha = np.ones((64, 64), np.float32)
+        alpha[:6, :9] = 0
+        return replace(view, source=ViewImage(image.color * alpha[..., None], alpha))
+
+    views = [*room[:5], cornered(room[5]), *room[6:]]
+    assert not has_silhouettes(views)
+    assert not has_silhouettes([*map(cornered, room)])
+    with pytest.warns(DataWarning, match="1 of 24 photographs have clear pixels.*: 005. These pixels do not"):
+        dataset = with_clear_pixels_masked(Dataset(views[:20], views[20:]))
+    odd = dataset.train[5]
+    assert odd.alpha is None
+    assert not odd.mask[:6, :9].any()
+    assert odd.mask.sum() == 64 * 64 - 54
+    assert dataset.train[4] is room[4]
+    assert not has_alpha(odd)
+    assert with_clear_pixels_masked(dataset) is dataset
+
+
+def test_cut_out_photographs_keep_their_alpha(ball, room):
+    dataset = Dataset(tuple(ball[:12]), tuple(ball[12:]))
+    assert with_clear_pixels_masked(dataset) is dataset
+    assert has_silhouettes([*ball[:12], *room[12:]])
+    assert not has_silhouettes([*ball[:11], *room[11:]])
+
+
 @pytest.mark.slow
-def test_one_view_with_alpha_is_enough_for_silhouettes(ball, room):
-    """Whichever it is; the others take no part."""
-    assert has_silhouettes([room[0], ball[1]])
+def test_photographs_without_alpha_take_no_part_in_silhouettes(ball, room):
     surface = carve([*ball[::2], *room[1::2]], 500)
     assert np.linalg.norm(surface.points, axis=1).min() > 1 - surface.side
     assert np.quantile(np.linalg.norm(surface.points, axis=1), 0.9) < 1.5

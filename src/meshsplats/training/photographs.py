@@ -66,6 +66,7 @@ class PhotographOptions:
         """The photographs in ``folder``, over the background of the training, and that background. ValueError
         if there are fewer than two to train on."""
         from meshsplats.datasets.folder import load_dataset
+        from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_masked
         from meshsplats.evaluation.backgrounds import BLACK, Background
 
         dataset = load_dataset(
@@ -81,12 +82,13 @@ class PhotographOptions:
                 f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
                 " are needed to train on (``test_every`` 0 holds none out)"
             )
+        dataset = with_clear_pixels_masked(dataset)
         if config.background in BACKGROUNDS:
             found = Background(BACKGROUNDS[config.background], "given")
-        elif dataset.train[0].load().alpha is None:
-            found = Background(BLACK, "given")  # covered by the fans themselves
-        else:
+        elif has_silhouettes(dataset.train):
             found = Background((1.0, 1.0, 1.0), "usual")
+        else:
+            found = Background(BLACK, "given")  # covered by the fans themselves
         return dataset.over(found.color), found
 
     def plan(self, folder: Path, config: TrainConfig, *, as_splats: bool = False, say: Say) -> Plan:

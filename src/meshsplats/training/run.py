@@ -14,7 +14,7 @@ from meshsplats._kinds import need
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import reduced_views
-from meshsplats.datasets.silhouettes import has_silhouettes
+from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_masked
 from meshsplats.datasets.views import Dataset, ImageCache
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
@@ -63,7 +63,8 @@ def train(
 
     Args:
         dataset: the training views, and held-out views to score. Photographs without alpha count as opaque:
-            the random background of some steps must be covered.
+            the random background of some steps must be covered. Alpha cuts out a subject if a tenth of the
+            image is clear in at least half of the training views.
         config: the configuration; ``train_config()`` by default.
         points: known points of the scene, from ``load_points``.
         run: output folder, resumption from a checkpoint, logging and resources.
@@ -97,6 +98,7 @@ def train(
     journal = None if run.folder is None else Journal(run.folder)
     if run.resume and journal is not None:
         mesh = _stored_start(journal)
+    dataset = with_clear_pixels_masked(dataset)
     else:
         mesh = starting_fans(dataset, config, points, run.threads)
         for message in find_suspects(dataset.train).messages():
