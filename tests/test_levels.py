@@ -13,6 +13,7 @@ from _stock_viewer import stock_image
 
 from meshsplats import (
     ConversionOptions,
+    chains,
     convert,
     load_gaussians,
     load_mesh,
@@ -28,6 +29,7 @@ from meshsplats.cli.messages import Terminated
 from meshsplats.conversion import merging
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.demo_scene import make_scene
+from meshsplats.evaluation.viewers import AlphaChoice
 from meshsplats.file_options import ChainOptions
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import listed_nodes
@@ -314,6 +316,14 @@ def test_levels_of_many_splats_are_merged_in_blocks(monkeypatch):
     made = merged(cloud, Level(400, 60, 2000), cameras)
     np.testing.assert_array_equal(made.means, simplify_in_blocks(cloud, 400, cameras=cameras).means)
     assert not np.array_equal(made.means, simplify(cloud, 400, cameras=cameras).means)
+
+
+def test_all_levels_have_the_alpha_mode_of_the_first(splats, tmp_path, monkeypatch):
+    choices = iter([AlphaChoice("mask", 0.1, 20.0, 25.0), AlphaChoice("blend", 0.3, 24.0, 23.0)])
+    monkeypatch.setattr(chains, "choose_alpha", lambda *args, **options: next(choices))
+    assert run(splats, "-o", tmp_path / "chain", *QUICK) == 0
+    rows = json.loads((tmp_path / "chain" / "levels.json").read_text())["levels"]
+    assert [(row["alpha"]["alpha"], row["alpha"]["cutoff"]) for row in rows] == [("mask", 0.1), ("mask", 0.3)]
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from meshsplats._files.atomic import replace_folder, write_json
 from meshsplats._kinds import as_path
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.level_tables import TABLE, load_table
-from meshsplats.evaluation.viewers import choose_alpha
+from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
 from meshsplats.file_options import ChainOptions
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 from meshsplats.formats.meshes import save_mesh
@@ -152,6 +152,15 @@ def make_chain(
     return table
 
 
+def _as_first(choice: AlphaChoice, record: Path) -> AlphaChoice:
+    """``choice`` with the mode of the first level, of ``record``, where there is one: nothing becomes
+    see-through when a viewer changes levels."""
+    if not record.is_file():
+        return choice
+    first = json.loads(record.read_text(encoding="utf-8"))["alpha"]["alpha"]
+    return replace(choice, alpha=first) if {first, choice.alpha} == {"blend", "mask"} else choice
+
+
 def _made(
     cloud: GaussianCloud,
     splats: GaussianCloud,
@@ -187,7 +196,7 @@ def _made(
         mesh = replace(mesh, order=chosen.order)
     choice = None
     if chosen.alpha == "auto" and chosen.format == "glb":
-        choice = choose_alpha(mesh, cameras, threads=threads)
+        choice = _as_first(choose_alpha(mesh, cameras, threads=threads), path.with_name("level_0.json"))
     asked = {} if chosen.alpha == "auto" else {"alpha": chosen.alpha}
     scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces), len(cloud))]
     if order is None:
