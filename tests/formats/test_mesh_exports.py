@@ -13,6 +13,7 @@ from _meshes import fan_mesh, random_mesh
 
 from meshsplats import DataWarning, MissingDependencyError, SplatMesh, load_mesh, save_mesh
 from meshsplats.colors import srgb_to_linear
+from meshsplats.formats._orientation import up_rotation
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.writer import change_alpha
 
@@ -131,12 +132,38 @@ def test_obj_by_hand(tmp_path):
     save_mesh(mesh, tmp_path / "m.obj")  # opaque: no warning
     lines = (tmp_path / "m.obj").read_text().splitlines()
     assert [x for x in lines if not x.startswith("#")] == [
-        "v 0 0 0.100000001 1 0 0.25",
+        "o meshsplats_up_0_-1_0_to_y",
+        "v 0 0 -0.100000001 1 0 0.25",
         "v 1 0 0 1 0 0.25",
-        "v 0 1 0 1 0 0.25",
-        *["vn 0 0 1"] * 3,
+        "v 0 -1 0 1 0 0.25",
+        *["vn 0 0 -1"] * 3,
         "f 1//1 2//2 3//3",
     ]
+
+
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.3, -0.8, 0.2), (-0.3, 0.8, 0.2)])
+def test_obj_has_y_up_and_comes_back_as_it_was(tmp_path, up):
+    unit = np.array(up) / np.linalg.norm(up)
+    mesh = SplatMesh([[0.1, 0.2, 0.3], [1, 0, 0.7], unit], [[0, 1, 2]], np.ones((3, 4)), up=unit)
+    save_mesh(mesh, tmp_path / "m.obj")
+    text = (tmp_path / "m.obj").read_text()
+    tip = [line.split()[1:4] for line in text.splitlines() if line.startswith("v ")][2]
+    np.testing.assert_allclose([float(x) for x in tip], (0, 1, 0), atol=1e-7)
+    again = load_mesh(tmp_path / "m.obj")
+    np.testing.assert_allclose(again.vertices, mesh.vertices, rtol=0, atol=1e-16)
+    np.testing.assert_array_equal(again.up, mesh.up)
+    # Editors drop comments and keep names of objects.
+    (tmp_path / "edited.obj").write_text("".join(x for x in text.splitlines(True) if x[0] != "#"))
+    np.testing.assert_allclose(load_mesh(tmp_path / "edited.obj").vertices, mesh.vertices, atol=1e-8)
+
+
+def test_older_obj_of_ours_is_not_turned(tmp_path):
+    (tmp_path / "m.obj").write_text(
+        "# meshsplats up 0 -1 0\nv 0 0 0 1 1 1\nv 1 2 3 1 1 1\nv 1 0 0 1 1 1\nf 1 2 3\n"
+    )
+    mesh = load_mesh(tmp_path / "m.obj")
+    assert mesh.vertices[1].tolist() == [1, 2, 3]
+    assert mesh.up.tolist() == [0, -1, 0]
 
 
 def test_obj_of_a_mesh_for_linear_blending_has_display_colours(tmp_path):
@@ -150,7 +177,7 @@ def test_trimesh_reads_our_obj(tmp_path):
     mesh = replace(MESH, normals=None, colors=np.hstack([MESH.plain_colors, np.ones((20, 1))]))
     save_mesh(mesh, tmp_path / "m.obj")
     got = trimesh.load(tmp_path / "m.obj", process=False, maintain_order=True)
-    np.testing.assert_array_equal(got.vertices.astype(np.float32), mesh.vertices)
+    np.testing.assert_allclose(got.vertices, mesh.vertices @ up_rotation(mesh.up).T, atol=1e-6)
     np.testing.assert_array_equal(got.faces, mesh.faces)
     np.testing.assert_allclose(got.visual.vertex_colors / 255, mesh.colors, atol=1 / 255)
 

@@ -445,7 +445,7 @@ def test_our_obj_comes_back_but_for_the_last_digits(tmp_path):
     save_mesh(mesh, tmp_path / "a.obj")
     again = load_mesh(tmp_path / "a.obj")
     np.testing.assert_array_equal(again.origin, mesh.origin)
-    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=2e-9)
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-8)
 
 
 def test_meshes_without_an_origin_are_written_as_before(tmp_path):

@@ -1,5 +1,10 @@
 """Wavefront `.obj` meshes: vertices, polygons, and colours after the positions, as many programs write
-them."""
+them.
+
+Readers of these files take +y for up. Ours are turned so, and a comment has the up direction from before, by
+which they are turned back; the name of the object, too, which editors keep. Older ones of ours are not
+turned, with their up direction in another comment.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +17,19 @@ from typing import BinaryIO
 import numpy as np
 
 from meshsplats._origin import in_words, zero_origin
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._orientation import up_rotation
 from meshsplats.formats._validation import checked, local_positions, straight_colors
 from meshsplats.formats.mesh_formats import FileSize, MeshCodec
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
+_TURNED_COMMENT = "# meshsplats turned"
 _UP_COMMENT = "# meshsplats up"
 _ORIGIN_COMMENT = "# meshsplats origin"
+_NAME = "meshsplats_up_"
 _ROWS = 1 << 14
 
 
@@ -28,9 +37,9 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
     """Writes positions, display colours after them (those for programs without harmonics) and triangles as
     text; nine digits keep float32 exactly.
 
-    The format has no opacity: a DataWarning counts translucent vertices. Positions are in the world, doubles
-    where the mesh has an origin; the up direction and the origin are in comments, which ``load_mesh`` reads
-    and other programs ignore.
+    The format has no opacity: a DataWarning counts translucent vertices. Positions are in the world, turned
+    until +y is up; doubles where the mesh has an origin or its up direction is along no axis. The up
+    direction and the origin are in comments, by which ``load_mesh`` gives the same mesh.
     """
     lost = [f.name for f in mesh.extras() if f.per == "face"] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
@@ -44,31 +53,53 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
         )
     rgb = mesh.plain.colors[:, :3]
     rgb = linear_to_srgb(rgb) if mesh.blending == "linear" else rgb
-    up = " ".join(repr(float(u)) for u in mesh.up)
     corner = "%d" if mesh.normals is None else "%d//%d"
     with open(path, "wb") as file:
         file.write(b"# x y z, then red green blue as display values\n")
-        file.write(f"{_UP_COMMENT} {up}\n".encode())
-        if mesh.origin.any():
-            file.write(f"{_ORIGIN_COMMENT} {in_words(mesh.origin)}\n".encode())
-            write_rows(file, "v %r %r %r %.9g %.9g %.9g\n", mesh.vertices, rgb, plus=mesh.origin)
-        else:
-            write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
+        file.write(comments(mesh))
+        wide = mesh.origin.any() or not _along_axes(_turn(mesh.up))
+        xyz = "%r %r %r" if wide else "%.9g %.9g %.9g"
+        write_rows(file, f"v {xyz} %.9g %.9g %.9g\n", turned_positions(mesh), rgb)
         if mesh.normals is not None:
-            write_rows(file, "vn %.9g %.9g %.9g\n", mesh.normals)
+            write_rows(file, "vn %.9g %.9g %.9g\n", turned_directions(mesh, mesh.normals))
         faces = mesh.faces + 1
         columns = [faces[:, k, None] for k in range(3) for _ in range(corner.count("%"))]
         write_rows(file, f"f {corner} {corner} {corner}\n", *columns)
 
 
-def write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: np.ndarray | None = None) -> None:
-    """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``; ``plus``, float64,
-    is added to the first of them."""
+def comments(mesh: SplatMesh | BaseMesh) -> bytes:
+    """Lines by which ``read_obj`` puts a mesh back in its place."""
+    lines = [f"{_TURNED_COMMENT} {' '.join(repr(float(u)) for u in mesh.up)}\n"]
+    if mesh.origin.any():
+        lines.append(f"{_ORIGIN_COMMENT} {in_words(mesh.origin)}\n")
+    lines.append(f"o {_NAME}{'_'.join(f'{u:.9g}' for u in mesh.up)}_to_y\n")
+    return "".join(lines).encode()
+
+
+def turned_positions(mesh: SplatMesh | BaseMesh) -> np.ndarray:
+    """(v, 3) float64 vertices in the world, turned until +y is up."""
+    return np.asarray((mesh.vertices + mesh.origin) @ _turn(mesh.up).T + 0.0)
+
+
+def turned_directions(mesh: SplatMesh | BaseMesh, directions: np.ndarray) -> np.ndarray:
+    """(n, 3) float64 ``directions`` (n, 3) of the mesh, turned with its vertices."""
+    return np.asarray(directions @ _turn(mesh.up).T + 0.0)
+
+
+def _turn(up: np.ndarray) -> np.ndarray:
+    """(3, 3) float64 ``up_rotation``; between axes without rounding errors, so that no digit is lost."""
+    turn = up_rotation(up)
+    return np.round(turn) if _along_axes(turn) else turn
+
+
+def _along_axes(turn: np.ndarray) -> bool:
+    return bool(np.abs(turn - np.round(turn)).max() < 1e-12)
+
+
+def write_rows(file: BinaryIO, line: str, *columns: np.ndarray) -> None:
+    """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``."""
     for start in range(0, len(columns[0]), _ROWS):
-        parts = [c[start : start + _ROWS] for c in columns]
-        if plus is not None:
-            parts[0] = parts[0] + plus
-        rows = np.concatenate(parts, axis=1)
+        rows = np.concatenate([c[start : start + _ROWS] for c in columns], axis=1)
         file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
 
 
@@ -78,17 +109,22 @@ def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     Positions are relative to ``origin``; by default to that of our files, or to one that suits those of
     others.
 
-    Up is +y, as usual for these files, unless a comment of ours says otherwise. Colours are those of lines
-    ``v x y z r g b``, display values in [0, 1], if all vertices have them; else the mesh is grey, with a
-    DataWarning. Texture coordinates, normals and materials are ignored. Raises FileFormatError that names the
-    line.
+    Up is +y, as usual for these files, unless a note of ours says that they were turned or never were.
+    Colours are those of lines ``v x y z r g b``, display values in [0, 1], if all vertices have them; else
+    the mesh is grey, with a DataWarning. Texture coordinates, normals and materials are ignored. Raises
+    FileFormatError that names the line.
     """
-    up, own = np.array([0.0, 1.0, 0.0]), None
+    up, turn, own = np.array([0.0, 1.0, 0.0]), None, None
     positions, colors, lengths, corners = array("d"), array("d"), array("q"), array("q")
     with open(path, "rb") as file:
         for number, words in statements(file.read()):
             try:
-                if words[:3] == _UP_COMMENT.encode().split():
+                if words[:3] == _TURNED_COMMENT.encode().split():
+                    up, turn = _turned(words[3:6])
+                    own = zero_origin() if own is None else own
+                elif turn is None and words[0] == b"o" and words[-1].startswith(_NAME.encode()):
+                    up, turn = _turned(words[-1].removeprefix(_NAME.encode()).split(b"_")[:3])
+                elif words[:3] == _UP_COMMENT.encode().split():
                     up = np.array([float(u) for u in words[3:6]])
                     own = zero_origin() if own is None else own
                 elif words[:3] == _ORIGIN_COMMENT.encode().split():
@@ -109,9 +145,11 @@ def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     if not lengths:
         raise FileFormatError(f"{path}: holds no faces")
     faces, _ = cut_polygons(np.array(lengths), np.array(corners), {})
-    vertices, at = local_positions(
-        np.array(positions).reshape(-1, 3), own if origin is None else origin, path
-    )
+    points = np.array(positions).reshape(-1, 3)
+    if turn is not None:
+        with np.errstate(invalid="ignore", over="ignore"):
+            points = points @ turn
+    vertices, at = local_positions(points, own if origin is None else origin, path)
     stored = np.array(colors).reshape(-1, 3)
     return checked(
         path,
@@ -124,6 +162,15 @@ def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         up=up,
         origin=at,
     )
+
+
+def _turned(words: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """The up direction of a mesh, and the turn that its file has. ValueError for none."""
+    x, y, z = map(float, words)
+    up = np.array([x, y, z])
+    if not (np.isfinite(up).all() and up.any()):
+        raise ValueError
+    return up, _turn(up)
 
 
 def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:

@@ -7,9 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._files.atomic import write_bytes
-from meshsplats._origin import in_words
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.formats.obj.mesh import write_obj, write_rows
+from meshsplats.formats.obj.mesh import (
+    comments,
+    turned_directions,
+    turned_positions,
+    write_obj,
+    write_rows,
+)
 from meshsplats.formats.ply.mesh import write_mesh_ply
 from meshsplats.formats.surfaces.corners import normal_file, plain_mesh, smooth_normals, texture_file
 
@@ -34,13 +39,12 @@ def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | Non
     coordinates[:, 1] = 1 - coordinates[:, 1]
     places, index = np.unique(coordinates, axis=0, return_inverse=True)
     corner = np.stack([base.faces.ravel() + 1, index.reshape(-1) + 1, base.faces.ravel() + 1], axis=1)
-    up = " ".join(repr(float(u)) for u in base.up)
     with open(path, "wb") as file:
-        file.write(f"# meshsplats up {up}\n# meshsplats origin {in_words(base.origin)}\n".encode())
+        file.write(comments(base))
         file.write(f"mtllib {material.name}\nusemtl surface\n".encode())
-        write_rows(file, "v %r %r %r\n", base.vertices, plus=base.origin)
+        write_rows(file, "v %r %r %r\n", turned_positions(base))
         write_rows(file, "vt %.9g %.9g\n", places)
-        write_rows(file, "vn %.6f %.6f %.6f\n", smooth_normals(base))
+        write_rows(file, "vn %.6f %.6f %.6f\n", turned_directions(base, smooth_normals(base)))
         write_rows(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", corner.reshape(-1, 9))
 
 
