@@ -23,11 +23,8 @@ PAGE = """<!doctype html><style>body {margin: 0}</style><canvas id="c"></canvas>
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 PREPARE
-window.draw = async (k, prepared) => {
-  const canvas = document.getElementById('c');
-  const renderer = new THREE.WebGLRenderer({ canvas, preserveDrawingBuffer: true });
-  renderer.setSize(k.width, k.height);
-  const gltf = await new GLTFLoader().loadAsync('./mesh.glb');
+const load = async (name, prepared) => {
+  const gltf = await new GLTFLoader().loadAsync(name);
   const scene = new THREE.Scene();
   scene.background = new THREE.Color(1, 1, 1);
   scene.add(gltf.scene);
@@ -35,6 +32,13 @@ window.draw = async (k, prepared) => {
   gltf.scene.traverse(o => {
     if (o.isMesh) { o.frustumCulled = false; if (prepared) window.prepare(o); scene.ours = o; }
   });
+  return scene;
+};
+window.draw = async (k, prepared, before) => {
+  const canvas = document.getElementById('c');
+  const renderer = new THREE.WebGLRenderer({ canvas, preserveDrawingBuffer: true });
+  renderer.setSize(k.width, k.height);
+  const scene = await load('./mesh.glb', prepared);
   const camera = new THREE.PerspectiveCamera(), m = k.world_to_camera, s = [1, -1, -1, 1], view = [];
   for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) view.push(s[r] * m[r][c]);
   camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
@@ -47,6 +51,7 @@ window.draw = async (k, prepared) => {
   renderer.debug.onShaderError = (gl, program, vertex, fragment) => {
     message = gl.getShaderInfoLog(vertex) + gl.getShaderInfoLog(fragment) + gl.getProgramInfoLog(program);
   };
+  if (before) renderer.render(await load('./before.glb', prepared), camera);
   renderer.render(scene, camera);
   const gl = renderer.getContext(), pixels = new Uint8Array(4 * w * h);
   gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
@@ -71,8 +76,9 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 def three_js(
     folder: Path, node_package: Callable[[str], Path], prepare: str = ""
 ) -> Iterator[Callable[..., np.ndarray]]:
-    """Gives ``draw(camera, prepared=False)``: the image (h, w, 3) of ``folder / "mesh.glb"``, in [0, 1].
-    ``prepare``: a script that sets ``window.prepare``, which is called with each mesh if ``prepared``."""
+    """Gives ``draw(camera, prepared=False, before=False)``: the image (h, w, 3) of ``folder / "mesh.glb"``,
+    in [0, 1]. ``prepare``: a script that sets ``window.prepare``, which is called with each mesh if
+    ``prepared``. ``before``: draw ``folder / "before.glb"`` first, with the same renderer."""
     if _browser.PROGRAM is None:
         lacking("browser", "no Chromium was found")
     (folder / "node_modules").symlink_to(node_package("three") / "node_modules")
@@ -83,12 +89,12 @@ def three_js(
     threading.Thread(target=server.serve_forever, daemon=True).start()
     browser = _browser.Browser(_browser.WEBGL)
 
-    def draw(camera: Camera, prepared: bool = False) -> np.ndarray:
+    def draw(camera: Camera, prepared: bool = False, before: bool = False) -> np.ndarray:
         k = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         k |= {"world_to_camera": camera.world_to_camera.tolist(), "near": 0.05, "far": 100}
         page = browser.page(f"http://127.0.0.1:{server.server_port}/index.html", 200, 200)
         page.wait("document.body.dataset.ready")
-        drawn = page.run(f"draw({json.dumps(k)}, {json.dumps(prepared)})")
+        drawn = page.run(f"draw({json.dumps(k)}, {json.dumps(prepared)}, {json.dumps(before)})")
         assert drawn["message"] == ""
         rgba = np.array(drawn["pixels"]).reshape(camera.height, camera.width, 4)
         return rgba[::-1, :, :3] / 255

@@ -25,9 +25,12 @@ def drawing(tmp_path_factory, node_package):
     folder = tmp_path_factory.mktemp("three")
     with three_js(folder, node_package, snippet + "window.prepare = showHarmonics;") as draw:
 
-        def drawn(mesh, camera, *, harmonics=True):
-            ms.save_mesh(mesh, folder / "mesh.glb", alpha="opaque", cutoff=0.5)
-            return draw(camera, harmonics)
+        def drawn(mesh, camera, *, harmonics=True, before=None, order=None):
+            how = {"alpha": "opaque", "cutoff": 0.5} if order is None else {"order": order}
+            ms.save_mesh(mesh, folder / "mesh.glb", **how)
+            if before is not None:
+                ms.save_mesh(before, folder / "before.glb", **how)
+            return draw(camera, harmonics, before is not None)
 
         yield drawn
 
@@ -53,3 +56,23 @@ def test_images_are_those_of_render(drawing, mesh, degree):
     assert share > 0.97
     assert with_it > 55
     assert without < 40
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_the_model_before_has_a_shader_of_its_own(drawing, mesh, degree):
+    camera = ms.orbit(mesh, 1, azimuth=30, elevation=20, width=80, height=60)[0]
+    own, other = mesh.of_degree(1), mesh.of_degree(degree)
+    if degree:
+        other = replace(other, harmonics=3 * other.harmonics)
+    alone = drawing(own, camera)
+    np.testing.assert_array_equal(drawing(own, camera, before=other), alone)
+    assert ms.psnr(drawing(other, camera), alone) < 40
+
+
+def test_all_nodes_of_an_order_have_the_shader(drawing, mesh):
+    mesh = mesh.of_degree(1)
+    mesh = replace(mesh, harmonics=4 * mesh.harmonics)
+    camera = ms.orbit(mesh, 1, azimuth=30, elevation=20, width=80, height=60)[0]
+    order, wanted = ms.drawing_order(mesh, nodes=3, quick=True), ms.render(mesh, camera).color
+    shown, plain = (drawing(mesh, camera, harmonics=own, order=order) for own in (True, False))
+    assert ms.psnr(shown, wanted) > 3 + ms.psnr(plain, wanted)

@@ -67,6 +67,6 @@ static func _described(node: MeshInstance3D) -> String:
 static func bounds(node: Node) -> AABB:
 	var box := AABB()
 	for mesh in node.find_children("*", "MeshInstance3D", true, false):
-		var own: AABB = mesh.transform * mesh.get_aabb()
+		var own: AABB = mesh.global_transform * mesh.get_aabb()
 		box = own if box.size == Vector3.ZERO else box.merge(own)
 	return box

@@ -204,6 +204,8 @@ def _ordered_document(
         own_tables = {name: table[part.vertices] for name, table in tables.items()}
         primitive = _primitive(buffer, piece, colors.type, 0, own_tables)
         meshes.append({"name": "splats", "primitives": [primitive]})
+        if colors.note:  # for shaders, which see one mesh at a time
+            meshes[-1]["extras"] = {"meshsplats": colors.note}
     own = copies.own_triangles(mesh.faces)
     extras["copies"] = note = {"nodes": len(meshes), "turned": _raw(buffer, own.turned)}
     note["offset"] = _raw(buffer, own.offset) | {"bytes": own.offset.itemsize}
