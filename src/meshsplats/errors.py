@@ -31,6 +31,14 @@ class OverwritingError(ValueError):
     """An output would replace a file that is read, or another output."""
 
 
+class EarlierRunError(NamingOptions, FileExistsError):
+    """What an earlier run, or somebody else, has left where a run would write."""
+
+
+class NothingToResumeError(NamingOptions, FileNotFoundError):
+    """There is no earlier run to go on with."""
+
+
 class OptionValueError(NamingOptions, ValueError):
     """A value of an option that is out of range."""
 

@@ -18,6 +18,7 @@ from PIL import Image
 
 from meshsplats._core.kernels import round_fans
 from meshsplats.cli import main
+from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
@@ -633,6 +634,27 @@ def test_a_resumed_run_ends_with_the_same_bits(ball, tmp_path):
         train(ball, replace(config, max_splats=700), run=RunOptions(folder, resume=True))
 
 
+@pytest.mark.parametrize("shift", [(0, 0, 0), (4.5e5, 5.1e6, 90.0), (0, 1e5, 0)])
+def test_points_beside_the_scene_are_named(ball, monkeypatch, recwarn, shift):
+    """Of georeferenced photographs, for instance, loaded without the origin of the data set."""
+    from meshsplats.training import run
+
+    def begin(*_):
+        raise RuntimeError("began")
+
+    monkeypatch.setattr(run, "starting_fans", begin)
+    rng = np.random.default_rng(0)
+    colors, shown = np.full((500, 3), 128, np.uint8), np.full(500, 3)
+    positions = rng.normal(scale=0.2, size=(500, 3)) + shift
+    with pytest.raises(RuntimeError, match="began"):
+        train(ball, train_config(steps=1, **SMALL), points=ScenePoints(positions, colors, shown))
+    said = [str(one.message) for one in recwarn if "of the points" in str(one.message)]
+    assert [text[:39] for text in said] == ["100% of the points lie where no photogr"] * any(shift)
+    positions[7, 1] = np.nan
+    with pytest.raises(ValueError, match="points must be finite, 1 of 500 are not"):
+        train(ball, train_config(steps=1, **SMALL), points=ScenePoints(positions, colors, shown))
+
+
 def test_bad_input_is_refused_before_the_work(ball, tmp_path):
     with pytest.raises(ValueError, match="at least 2 training views"):
         train(Dataset(ball.train[:1]), train_config(steps=1))
@@ -780,14 +802,20 @@ def test_a_new_run_removes_the_mesh_of_an_earlier_one(ball, start, tmp_path, mon
 
     monkeypatch.setattr(run, "starting_fans", lambda *_: start)
     tmp_path.joinpath(SO_FAR).write_bytes(b"")
+    tmp_path.joinpath("mesh.npz").write_bytes(b"mine")
 
     def fail(_progress):
-        raise OSError
+        raise RuntimeError("crashed")
 
-    with pytest.raises(OSError):
-        train(ball, train_config(steps=2, **SMALL), run=RunOptions(tmp_path), on_progress=fail)
+    config = train_config(steps=2, **SMALL)
+    with pytest.raises(FileExistsError, match=f"{SO_FAR} is not of an earlier run and would be replaced"):
+        train(ball, config, run=RunOptions(tmp_path), on_progress=fail)
+    tmp_path.joinpath("config.json").write_text(json.dumps(config.to_dict()))
+    with pytest.raises(RuntimeError, match="crashed"):
+        train(ball, config, run=RunOptions(tmp_path), on_progress=fail)
     assert not (tmp_path / SO_FAR).exists()
     assert load_image(tmp_path / COVERAGE).shape[2] == 3
+    assert tmp_path.joinpath("mesh.npz").read_bytes() == b"mine"
 
 
 # ---- As splats

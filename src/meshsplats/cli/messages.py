@@ -144,5 +144,5 @@ def about(*names: str) -> Iterator[None]:
 
 
 def flag(name: str) -> str:
-    """The option of a field: ``max_splats`` is ``--max-splats``."""
-    return "--" + name.replace("_", "-")
+    """The option of a field: ``max_splats`` is ``--max-splats``. What replaces old files has one flag."""
+    return "--force" if name == "replace_old" else "--" + name.replace("_", "-")

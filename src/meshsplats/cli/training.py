@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from meshsplats.finetuning.checkpoint import Checkpoint
     from meshsplats.finetuning.plans import Plan, Trained
-    from meshsplats.finetuning.run import RunOptions
+    from meshsplats.finetuning.run_options import RunOptions
 
 Config = TypeVar("Config", bound=FinetuneConfig)
 STARTUP_SECONDS = 1.0
@@ -249,11 +249,12 @@ class TrainingCommand(Command):
     def _run_options(self, files: RunFiles, start: float, reserve: float) -> RunOptions:
         """Of a run whose command started at ``start`` by the performance counter, and needs ``reserve``
         seconds afterwards."""
-        from meshsplats.finetuning.run import RunOptions
+        from meshsplats.finetuning.run_options import RunOptions
 
         return RunOptions(
             folder=files.folder,
             resume=self.resume,
+            replace_old=self.force,
             report_every=self.report_every,
             preview_every=self.preview_every,
             threads=self.threads,

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from meshsplats.finetuning.initial import starting_mesh
     from meshsplats.finetuning.interruption import Interrupted
     from meshsplats.finetuning.ordered import OrderedMesh, finetune_ordered
-    from meshsplats.finetuning.run import Progress, RunOptions, finetune
+    from meshsplats.finetuning.run import Progress, finetune
+    from meshsplats.finetuning.run_options import RunOptions
 else:
     _HOME = {
         "meshsplats.finetuning.config": (
@@ -42,6 +43,7 @@ else:
         "meshsplats.finetuning.initial": ("starting_mesh",),
         "meshsplats.finetuning.interruption": ("Interrupted",),
         "meshsplats.finetuning.ordered": ("OrderedMesh", "finetune_ordered"),
-        "meshsplats.finetuning.run": ("Progress", "RunOptions", "finetune"),
+        "meshsplats.finetuning.run": ("Progress", "finetune"),
+        "meshsplats.finetuning.run_options": ("RunOptions",),
     }
     __getattr__ = lazy_names(__name__, _HOME)

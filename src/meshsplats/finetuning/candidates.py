@@ -9,7 +9,8 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.benchmarks import Candidates
 from meshsplats.finetuning.config import make_config
 from meshsplats.finetuning.initial import for_photographs, starting_mesh
-from meshsplats.finetuning.run import RunOptions, finetune
+from meshsplats.finetuning.run import finetune
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 

@@ -36,8 +36,9 @@ from meshsplats.finetuning.checkpoint import cloud_digest, dataset_fingerprint
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.dividing import Cells, divide, waves
 from meshsplats.finetuning.initial import starting_mesh
-from meshsplats.finetuning.journal import CHECKPOINT, Journal
-from meshsplats.finetuning.run import Progress, RunOptions, finetune
+from meshsplats.finetuning.journal import CHECKPOINT, RECORD, Journal, claimed
+from meshsplats.finetuning.run import Progress, finetune
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud
@@ -53,10 +54,10 @@ SIDE = 160
 """Longest side in pixels of the images that this is found in."""
 BORDER = 16
 """Pixels around the window of a cell in a view."""
-RECORD = "cells.json"
-"""In the folder of the run."""
+CELLS = "cells"
+"""Folder of the cells, in that of the run."""
 RECORD_BYTES = 1 << 20
-"""Largest size of such a file."""
+"""Largest size of a ``RECORD``."""
 _CELL_FILE = re.compile(r"cell-\d{5,}(\.npz)?|coarse-\d{5,}\.ply")
 """Names in the folder of the cells: tuned meshes, folders of runs, splats that stand for a cell."""
 
@@ -153,6 +154,7 @@ def finetune_cells(
         ValueError: options that are for whole scenes, no training views, no splats.
         OtherRunError: the folder is of another run.
         FileFormatError: the record of the run that is resumed is broken.
+        FileExistsError: as ``finetune``.
         MemoryError, DivergenceError, Interrupted: as ``finetune``.
         ClusterError: the workers are lost; what is done stays.
     """
@@ -168,31 +170,32 @@ def finetune_cells(
         raise ValueError("there is no splat to fine-tune")
     cells = here.cells(options.splats)
     count = len(cells.low)
-    folder = run.folder / "cells"
-    _begin(run, folder, config, options, here, count)
-    start = time.perf_counter()
-    task = _Tuning(scene, config, options, replace(run, folder=folder, threads=workers.threads))
-    coarse = [cell for cell in range(count) if count > 1 and not task.coarse_file(cell).is_file()]
-    for _ in workers.run(task.coarsen, coarse):
-        pass
-    before: tuple[int, ...] = ()
-    done = {cell for cell in range(count) if task.file(cell).is_file()}
-    journal = Journal(run.folder)
-    fresh, steps = 0, max((line["step"] for line in journal.metrics()), default=0)
-    for wave in waves(cells, here.cloud.means):
-        todo = [(cell, before) for cell in wave if cell not in done]
-        for i, taken in workers.run(task.tune, todo):
-            done.add(todo[i][0])
-            fresh += 1
-            steps += taken
-            journal.log_metrics(steps, cell=todo[i][0], cells=count, done=len(done))
-            if on_progress is not None:
-                seconds = time.perf_counter() - start
-                left = seconds / fresh * (count - len(done))
-                share = len(done) / count
-                on_progress(Progress(steps, None, share, None, None, seconds, left, 0))
-        before += tuple(wave)
-    return TunedCells([task.file(cell) for cell in range(count)])
+    with claimed(run, (RECORD, CELLS)):
+        folder = run.folder / CELLS
+        _begin(run, folder, config, options, here, count)
+        start = time.perf_counter()
+        task = _Tuning(scene, config, options, replace(run, folder=folder, threads=workers.threads))
+        coarse = [cell for cell in range(count) if count > 1 and not task.coarse_file(cell).is_file()]
+        for _ in workers.run(task.coarsen, coarse):
+            pass
+        before: tuple[int, ...] = ()
+        done = {cell for cell in range(count) if task.file(cell).is_file()}
+        journal = Journal(run.folder)
+        fresh, steps = 0, max((line["step"] for line in journal.metrics()), default=0)
+        for wave in waves(cells, here.cloud.means):
+            todo = [(cell, before) for cell in wave if cell not in done]
+            for i, taken in workers.run(task.tune, todo):
+                done.add(todo[i][0])
+                fresh += 1
+                steps += taken
+                journal.log_metrics(steps, cell=todo[i][0], cells=count, done=len(done))
+                if on_progress is not None:
+                    seconds = time.perf_counter() - start
+                    left = seconds / fresh * (count - len(done))
+                    share = len(done) / count
+                    on_progress(Progress(steps, None, share, None, None, seconds, left, 0))
+            before += tuple(wave)
+        return TunedCells([task.file(cell) for cell in range(count)])
 
 
 def check_for_cells(config: FinetuneConfig) -> None:
@@ -235,11 +238,10 @@ def _begin(
             if before.get(name) != value:
                 raise OtherRunError(f"the cells in {folder} are of another run: other {name}")
         return
-    run.folder.mkdir(exist_ok=True)
-    folder.mkdir(exist_ok=True)
     path.unlink(missing_ok=True)
-    _remove_cells(folder)
     Journal(run.folder).begin(config.to_dict())
+    folder.mkdir(exist_ok=True)
+    _remove_cells(folder)
     write_text(path, json.dumps(facts, indent=1) + "\n")
 
 

@@ -24,8 +24,8 @@ from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
 from meshsplats.finetuning.config import FinetuneConfig, worthwhile_views, worthwhile_zooms
 from meshsplats.finetuning.initial import for_photographs, starting_mesh, starts_with_filter
 from meshsplats.finetuning.plans import Plan, Trained, over_background
-from meshsplats.finetuning.run import RunOptions
 from meshsplats.finetuning.run_files import RunFiles
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.start_options import StartOptions
 from meshsplats.finetuning.targets import Targets

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from meshsplats._files.atomic import write_text
+from meshsplats._files.locks import locked
+from meshsplats._json import json_object
+from meshsplats._kinds import need
+from meshsplats.errors import EarlierRunError, FileFormatError
 from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from meshsplats.finetuning.config import LENGTHS
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.images.writing import amplified_error, save_image, strip
 
 CHECKPOINT, METRICS, CONFIGURATION, PREVIEWS = (
@@ -21,6 +29,12 @@ CHECKPOINT, METRICS, CONFIGURATION, PREVIEWS = (
     "config.json",
     "previews",
 )
+RECORD = "cells.json"
+"""What a run in cells is about."""
+LOCK = ".run.lock"
+"""Not that of commands (``RunFiles.claimed``), which hold theirs around a run."""
+CONFIGURATION_BYTES = 1 << 20
+"""Most of a configuration."""
 ERROR_FACTOR = 4.0
 """Amplification of the error in previews."""
 
@@ -40,7 +54,8 @@ class Journal:
         return self.folder / CHECKPOINT
 
     def begin(self, config: dict[str, Any]) -> None:
-        """Creates the folder if needed (but not its parent) and removes the files of an earlier run."""
+        """Creates the folder if needed (but not its parent) and removes the files of an earlier run. The
+        configuration is the last to go and the first to come: files without one are not of a run."""
         self.folder.mkdir(exist_ok=True)
         self.remove()
         self._write_config(config)
@@ -48,10 +63,38 @@ class Journal:
 
     def remove(self) -> None:
         """Removes the files of a run, if there was one."""
-        for path in (self.checkpoint_path, self.folder / METRICS, self.folder / CONFIGURATION):
-            path.unlink(missing_ok=True)
         for preview in self._previews():
             preview.unlink()
+        for path in (self.checkpoint_path, self.folder / METRICS, self.folder / CONFIGURATION):
+            path.unlink(missing_ok=True)
+
+    def check_free(self, more: tuple[str, ...], replace_old: bool) -> None:
+        """EarlierRunError if a run that begins would replace files that are not of a run or, without
+        ``replace_old``, what an earlier one has left to resume. ``more``: names of further files of it."""
+        if self._has_run():
+            for name in () if replace_old else (CHECKPOINT, RECORD):
+                if (self.folder / name).exists():
+                    raise EarlierRunError(
+                        f"{self.folder / name} is left from an earlier run: ``resume`` continues it,"
+                        " ``replace_old`` starts again"
+                    )
+            return
+        named = [self.folder / name for name in (CHECKPOINT, METRICS, CONFIGURATION, *more)]
+        for path in (*named, *self._previews()):
+            if os.path.lexists(path):
+                raise EarlierRunError(
+                    f"{path} is not of an earlier run and would be replaced: give another folder"
+                )
+
+    def _has_run(self) -> bool:
+        """Whether the folder has the configuration of a run."""
+        path = self.folder / CONFIGURATION
+        try:
+            with open(path, "rb") as file:
+                found = json_object(file.read(CONFIGURATION_BYTES + 1), CONFIGURATION_BYTES, path)
+        except (OSError, FileFormatError):
+            return False
+        return {"preset", *LENGTHS} <= set(found)
 
     def _write_config(self, config: dict[str, Any]) -> None:
         write_text(self.folder / CONFIGURATION, json.dumps(config, indent=1) + "\n")
@@ -112,3 +155,28 @@ class Journal:
     def _previews(self) -> list[Path]:
         found = (self.folder / PREVIEWS).glob("step_*.png")
         return sorted(p for p in found if p.stem.removeprefix("step_").isdigit())
+
+
+@contextmanager
+def claimed(run: RunOptions | None, more: tuple[str, ...] = ()) -> Iterator[None]:
+    """While the block runs, no other process writes the folder of ``run``, if it has one.
+
+    Raises FileExistsError if one does, and, of a run that begins, EarlierRunError as ``Journal.check_free``.
+    """
+    need(RunOptions, run=run, optional=True)
+    if run is None or run.folder is None:
+        yield
+        return
+    run.folder.mkdir(exist_ok=True)
+    try:
+        with locked(run.folder / LOCK) as ours:
+            if not ours:
+                raise FileExistsError(
+                    errno.EEXIST, "another process is writing this run; give another folder", str(run.folder)
+                )
+            if not run.resume:
+                Journal(run.folder).check_free(more, run.replace_old)
+            yield
+    finally:
+        with suppress(OSError):
+            run.folder.rmdir()  # where nothing was written

@@ -46,7 +46,8 @@ from meshsplats.finetuning.pace import (
 from meshsplats.finetuning.phases.listed import check_for_file_order
 from meshsplats.finetuning.plain import with_plain_means
 from meshsplats.finetuning.reports import SCORED_VIEWS, held_out_scores, scored_count
-from meshsplats.finetuning.run import RunOptions, finetune
+from meshsplats.finetuning.run import finetune
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.gaussians import GaussianCloud

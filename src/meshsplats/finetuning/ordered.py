@@ -9,7 +9,9 @@ from meshsplats._kinds import need
 from meshsplats.datasets.views import Dataset
 from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
-from meshsplats.finetuning.run import Progress, RunOptions, ready_loop
+from meshsplats.finetuning.journal import claimed
+from meshsplats.finetuning.run import Progress, ready_loop
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
@@ -52,7 +54,8 @@ def finetune_ordered(
     listing.listed(mesh.faces)
     changes["order"] = "file"
     config = with_changes(config or FinetuneConfig(), **changes)
-    loop = ready_loop(mesh.plain, dataset, config, run, listing=listing, on_progress=on_progress)
-    tuned = loop.run()
+    with claimed(run):
+        loop = ready_loop(mesh.plain, dataset, config, run, listing=listing, on_progress=on_progress)
+        tuned = loop.run()
     assert loop.phase.listing is not None
     return OrderedMesh(tuned, loop.phase.listing)

@@ -17,8 +17,8 @@ from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import available_memory, check_memory, readable
 from meshsplats.finetuning.reports import SCORED_VIEWS
-from meshsplats.finetuning.run import RunOptions
 from meshsplats.finetuning.run_files import RunFiles
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud

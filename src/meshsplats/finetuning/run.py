@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
-from meshsplats._kinds import need, need_path
-from meshsplats._options import Range, check_options
+from meshsplats._kinds import need
 from meshsplats._origin import need_one_origin
-from meshsplats.choices import Device
-from meshsplats.datasets.views import CACHE_BYTES, Dataset
+from meshsplats.datasets.views import Dataset
 from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import OtherRunError
 from meshsplats.finetuning.checkpoint import (
@@ -30,13 +26,14 @@ from meshsplats.finetuning.clock import Clock
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.initial import order_of
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
-from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.journal import Journal, claimed
 from meshsplats.finetuning.loss import Loss, check_loss, loss_name
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.phases.choice import PHASE_ARRAYS, check_phases, first_phase
 from meshsplats.finetuning.phases.phase import Moment, Phase
 from meshsplats.finetuning.plain import most_images, with_plain_colors
 from meshsplats.finetuning.reports import Reports, scored_count
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import for_views, make_step
 from meshsplats.mesh import SplatMesh
@@ -55,41 +52,6 @@ CHECKPOINT_SECONDS = 4e-7
 
 CHECKPOINT_SHARE = 0.05
 """Largest share of the time that checkpoints take."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options that do not change the result, but for rounding: output folder, intervals of logging,
-    resources."""
-
-    folder: Path | None = None
-    """Folder for checkpoint, metrics, previews and configuration. None: nothing is written."""
-    resume: bool = False
-    """Resume from the checkpoint in ``folder``."""
-    report_every: Annotated[int, Range(0, math.inf)] = 100
-    """Steps between two scores on held-out views. 0: only at the end."""
-    preview_every: Annotated[int, Range(0, math.inf)] = 500
-    """Steps between two preview images; also one after each quarter of the run. 0: none."""
-    checkpoint_seconds: Annotated[float, Range(0, math.inf)] = 30.0
-    """Seconds between two checkpoints."""
-    threads: Annotated[int | None, Range(1, math.inf)] = None
-    """Maximum number of threads. None: all processors."""
-    device: Device = "cpu"
-    """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
-    spent: Annotated[float, Range(0, math.inf)] = 0.0
-    """Seconds already spent. They count towards ``minutes``."""
-    reserve: Annotated[float, Range(0, math.inf)] = 0.0
-    """Seconds that the caller needs afterwards. They count, too."""
-    cache_bytes: Annotated[int, Range(0, math.inf)] = CACHE_BYTES
-    """Limit of the data set's image cache, for the memory estimate."""
-
-    def __post_init__(self) -> None:
-        if self.folder is not None:
-            need_path(folder=self.folder)
-            object.__setattr__(self, "folder", Path(self.folder))
-        check_options(self)
-        if self.resume and self.folder is None:
-            raise ValueError("resume needs the folder of the run")
 
 
 @dataclass(frozen=True)
@@ -150,6 +112,8 @@ def finetune(
             origins; weights of the default loss beside another; a gradient of ``loss`` that does not have the
             shape of the image.
         OtherRunError: the checkpoint is of another run.
+        FileExistsError: the folder has the checkpoint of an earlier run (``RunOptions.replace_old``), files
+            of no run that would be replaced, or another process at work; nothing was written.
         MemoryError: the estimated memory is not available, or the mesh does not fit on the GPU; of a run that
             starts, nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
@@ -164,7 +128,9 @@ def finetune(
         raise ValueError("order 'file' gives a mesh and the order of its triangles: call finetune_ordered")
     if loss is not None:
         check_loss(loss, config, changes)
-    return ready_loop(mesh, dataset, config, run, frozen=frozen, loss=loss, on_progress=on_progress).run()
+    with claimed(run):
+        loop = ready_loop(mesh, dataset, config, run, frozen=frozen, loss=loss, on_progress=on_progress)
+        return loop.run()
 
 
 def ready_loop(
@@ -178,8 +144,8 @@ def ready_loop(
     listing: DrawOrder | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> TrainingLoop:
-    """The loop of a run, checked and begun or resumed. Arguments and errors as in ``finetune``; ``listing``:
-    of a run with order 'file', which needs one unless it is resumed."""
+    """The loop of a run, checked and begun or resumed in a folder that is ``claimed``. Arguments and errors
+    as in ``finetune``; ``listing``: of a run with order 'file', which needs one unless it is resumed."""
     need(SplatMesh, mesh=mesh)
     need(Dataset, dataset=dataset)
     need(RunOptions, run=run, optional=True)

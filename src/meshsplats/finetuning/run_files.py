@@ -56,8 +56,7 @@ class RunFiles:
 
     def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
         """OSError if something would be overwritten, cannot be written, or is missing for --resume."""
-        from meshsplats.finetuning.cells import RECORD
-        from meshsplats.finetuning.journal import CHECKPOINT
+        from meshsplats.finetuning.journal import CHECKPOINT, RECORD
 
         checkpoint = self.folder / (RECORD if self.in_cells else CHECKPOINT)
         if resume and not checkpoint.is_file():

@@ -19,7 +19,7 @@ from meshsplats.errors import OptionsError
 from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
 from meshsplats.finetuning.config import FinetuneConfig, worthwhile_views
 from meshsplats.finetuning.plans import Plan, Trained, over_background
-from meshsplats.finetuning.run import RunOptions
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.base_meshes import load_base

@@ -15,7 +15,8 @@ from meshsplats.conversion.recovery import THICKNESS
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.phases.blended import Blended
-from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
+from meshsplats.finetuning.run import Progress, TrainingLoop, run_start
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import for_views
 from meshsplats.gaussians import SH_C0, GaussianCloud

@@ -42,6 +42,10 @@ FEWEST_POINTS = 30
 """Points that bound the depths in a view, at least."""
 RANGE_POINTS = 20_000
 """Points, at most, that ranges of depth are taken from."""
+LOST_POINTS = 5000
+"""Points, at most, of which is asked whether any view shows them..."""
+LOST_DISTANCE = 1000.0
+"""...within this multiple of the farthest camera's distance from the middle of all."""
 NEARER, FARTHER = 0.6, 60.0
 """Depths are tried from this multiple of the least depth of the points to that of the greatest: outdoors,
 all known points may lie on what stands in front."""
@@ -94,6 +98,30 @@ def starting_patches(
         dense = None
     radius = shell_radius(views, surface.points.astype(np.float64) + origin, far)
     return dense, shell_patches(views, dense, radius, shell)
+
+
+def lost_points(views: Sequence[View], points: ScenePoints) -> float:
+    """Share of ``points`` that lie in the image of none of ``views``, or far from them all.
+
+    Raises ValueError for points that are not finite.
+    """
+    positions = points.positions
+    if not np.isfinite(positions).all():
+        wrong = int((~np.isfinite(positions).all(axis=1)).sum())
+        raise ValueError(f"points must be finite, {wrong:,} of {len(positions):,} are not: leave them out")
+    positions = subsample(positions, LOST_POINTS)
+    centers = np.array([view.camera.center for view in views])
+    middle = np.median(centers, axis=0)
+    around = np.linalg.norm(positions - middle, axis=1)
+    near = around <= LOST_DISTANCE * (np.linalg.norm(centers - middle, axis=1).max() or np.inf)
+    seen = np.zeros(len(positions), bool)
+    for view in views:
+        rest = np.flatnonzero(near & ~seen)
+        if not len(rest):
+            break
+        image, _ = view.camera.project(positions[rest])
+        seen[rest] = view.camera.in_image(image)
+    return 1 - float(seen.mean()) if len(seen) else 0.0
 
 
 def _with_points(

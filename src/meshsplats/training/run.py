@@ -18,9 +18,10 @@ from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_m
 from meshsplats.datasets.views import Dataset, ImageCache
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
-from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.journal import Journal, claimed
 from meshsplats.finetuning.memory import HARMONIC_BYTES, SHADED_BYTES, check_bytes, estimate_bytes
-from meshsplats.finetuning.run import Progress, RunOptions, TrainingLoop, run_start
+from meshsplats.finetuning.run import Progress, TrainingLoop, run_start
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.step import for_views
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.images.writing import save_image
@@ -33,14 +34,14 @@ from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growing import REDUCED_PART, Growing
 from meshsplats.training.growth import SHELL
 from meshsplats.training.hull import carving_bytes
-from meshsplats.training.initial import colored, fans_of, starting_patches
+from meshsplats.training.initial import colored, fans_of, lost_points, starting_patches
 from meshsplats.training.patches import Patches, flat_splats
 from meshsplats.training.stereo import matching_bytes
 from meshsplats.training.suspects import find_suspects
 
 SHOWN_NAMES = 10
 """Maximum number of such photographs that are named."""
-START, SO_FAR, COVERAGE = "start.npz", "mesh.npz", "coverage.png"
+START, SO_FAR, COVERAGE = "start.npz", "interrupted.npz", "coverage.png"
 """Files in the folder of a run: the fans that it started from, those at an interruption, and how many
 photographs show each place."""
 
@@ -66,7 +67,8 @@ def train(
             the random background of some steps must be covered. Alpha cuts out a subject if a tenth of the
             image is clear in at least half of the training views.
         config: the configuration; ``train_config()`` by default.
-        points: known points of the scene, from ``load_points``.
+        points: known points of the scene, relative to the origin of ``dataset``:
+            ``load_points(path, origin=dataset.origin)``.
         run: output folder, resumption from a checkpoint, logging and resources.
         on_progress: called after every step.
         changes: fields of ``TrainConfig`` in place of those of ``config``.
@@ -77,12 +79,16 @@ def train(
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: fewer than two training views, or masks that do not fit the cameras.
-        OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError, Interrupted: as by
-            ``finetune``. Interrupted leaves the mesh so far in the folder, too.
+        ValueError: fewer than two training views, points that are not finite, or masks that do not fit the
+            cameras.
+        FileExistsError, OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError,
+            Interrupted: as by ``finetune``. Interrupted leaves the mesh so far in the folder, too, as
+            ``interrupted.npz``.
 
-    Warns with a DataWarning of photographs that do not fit the others: before the first step of those that
-    are blurred or double, at the end of those that the mesh cannot show.
+    Warns with a DataWarning of points if no photograph shows most of them, and of photographs that do not fit
+    the others: before the first step of those that
+    have clear pixels though no subject is cut out, which do not count then, and of those that are blurred or
+    double; at the end of those that the mesh cannot show.
     """
     need(Dataset, dataset=dataset)
     need(TrainConfig, config=config, optional=True)
@@ -92,47 +98,56 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
+    dataset = with_clear_pixels_masked(dataset)
     config = for_views(config, dataset.train)
     engine(run.device, run.threads).check()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
-    journal = None if run.folder is None else Journal(run.folder)
-    if run.resume and journal is not None:
-        mesh = _stored_start(journal)
-    dataset = with_clear_pixels_masked(dataset)
-    else:
-        mesh = starting_fans(dataset, config, points, run.threads)
-        for message in find_suspects(dataset.train).messages():
-            warnings.warn(message, DataWarning, stacklevel=2)
-    if config.exposure is None:
-        config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
-        if config.exposure:
-            warnings.warn(
-                "the photographs differ in exposure or white balance: a gain and an offset of each are fitted"
-                " (``exposure`` False: not)",
-                DataWarning,
-                stacklevel=2,
-            )
-    picture = None
-    if journal is not None and not run.resume:
-        picture = coverage_picture(mesh, dataset.train, run.threads)
-    run = replace(run, spent=run.spent + time.perf_counter() - began)
-    start = run_start(mesh, dataset, config, run, journal)
-    if journal is not None and picture is not None:
-        (journal.folder / SO_FAR).unlink(missing_ok=True)
-        save_mesh(mesh, journal.folder / START)
-        save_image(journal.folder / COVERAGE, picture)
-    clock, views = start.clock(run), start.dataset.train
-    phase = Growing(config, mesh, views, clock.fraction, run.cache_bytes)
-    loop = TrainingLoop(start, clock, phase, run, on_progress)
-    del start
-    try:
-        mesh = loop.run()
-    except Interrupted:
+    with claimed(run, (START, SO_FAR, COVERAGE)):
+        journal = None if run.folder is None else Journal(run.folder)
+        if run.resume and journal is not None:
+            mesh = _stored_start(journal)
+        else:
+            lost = 0.0 if points is None else lost_points(dataset.train, points)
+            if lost > 0.5:
+                warnings.warn(
+                    f"{lost:.0%} of the points lie where no photograph shows them: load_points(...,"
+                    " origin=data.origin) has them beside the cameras of a data set",
+                    DataWarning,
+                    stacklevel=2,
+                )
+            mesh = starting_fans(dataset, config, points, run.threads)
+            for message in find_suspects(dataset.train).messages():
+                warnings.warn(message, DataWarning, stacklevel=2)
+        if config.exposure is None:
+            config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
+            if config.exposure:
+                warnings.warn(
+                    "the photographs differ in exposure or white balance: a gain and an offset of each are"
+                    " fitted (``exposure`` False: not)",
+                    DataWarning,
+                    stacklevel=2,
+                )
+        picture = None
+        if journal is not None and not run.resume:
+            picture = coverage_picture(mesh, dataset.train, run.threads)
+        run = replace(run, spent=run.spent + time.perf_counter() - began)
+        start = run_start(mesh, dataset, config, run, journal)
+        if journal is not None and picture is not None:
+            (journal.folder / SO_FAR).unlink(missing_ok=True)
+            save_mesh(mesh, journal.folder / START)
+            save_image(journal.folder / COVERAGE, picture)
+        clock, views = start.clock(run), start.dataset.train
+        phase = Growing(config, mesh, views, clock.fraction, run.cache_bytes)
+        loop = TrainingLoop(start, clock, phase, run, on_progress)
+        del start
+        try:
+            mesh = loop.run()
+        except Interrupted:
+            if journal is not None:
+                save_mesh(loop.finished(), journal.folder / SO_FAR)
+            raise
         if journal is not None:
-            save_mesh(loop.finished(), journal.folder / SO_FAR)
-        raise
-    if journal is not None:
-        (journal.folder / SO_FAR).unlink(missing_ok=True)
+            (journal.folder / SO_FAR).unlink(missing_ok=True)
     if names := phase.misfits(views):
         shown = ", ".join(names[:SHOWN_NAMES]) + (" ..." if len(names) > SHOWN_NAMES else "")
         warnings.warn(
