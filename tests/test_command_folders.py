@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,18 @@ import meshsplats as ms
 from meshsplats.chains import TABLE, begin_folder, check_folder
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, view_names
 from meshsplats.renders.frames import remove_older
+
+
+def write_table(folder):
+    """That of a chain of one level."""
+    numbers = ("splats", "triangles", "bytes", "screen_size", "views", "psnr", "seconds")
+    table = {
+        "splats": 1,
+        "look": "area",
+        "samples": 1,
+        "levels": [dict.fromkeys(numbers, 1) | {"file": "0.npz"}],
+    }
+    (folder / TABLE).write_text(json.dumps(table), "utf-8")
 
 
 def test_a_folder_becomes_a_chain_where_nothing_is_lost(tmp_path):
@@ -25,7 +39,7 @@ def test_a_folder_becomes_a_chain_where_nothing_is_lost(tmp_path):
     folder.mkdir()
     with pytest.raises(FileExistsError, match=f"holds no {TABLE}"):
         check_folder(folder, replace_old=True)
-    (folder / TABLE).touch()
+    write_table(folder)
     check_folder(folder, replace_old=True)
     with pytest.raises(FileExistsError):
         check_folder(folder)
@@ -40,7 +54,7 @@ def test_the_way_that_a_message_names_is_open(tmp_path, finished, left):
     for start in ({}, {"resume": True}, {"replace_old": True}):
         if finished:
             folder.mkdir(exist_ok=True)
-            (folder / TABLE).touch()
+            write_table(folder)
         if left:
             unfinished.mkdir(exist_ok=True)
         if left == "record":
@@ -54,11 +68,11 @@ def test_the_way_that_a_message_names_is_open(tmp_path, finished, left):
                 said.append(str(error))
             if "remove it" in said[-1]:
                 unfinished.rmdir()
-            if "leave out ``resume``" in said[-1]:
+            if "leave out resume" in said[-1]:
                 how = {}
-            elif "``resume`` continues it" in said[-1]:
+            elif "resume continues it" in said[-1]:
                 how = {"resume": True}
-            elif "``force``" in said[-1]:
+            elif "replace_old" in said[-1] or "``force``" in said[-1]:
                 how = {"replace_old": True}
         else:
             pytest.fail(f"{start}: {said}")

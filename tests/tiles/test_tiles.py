@@ -348,11 +348,11 @@ def test_a_full_disk_is_reported(splats, tmp_path, monkeypatch):
 
 def test_what_a_run_refuses(splats, tileset, tmp_path):
     source = stream_gaussians(splats)
-    with pytest.raises(FileNotFoundError, match=r"nothing to resume .* leave out ``resume``"):
+    with pytest.raises(FileNotFoundError, match=r"nothing to resume .* leave out resume"):
         build_tiles(source, tmp_path / "tiles", SMALL, resume=True)
-    with pytest.raises(FileNotFoundError, match="``force``, not ``resume``, replaces"):
+    with pytest.raises(FileNotFoundError, match="replace_old, not resume, replaces"):
         build_tiles(source, tileset, SMALL, resume=True)
-    with pytest.raises(FileExistsError, match="exists: give another folder, or ``force`` to replace it"):
+    with pytest.raises(FileExistsError, match="exists: give another folder, or replace_old to replace it"):
         build_tiles(source, tileset, SMALL)
     diary = tmp_path / "diary"
     diary.mkdir()
@@ -405,6 +405,16 @@ def test_a_tileset_of_another_program_is_not_replaced(splats, tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_what_cannot_begin_leaves_nothing(splats, tmp_path):
+    out = tmp_path / "tiles"
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        build_tiles(stream_gaussians(splats), out, SMALL, threads=0)
+    nowhere = replace(SMALL, conversion=ConversionOptions(crop=(90, 90, 90, 91, 91, 91)))
+    with pytest.raises(ValueError, match="crop"):
+        build_tiles(stream_gaussians(splats), out, nowhere)
+    assert not list(tmp_path.iterdir())
+
+
 def test_one_is_no_plural():
     one = TilesetSummary(1, 8, 1, 1, 2_000_000, 0.0, AlphaChoice("blend"))
     assert one.in_words() == "1 splat -> 8 triangles in 1 tile of 1 level, 2.0 MB"
@@ -417,7 +427,7 @@ def test_another_scene_or_other_options_are_not_mixed(splats, tmp_path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         build_tiles(stream_gaussians(splats), out, SMALL)
     monkeypatch.setattr(making, "save_mesh", save)
-    with pytest.raises(FileExistsError, match="``resume`` continues it, ``force`` starts again"):
+    with pytest.raises(FileExistsError, match="run: resume continues it, replace_old starts again"):
         build_tiles(stream_gaussians(splats), out, SMALL)
     with pytest.raises(ValueError, match="started with other options"):
         build_tiles(stream_gaussians(splats), out, TileOptions(max_triangles=8192), resume=True)
@@ -494,7 +504,7 @@ def test_an_image_in_parts_is_the_same(tileset):
     found = Tileset(tileset)
     camera = orbit(found.root.load(), 1, elevation=15, width=200, height=130)[0]
     background = np.random.default_rng(0).random((130, 200, 3)).astype(np.float32)
-    options = {"max_error": 0, "background": background, "depth": True}
+    options = {"max_error": 0, "background": background, "depth": True, "median_depth": True}
     whole = render_tiles(found, camera, **options)
     most = sum(tile.triangles for tile in choose_tiles(found, [camera], max_error=0)[0]) - 1
     loaded = []
@@ -508,6 +518,8 @@ def test_an_image_in_parts_is_the_same(tileset):
     assert max(sum(tile.triangles for tile in tiles) for tiles in loaded) <= most
     assert psnr(parts.color, whole.color) > 80
     np.testing.assert_allclose(parts.depth, whole.depth, atol=1e-3)
+    same = np.isclose(parts.median_depth, whole.median_depth, atol=1e-3)
+    assert same.mean() > 0.999
 
 
 def test_the_tiles_that_a_camera_needs(tileset):

@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from meshsplats._files.atomic import refuse_existing
-from meshsplats.errors import FileFormatError, OptionsError, OptionValueError, OverwritingError
+from meshsplats.errors import (
+    EarlierRunError,
+    FileFormatError,
+    NothingToResumeError,
+    OptionsError,
+    OptionValueError,
+    OverwritingError,
+)
 from meshsplats.formats.mesh_formats import mesh_format_to_write, written_mesh_suffixes
 from meshsplats.formats.splat_formats import format_to_write, listed, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
@@ -194,15 +201,15 @@ def check_resumption(
         if unfinished.exists():
             way = "it is not of this command: remove it, and leave out ``resume``"
         elif folder.exists():
-            way = f"``force``, not ``resume``, replaces {folder}"
-        raise FileNotFoundError(f"nothing to resume in {unfinished}: {way}")
+            way = f"``replace_old``, not ``resume``, replaces {folder}"
+        raise NothingToResumeError(f"nothing to resume in {unfinished}: {way}")
     if unfinished.exists() and not known:
         raise FileExistsError(
             f"{unfinished} exists and is not of this command: remove it, or give another folder"
         )
     if known and not (resume or replace_old):
-        raise FileExistsError(
-            f"{unfinished} is left from an earlier run: ``resume`` continues it, ``force`` starts again"
+        raise EarlierRunError(
+            f"{unfinished} is left from an earlier run: ``resume`` continues it, ``replace_old`` starts again"
         )
 
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._core.library import check_threads
 from meshsplats._files.atomic import atomic_path, replace_folder
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
@@ -31,7 +32,7 @@ from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey, survey
-from meshsplats.errors import DataWarning
+from meshsplats.errors import DataWarning, EarlierRunError, OptionValueError
 from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
 from meshsplats.formats.gltf.writer import change_alpha
 from meshsplats.formats.outputs import check_resumption
@@ -121,6 +122,7 @@ def build_tiles(
     need_path(folder=folder)
     need(TileOptions, options=options, optional=True)
     need(Workers, workers=workers, optional=True)
+    check_threads(threads)
     chosen = options or TileOptions()
     if chosen.up is None:
         up = DEFAULT_UP if source.up is None else source.up.astype(float).tolist()
@@ -133,7 +135,12 @@ def build_tiles(
             raise FileExistsError(f"{unfinished}: another process is at work on this tileset")
         _check_folders(target, unfinished, resume, replace_old)
         build = _Build(source, unfinished, chosen, conversion, threads, workers, on_progress)
-        summary = build.run()
+        try:
+            summary = build.run()
+        except ValueError:
+            if not resume and build.journal.find("survey") is None:
+                shutil.rmtree(unfinished)  # nothing to go on with
+            raise
         replace_folder(unfinished / "tileset", target, is_tile_file)
         shutil.rmtree(unfinished)
     return summary
@@ -152,7 +159,7 @@ def _check_folders(target: Path, unfinished: Path, resume: bool, replace_old: bo
         if not is_ours(target):
             raise FileExistsError(f"{target} holds a tileset of another program: give another folder")
         if not (replace_old or resume):
-            raise FileExistsError(f"{target} exists: give another folder, or ``force`` to replace it")
+            raise EarlierRunError(f"{target} exists: give another folder, or ``replace_old`` to replace it")
     check_resumption(target, unfinished, JOURNAL, resume=resume, replace_old=replace_old)
     if unfinished.exists() and not resume:
         shutil.rmtree(unfinished)
@@ -288,9 +295,9 @@ class _Build:
             return
         for name, value in facts.items():
             if before.get(name) != value:
-                raise ValueError(
+                raise OptionValueError(
                     f"{self._work.parent} was started with other {name} ({str(before.get(name))[:200]}):"
-                    " ``resume`` with the same, or begin again with ``force``"
+                    " ``resume`` with the same, or begin again with ``replace_old``"
                 )
 
     def _survey(self) -> Survey:

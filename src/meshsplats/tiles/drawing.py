@@ -229,4 +229,5 @@ def _side_by_side(parts: Sequence[Rendering], axis: int) -> Rendering:
         joined("depth"),
         joined("normals"),
         fragments=sum(part.fragments for part in parts),
+        median_depth=joined("median_depth"),
     )
