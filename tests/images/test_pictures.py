@@ -70,6 +70,13 @@ def test_images_of_other_shapes_and_names_are_refused(tmp_path, name, shape, wor
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.int64])
+def test_bytes_are_not_taken_for_values_from_0_to_1(tmp_path, kind):
+    with pytest.raises(TypeError, match=f"from 0 to 1, got {kind.__name__}: divide bytes by 255"):
+        save_image(tmp_path / "x.png", np.full((2, 2, 3), 128, kind))
+    assert not list(tmp_path.iterdir())
+
+
 def test_straight_alpha_composes_to_the_same_image():
     """Over any background: straight * alpha + background * (1 - alpha) is the image rendered on it."""
     alpha = RNG.uniform(0, 1, (6, 5)).astype(np.float32)

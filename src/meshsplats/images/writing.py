@@ -38,7 +38,11 @@ CAPTION = 22
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
-    """uint8 array of the same shape: ``round(255 * clip(image, 0, 1))``. ValueError for values not finite."""
+    """uint8 array of the same shape: ``round(255 * clip(image, 0, 1))``. TypeError for whole numbers,
+    ValueError for values not finite."""
+    kind = np.asarray(image).dtype
+    if kind.kind in "iu":
+        raise TypeError(f"an image must hold float values from 0 to 1, got {kind}: divide bytes by 255")
     image = np.asarray(image, np.float32)
     if not np.isfinite(image).all():
         raise ValueError("an image holds values that are not finite")
@@ -65,6 +69,7 @@ def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
         image: (h, w, 3) RGB or, not for JPEG, (h, w, 4) straight RGBA, in [0, 1].
 
     Raises:
+        TypeError: an image of whole numbers, such as bytes: divide them by 255.
         ValueError: the suffix or the shape is another, or a value is not finite.
     """
     need_path(path=path, instead={"ndarray": "the path comes first, save_image(path, image)"})
