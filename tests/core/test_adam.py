@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -100,6 +102,28 @@ def test_a_step_on_all_rows_is_adam_but_for_epsilon():
         model.step()
         adam.step(gradient)
     assert np.allclose(values, theirs.detach().numpy(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["deepcopy", "pickle"])
+def test_a_copy_of_the_optimiser_moves_the_values_copied_with_it(kind):
+    values = np.ones((2, 3), np.float32)
+    both = values, RowAdam(values, lr=0.1)
+    copied, adam = copy.deepcopy(both) if kind == "deepcopy" else pickle.loads(pickle.dumps(both))
+    adam.step(np.ones_like(values))
+    assert np.allclose(copied, 0.9)
+    assert (values == 1).all()
+
+
+def test_a_tensor_with_other_memory_is_stepped_there():
+    torch = pytest.importorskip("torch", reason="the values are a tensor")
+    values = torch.ones(2, 3, requires_grad=True)
+    adam = RowAdam(values, lr=0.1)
+    values.data = torch.full((2, 3), 5.0)
+    adam.step(torch.ones(2, 3))
+    assert torch.allclose(values, torch.full((2, 3), 4.9))
+    values.data = torch.ones(3, 3)
+    with pytest.raises(ValueError, match=r"must keep their shape \(2, 3\), got \(3, 3\)"):
+        adam.step(torch.ones(3, 3))
 
 
 def test_first_steps_by_hand():

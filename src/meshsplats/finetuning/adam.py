@@ -28,7 +28,8 @@ class RowAdam:
 
     Args:
         values: (v, k) float32, C-contiguous: a NumPy array, or a torch tensor on the CPU (a leaf that
-            requires a gradient, too). :meth:`step` changes it in place; no copy is kept.
+            requires a gradient, too). :meth:`step` changes it in place; no copy is kept. A copy of the
+            optimiser has its own, unless both are copied together (``copy.deepcopy((values, optimiser))``).
         lr: learning rate, positive. The attribute of this name may be set between steps.
         betas: decay rates of the two moments, in [0, 1).
         eps: positive.
@@ -58,9 +59,9 @@ class RowAdam:
         threads: int | None = None,
     ) -> None:
         self._values = values
-        self._array = _float32_array("values", values, writeable=True)
-        if self._array.ndim != 2 or 0 in self._array.shape[1:]:
-            raise ValueError(f"values must have shape (v, k), got {self._array.shape}")
+        array = self._array
+        if array.ndim != 2 or 0 in array.shape[1:]:
+            raise ValueError(f"values must have shape (v, k), got {array.shape}")
         if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"betas must be two numbers in [0, 1), got {betas}")
         if not (eps > 0 and math.isfinite(eps)):
@@ -71,10 +72,16 @@ class RowAdam:
         check_threads(threads)
         self.lr = lr
         self.betas, self.eps, self.bounds, self.threads = (betas[0], betas[1]), eps, (low, high), threads
-        self.scale = _checked_scale(scale, len(self._array))
-        self.mean = np.zeros_like(self._array)
-        self.square = np.zeros_like(self._array)
+        self.scale = _checked_scale(scale, len(array))
+        self.mean = np.zeros_like(array)
+        self.square = np.zeros_like(array)
         self.steps = 0
+
+    @property
+    def _array(self) -> np.ndarray:
+        """The memory of the values as it is now: a tensor can be given another (``values.data = ...``), and
+        a copy of this object has its own."""
+        return _float32_array("values", self._values, writeable=True)
 
     @property
     def lr(self) -> float:
@@ -99,16 +106,18 @@ class RowAdam:
             TypeError, ValueError: as the class does, and ValueError for indices that are out of range or do
                 not increase. Nothing has changed then.
         """
-        array = _float32_array("gradient", gradient)
-        if array.shape != self._array.shape:
+        values, array = self._array, _float32_array("gradient", gradient)
+        if values.shape != self.mean.shape:
             raise ValueError(
-                f"gradient must have shape {self._array.shape} like the values, got {array.shape}"
+                f"values must keep their shape {self.mean.shape}, got {values.shape}; use select"
             )
-        selected = None if rows is None else _mask_or_indices(rows, len(self._array))
+        if array.shape != values.shape:
+            raise ValueError(f"gradient must have shape {values.shape} like the values, got {array.shape}")
+        selected = None if rows is None else _mask_or_indices(rows, len(values))
         if selected is not None and selected.dtype not in (bool, np.int32):
             raise TypeError(f"rows must be a bool mask or int32 indices, got {selected.dtype}")
         step = AdamStep(self.next_rate(self.lr), self.betas, self.eps, self.scale, self.bounds)
-        adam_rows(self._array, (self.mean, self.square), array, selected, step, self.threads)
+        adam_rows(values, (self.mean, self.square), array, selected, step, self.threads)
         self.steps += 1
         _bump_version(self._values)
 
