@@ -169,6 +169,14 @@ def test_results_have_the_shape_of_the_3dgs_code():
     assert set(full["methods"]["mesh"]["mean"]) == set(COLUMNS)
 
 
+def test_views_of_one_name_and_of_none_are_told_apart():
+    names = ["", "a.png", "a.png", "", "a.png 2", "a.png"]
+    views = tuple(ViewScores(name, float(i), 1.0) for i, name in enumerate(names))
+    psnrs = Report("scene", (MethodScores("mesh", views),)).per_view()["mesh"]["PSNR"]
+    wanted = ["view_0000", "a.png", "a.png 3", "view_0003", "a.png 2", "a.png 4"]
+    assert psnrs == {name: float(i) for i, name in enumerate(wanted)}
+
+
 def test_unknown_and_infinite_values_are_null():
     report = report_of([float("inf"), 30.0], [1.0, 0.9], [None, 0.1])
     assert report.results()["mesh"] == {"SSIM": pytest.approx(0.95), "PSNR": None, "LPIPS": None}

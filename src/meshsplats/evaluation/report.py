@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat
 
 import numpy as np
@@ -101,10 +102,14 @@ class Report:
         }
 
     def per_view(self) -> dict[str, dict[str, dict[str, float | None]]]:
-        """Scores in the layout of INRIA's ``per_view.json``: by method, metric, and name of the view."""
+        """Scores in the layout of INRIA's ``per_view.json``: by method, metric, and name of the view. A view
+        without a name is ``view_0000`` by its number; the second of one name, ``a.png``, is ``a.png 2``."""
         return {
             scores.method: {
-                key: {view.name: _finite(getattr(view, key.lower())) for view in scores.views}
+                key: {
+                    name: _finite(getattr(view, key.lower()))
+                    for name, view in zip(_distinct_names(scores.views), scores.views, strict=True)
+                }
                 for key in ("SSIM", "PSNR", "LPIPS")
             }
             for scores in self.methods
@@ -128,6 +133,16 @@ class Report:
                 for scores in self.methods
             },
         }
+
+
+def _distinct_names(views: Sequence[ViewScores]) -> list[str]:
+    """A name for each of ``views`` that no other has."""
+    wanted = [view.name or f"view_{i:04d}" for i, view in enumerate(views)]
+    found: dict[str, None] = {}
+    for name in wanted:
+        free = (one for n in count(2) if (one := f"{name} {n}") not in found and one not in wanted)
+        found[next(free) if name in found else name] = None
+    return list(found)
 
 
 @dataclass(frozen=True, eq=False)
