@@ -34,6 +34,7 @@ from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
+from meshsplats.training import train_config
 
 ROOT = Path(__file__).parents[2]
 
@@ -110,6 +111,15 @@ def test_long_runs_move_positions_less_and_end_lower():
 def test_values_out_of_range(changes, message):
     with pytest.raises(ValueError, match=message):
         make_config(**changes)
+
+
+def test_numbers_of_numpy_become_those_of_python():
+    config = make_config(steps=np.int64(3), ssim_weight=np.float32(0.25), seed=np.int32(3), dropout=None)
+    assert config == make_config(steps=3, ssim_weight=0.25, seed=3, dropout=None)
+    assert FinetuneConfig(**json.loads(json.dumps(config.to_dict()))) == config
+    assert type(train_config(minutes=np.float64(2), max_splats=np.array(9)).max_splats) is int
+    with pytest.raises(ValueError, match="steps must be a whole number"):
+        make_config(steps=np.float32(2.5))
 
 
 def test_names_that_do_not_exist():

@@ -167,6 +167,9 @@ class FinetuneConfig:
     same bits, with any number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if getattr(value, "ndim", None) == 0:  # a number of NumPy
+                object.__setattr__(self, name, value.item())
         check_options(self, types=(int, float))  # what JSON can hold
         if self.opacity == "cutoff":
             self._check_cutoff()
