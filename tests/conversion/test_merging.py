@@ -706,3 +706,21 @@ def look_around(cloud):
 
 def shown(cloud, view):
     return render_splats(cloud, view, background=(0, 0, 0)).color.clip(0, 1)
+
+
+@pytest.mark.parametrize(("visible", "count"), [(0, 5), (3, 100), (1, 1)])
+def test_as_many_are_left_as_are_wanted_where_few_count(visible, count):
+    cloud = random_cloud(1873)
+    opacities = np.where(np.arange(len(cloud)) < visible, 0.5, 1e-4)
+    assert len(simplify(replace(cloud, opacities=opacities), count)) == count
+    scales = np.where(np.arange(len(cloud))[:, None] < visible, 1e3, cloud.scales)
+    assert len(simplify(replace(cloud, scales=scales), count)) == count
+    assert len(np.unique(convert(replace(cloud, scales=scales), max_splats=count).face_splat)) == count
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5])
+def test_threads_are_checked_before_the_work(threads):
+    cloud = random_cloud(20)
+    for work in (lambda: simplify(cloud, 5, threads=threads), lambda: convert(cloud, threads=threads)):
+        with pytest.raises(ValueError, match="threads must be at least 1"):
+            work()

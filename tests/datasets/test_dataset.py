@@ -333,9 +333,14 @@ def test_windows_are_parts_of_larger_images(cloud):
         assert part.mean() < 0.01
     assert len(places) == 5
     assert all(view.camera.width == view.camera.height == 40 for view in windows.train)
-    for zooms in ((), (0,)):
+    for zooms in ((), (0,), (1.5,)):
         with pytest.raises(ValueError, match="zooms must be whole numbers"):
             splat_dataset(cloud, zooms=zooms)
+    for name, value in {"samples": 99, "sh_degree": 7, "threads": 0}.items():
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            splat_dataset(cloud, **{name: value})
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            splat_views(cloud, [], **{name: value})
 
 
 def test_windows_show_the_subject():

@@ -33,6 +33,13 @@ def cloud():
     return make_scene(300)
 
 
+@pytest.mark.parametrize("how", ["given", "named"])
+@pytest.mark.parametrize("color", [(2, 0, 0), (0, 0), (0, float("nan"), 0)])
+def test_a_background_out_of_range_is_refused(cloud, how, color):
+    with pytest.raises(ValueError, match="a background must be RGB from 0 to 1, got"):
+        find_background(photographs(cloud, (0, 0, 0)), {"splats": cloud}, **{how: color})
+
+
 def photographs(scene, color, count=3) -> Dataset:
     """Of splats, or of a mesh, over ``color``; there is no alpha in them."""
     views = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
+from meshsplats._core.library import check_threads
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, unit_up
@@ -80,6 +81,7 @@ def convert(
     need(GaussianCloud, cloud=cloud)
     need(ConversionOptions, options=options, optional=True)
     need_all(Camera, cameras=cameras, optional=True)
+    check_threads(threads)
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
     filter_px2 = filter_of(cloud.kernel, chosen)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats._core.library import processors
+from meshsplats._core.library import check_threads, processors
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
@@ -95,13 +95,14 @@ def simplify(
         A cloud of min(count, n) splats, in the order of the first of the splats merged into each.
 
     Raises:
-        ValueError: ``count`` or ``low_pass`` out of range.
+        ValueError: ``count``, ``low_pass`` or ``threads`` out of range.
         MemoryError: the work does not fit; it takes about 600 bytes a splat, and 80 MB a thread.
     """
     need(GaussianCloud, cloud=cloud)
     need_all(Camera, cameras=cameras, optional=True)
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ValueError(f"count must be a whole number of splats, at least 1, got {count!r}")
+    check_threads(threads)
     if count >= len(cloud):
         return cloud
     if low_pass is None:

@@ -50,12 +50,12 @@ def groups_of(
     # flat or thin splats with anything beside them would have an unbounded cost.
     covariances[:, [0, 3, 5]] += np.square(np.maximum(low_pass / unit, FINEST))[:, None]
     all_moments = Moments(means, covariances, masses, colors)
+    group, moments = np.arange(len(cloud)), all_moments
     if CLUMPED * count < len(cloud):
-        group = clumps(means, masses, float(masses.sum()) / (CLUMPS * count))
-        moments = all_moments.together(Groups(group, masses))
-    else:
-        group = np.arange(len(cloud))
-        moments = all_moments
+        clumped = clumps(means, masses, float(masses.sum()) / (CLUMPS * count))
+        # Fewer clumps than are wanted come of few splats that count for almost all.
+        if clumped.max() >= count - 1:
+            group, moments = clumped, all_moments.together(Groups(clumped, masses))
     while True:
         part, left = _merge_neighbours(moments, count, threads)
         group = part[group]

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from meshsplats._core.library import check_threads
 from meshsplats._kinds import need, need_all, need_choice
 from meshsplats.camera import Camera
 from meshsplats.cameras.placing import (
@@ -23,6 +24,7 @@ from meshsplats.cameras.placing import (
 from meshsplats.choices import MAX_SIDE, Look
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.rendering.core_arguments import MAX_SAMPLES
 from meshsplats.rendering.looks import check_look, draw_splats
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
@@ -108,6 +110,10 @@ def splat_dataset(
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
+    _check_drawing(look, sh_degree, samples, threads)
+    zooms = ZOOMS[look] if zooms is None else zooms
+    if not zooms or not all(isinstance(zoom, (int, np.integer)) and zoom >= 1 for zoom in zooms):
+        raise ValueError(f"zooms must be whole numbers from 1 on, got {zooms!r}")
     first = max(test, HELD_OUT)  # of the training views
     free, found = fov is None and tuple(distance) == DISTANCES, None
     if cameras is not None:
@@ -133,10 +139,6 @@ def splat_dataset(
             height=height or width,
             fov=50.0 if fov is None else fov,
         )
-    check_look(look)
-    zooms = ZOOMS[look] if zooms is None else zooms
-    if not zooms or min(zooms) < 1:
-        raise ValueError(f"zooms must be whole numbers from 1 on, got {zooms!r}")
     centers = window_centers(cloud)
     learned_from = [
         window_of_image(camera, zooms[i % len(zooms)], i, centers) for i, camera in enumerate(placed[first:])
@@ -243,8 +245,10 @@ def splat_views(
     ``look``, ``sh_degree``, ``samples`` and ``threads`` are those of ``rendering.looks.draw_splats``. Images
     have alpha, so that they can be laid over any background; ``background`` is that of ``View.image``. They
     are rendered at first use and kept in float16, 8 bytes a pixel, as in ``load_dataset``.
+
+    Raises ValueError for an option out of its range.
     """
-    check_look(look)
+    _check_drawing(look, sh_degree, samples, threads)
     red, green, blue = map(float, background)
     store = ImageCache(cache_bytes)
     return tuple(
@@ -255,6 +259,16 @@ def splat_views(
         )
         for camera in cameras
     )
+
+
+def _check_drawing(look: Look, sh_degree: int | None, samples: int | None, threads: int | None) -> None:
+    """ValueError for what ``render_splats`` refuses: images are rendered when they are first used."""
+    check_look(look)
+    check_threads(threads)
+    if sh_degree is not None and sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree!r}")
+    if samples is not None and not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
+        raise ValueError(f"samples must be a whole number from 1 to {MAX_SAMPLES}, got {samples!r}")
 
 
 def are_rendered(views: Sequence[View]) -> bool:

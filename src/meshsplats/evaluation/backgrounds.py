@@ -124,6 +124,8 @@ def find_background(
         named: display RGB in [0, 1] from the model folder (``model_background``).
         threads: maximum number of threads; all processors by default.
 
+    Raises ValueError for a background of another shape, or out of this range.
+
     Returns:
         The background with its reason and the scores. A DataWarning names each scene that loses more than
         ``WARNING_GAIN`` dB by it.
@@ -137,6 +139,8 @@ def find_background(
             require(GaussianCloud, f"scenes[{name!r}]", scene)
     views = subsample(dataset.train or dataset.views, MAX_VIEWS)
     chosen = given if given is not None else named
+    if chosen is not None and not (np.shape(chosen) == (3,) and all(0 <= part <= 1 for part in chosen)):
+        raise ValueError(f"a background must be RGB from 0 to 1, got {chosen!r}; divide bytes by 255")
     reason: Reason = "given" if given is not None else "model folder"
     candidates = dict(CANDIDATES)
     if not scenes or not any(_opaque(view) for view in views):
