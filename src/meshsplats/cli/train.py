@@ -87,7 +87,7 @@ class Train(TrainingCommand):
         return self.target.plan(self.input, config, as_splats=self.as_splats is not None, say=say)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
-        from meshsplats.finetuning.run import RunOptions
+        from meshsplats.finetuning.run_options import RunOptions
         from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.training.as_splats import fit_splats
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from meshsplats.datasets.views import Dataset
     from meshsplats.evaluation.backgrounds import Background
     from meshsplats.finetuning.plans import Plan, Trained
-    from meshsplats.finetuning.run import RunOptions
+    from meshsplats.finetuning.run_options import RunOptions
     from meshsplats.finetuning.setup import Display
 
 Say = Callable[[str], None]
