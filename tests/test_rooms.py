@@ -13,7 +13,7 @@ ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 13
 LOWEST = (
     *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_lazy", "_origin"),
-    *("_toml", "choices", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
+    *("choices", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
 )
 """Rooms that import no other room."""
 FLOORS = (
@@ -22,7 +22,7 @@ FLOORS = (
         "mesh_joining",
         "mesh_moving",
     ),
-    ("_option_values", "base_mesh", "demo_scene", "images", "mesh"),
+    ("_option_values", "_toml", "base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),
     ("viewpoints",),

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from meshsplats._words import legible
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -18,8 +20,6 @@ MAX_LINE = 5000
 """The reader's time grows with the square of a line's length: "a.a.a..." nests a table in each dot."""
 _WIDTH = 100
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_SURROGATE = re.compile("[\ud800-\udfff]")
-"""Bytes of a path that are not UTF-8, which TOML cannot express."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
@@ -81,8 +81,8 @@ def _value(value: Any) -> str:
 
 
 def _text(text: str) -> str:
-    text = _SURROGATE.sub("\ufffd", text)
-    return '"' + "".join(_ESCAPES.get(c) or (c if _plain(c) else f"\\u{ord(c):04x}") for c in text) + '"'
+    escaped = (_ESCAPES.get(c) or (c if _plain(c) else f"\\u{ord(c):04x}") for c in legible(text))
+    return '"' + "".join(escaped) + '"'
 
 
 def _plain(character: str) -> bool:

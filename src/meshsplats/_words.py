@@ -22,6 +22,7 @@ NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "gray": (0.5, 0.5, 0.5),
 }
 
+_NO_CHARACTER = re.compile("[\ud800-\udfff]")
 SOON = 3.0
 """Seconds of a phase before its end is estimated."""
 
@@ -86,6 +87,11 @@ def _numbers(text: str) -> tuple[float, float, float] | None:
     except ValueError:
         return None
     return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
+
+
+def legible(text: str) -> str:
+    """``text`` with a mark for each byte of a file name that is not UTF-8, which no file of text can hold."""
+    return _NO_CHARACTER.sub("\ufffd", text)
 
 
 def plural(count: int, noun: str, several: str = "") -> str:

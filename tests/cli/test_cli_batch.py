@@ -293,6 +293,16 @@ def test_what_is_kept_but_may_be_wrong_is_named(scans, capsys):
     assert Path("a.glb").read_bytes() == before
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf8_are_no_other_options(scans, capsys):
+    name = os.fsdecode(b"caf\xe9.ply")
+    os.rename("scans/a.ply", name)
+    assert run(name, "-o", "a.glb", "--no-preview") == 0
+    capsys.readouterr()
+    assert run(name, "-o", "a.glb", "--no-preview", "--skip-existing") == 0
+    assert "other options" not in capsys.readouterr().err
+
+
 def test_a_further_format_beside_what_is_there(scans, capsys):
     options = ["-o", "out", "--no-sidecar", "--json"]
     assert run("scans/a.ply", *options, "--formats", "glb") == 0

@@ -299,6 +299,7 @@ def test_what_cannot_be_written(tmp_path):
     for mesh, name, options, message in [
         (base, "a.fbx", {}, "choose a name that ends in .glb"),
         (base, "a.obj", {"unlit": True}, "unlit applies to"),
+        (base, "caf\udce9.obj", {}, "'caf\ufffd.obj' is not UTF-8, as names of textures in .obj are"),
         (base, "a.glb", {"image": "gif"}, "image must be one of"),
         (plain, "a.glb", {"image": "png"}, "with a texture"),
         (base, "a.stl", {"image": "png"}, "with a texture"),

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 import json
+import os
 import re
 from dataclasses import replace
 
@@ -92,6 +93,12 @@ def test_hostile_names_stay_text(mesh, cameras):
     settings = json.loads(block(text, "settings"))
     assert settings["title"] == settings["cameras"][2]["name"] == HOSTILE
     assert html.escape(HOSTILE) in text
+
+
+def test_names_of_files_that_are_not_utf8_are_titles(mesh):
+    text = make_page(mesh, options=PageOptions(title=os.fsdecode(b"caf\xe9"))).html
+    assert "<title>caf\ufffd</title>" in text
+    assert text.encode("utf-8")
 
 
 def test_long_names_and_many_cameras_are_limited(mesh, cameras, monkeypatch):

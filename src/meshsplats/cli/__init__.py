@@ -7,6 +7,7 @@ A module is imported only when its command runs, so that ``meshsplats --version`
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import signal
 import sys
@@ -70,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     printed as JSON too: ``{"error": {"kind", "code", "message", "path", "type"}}``.
     """
     open_missing_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error: some file names are no UTF-8
     if "numpy" not in sys.modules:
         # The core has threads of its own. Those of NumPy's BLAS, which wait in loops for the next small
         # product, would take a fifth of the processor time of a conversion.

@@ -11,6 +11,7 @@ from typing import Any
 import meshsplats
 from meshsplats import _toml as toml
 from meshsplats._option_values import relative_to
+from meshsplats._words import legible
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
 from meshsplats.cli.messages import shown_path
 from meshsplats.formats.outputs import recorded_options
@@ -63,11 +64,8 @@ def in_plain_words(command: Command, differ: Mapping[str, tuple[Any, Any]]) -> s
     """``differences`` in a line, values as they are typed."""
 
     def shown(value: Any) -> str:
-        return (
-            "not given"
-            if value is None
-            else " ".join(map(str, value if isinstance(value, list) else [value]))
-        )
+        values = value if isinstance(value, list) else [value]
+        return "not given" if value is None else " ".join(map(str, values))
 
     return ", ".join(_compared(command, differ, shown))
 
@@ -109,9 +107,9 @@ def _shown(value: Any) -> str:
 
 
 def _plain(value: Any, folder: Path) -> Any:
-    """An option's value for TOML, which knows no paths."""
+    """An option's value as TOML has it, which knows no paths."""
     if isinstance(value, (tuple, list)):
         return [_plain(part, folder) for part in value]
-    if not isinstance(value, Path):
-        return value
-    return "-" if shown_path(value) == "-" else relative_to(value, folder)
+    if isinstance(value, Path):
+        value = "-" if shown_path(value) == "-" else relative_to(value, folder)
+    return legible(value) if isinstance(value, str) else value

@@ -13,6 +13,7 @@ import numpy as np
 
 from meshsplats._files.atomic import atomic_path, together
 from meshsplats._kinds import need, need_all, need_choice, need_path
+from meshsplats._words import legible
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
@@ -204,11 +205,13 @@ def check_writing(
     collision: Collision | None = None,
 ) -> None:
     """ValueError where the format of ``target`` is unknown or does not have one of the options of
-    ``save_base``."""
+    ``save_base``, or would name a file beside that is not in UTF-8."""
     suffix = target.suffix.lower()
     if suffix not in BASE_SUFFIXES:
         known = ", ".join(BASE_SUFFIXES)
         raise ValueError(f"{target.name!r} does not name a format; choose a name that ends in {known}")
+    if suffix in (*_BESIDE, ".usdz") and (name := legible(target.name)) != target.name:
+        raise ValueError(f"{name!r} is not UTF-8, as names of textures in {suffix} are: choose another name")
     if unlit and suffix not in SHADED:
         raise ValueError(f"unlit applies to {', '.join(SHADED)} only, not to {suffix}")
     need_choice(TextureImage, optional=True, image=image)

@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._kinds import need, need_all
+from meshsplats._words import legible
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
@@ -127,7 +128,7 @@ def make_page(
         views = [orbit(mesh, 1, azimuth=30, elevation=15, width=1000, height=1000, up=up)[0]]
     bounds = scene_bounds(mesh)
     settings = {
-        "title": options.title[:LONGEST_NAME],
+        "title": legible(options.title[:LONGEST_NAME]),
         "background": "#" + "".join(f"{round(255 * min(max(c, 0), 1)):02x}" for c in options.background),
         "up": up.tolist(),
         "center": bounds.center.tolist(),
