@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import os
 import sqlite3
+import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -14,13 +15,16 @@ import numpy as np
 import pytest
 from _balls import cameras_around
 from _datasets import save, simple_colmap
+from PIL import Image, TiffImagePlugin
 
 from meshsplats.camera import Camera
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.points import load_points
-from meshsplats.errors import DataWarning, MissingDependencyError
-from meshsplats.training import reconstruction
-from meshsplats.training.reconstruction import bare_photographs, find_cameras
+from meshsplats.errors import DataWarning, MissingDependencyError, OptionsError
+from meshsplats.images.reading import Shot, load_image, read_shot
+from meshsplats.training import poses, reconstruction
+from meshsplats.training.photographs import PhotographOptions
+from meshsplats.training.reconstruction import bare_photographs, ensure_cameras, find_cameras
 
 
 def photographs(folder, count):
@@ -94,6 +98,8 @@ class Colmap:
         self.matches: dict[tuple[int, int], int] = {}  # by places in the reversed list of names
         self.ratio = "ba_global_images_ratio" if methods else "ba_global_frames_ratio"
         self.cameras, self.methods, self.calls = cameras, methods, []
+        self.apart: list[str] = []  # names of photographs that have poses of their own
+        self.lenses: list[tuple[str, list[str]]] = []
 
     def IncrementalPipelineOptions(self):
         return SimpleNamespace(**{self.ratio: 1.1})
@@ -103,9 +109,12 @@ class Colmap:
 
     def extract_features(self, database, folder, names, *, camera_mode, device, sift_options):
         assert sift_options == {"max_image_size": 1600, "max_num_features": 3000, "first_octave": self.octave}
-        self.names, self.mode, self.folder = names, camera_mode, Path(folder)
+        self.lenses.append((camera_mode, names))
+        self.names, self.folder = sorted(name for _, names in self.lenses for name in names), Path(folder)
         with closing(sqlite3.connect(database)) as connection:
-            connection.execute("create table two_view_geometries (pair_id integer, rows integer)")
+            connection.execute(
+                "create table if not exists two_view_geometries (pair_id integer, rows integer)"
+            )
             for (one, other), matches in self.matches.items():
                 values = (one * (2**31 - 1) + other, matches)
                 connection.execute("insert into two_view_geometries values (?, ?)", values)
@@ -143,7 +152,8 @@ class Colmap:
         }
         count = len(self.cameras)
         best = SimpleNamespace(images=images, cameras=lenses, points3D=points, num_reg_images=lambda: count)
-        return {0: SimpleNamespace(num_reg_images=lambda: 2), 1: best}
+        other = {i: SimpleNamespace(name=name, has_pose=True) for i, name in enumerate(self.apart)}
+        return {0: SimpleNamespace(num_reg_images=lambda: 2, images=other), 1: best}
 
 
 @pytest.fixture
@@ -168,10 +178,12 @@ def test_cameras_are_found_and_written_beside_the_photographs(scene, under, meth
     folder, colmap, place = scene(under, methods)
     save(place / "previews" / "p0.png", np.zeros((40, 60), np.uint8))
     lines = []
-    with pytest.warns(DataWarning, match=r"1 of 5 photographs match no others and are left out: p4\.png"):
+    with pytest.warns(
+        DataWarning, match=r"1 of 5 photographs found no place among the others and are left out: p4\.png"
+    ):
         find_cameras(folder, lines.append)
     assert colmap.names == [f"p{i}.png" for i in range(5)]
-    assert colmap.mode == "single"
+    assert colmap.lenses == [("single", colmap.names)]
     assert "4 photographs and 4 points" in lines[-1]
     dataset = load_dataset(folder, test_every=0)
     assert len(dataset.train) == 4
@@ -226,12 +238,203 @@ def test_cameras_and_points_are_written_both_or_not_at_all(scene, monkeypatch):
     assert sorted(os.listdir(folder)) == [f"p{i}.png" for i in range(5)]
 
 
-def test_photographs_of_several_sizes_have_cameras_of_their_own(scene):
+def write_jpeg(path, side, focal=None, focal_of_film=None):
+    """A JPEG ``side`` x 40 pixels large, with focal lengths in its EXIF data."""
+    exif = Image.Exif()
+    exif[0x0110] = "Phone"
+    values = {0x920A: focal, 0xA405: focal_of_film}
+    exif.get_ifd(0x8769).update({tag: value for tag, value in values.items() if value is not None})
+    Image.new("RGB", (side, 40)).save(path, exif=exif)
+
+
+def test_photographs_of_one_size_and_focal_length_share_a_lens(scene):
+    """One photograph of another size, or a second lens of one, does not take it from the others."""
     folder, colmap, _ = scene()
     save(folder / "p4.png", np.zeros((60, 40, 3), np.uint8))
+    write_jpeg(folder / "q0.jpg", 60, 4.2, 26)
+    write_jpeg(folder / "q1.jpg", 60, 4.2, 52)
+    write_jpeg(folder / "q2.jpg", 60, 4.2)
+    write_jpeg(folder / "q3.jpg", 60, 4.3, 26)
     with pytest.warns(DataWarning):
         find_cameras(folder)
-    assert colmap.mode == "per image"
+    assert colmap.lenses == [
+        ("single", ["p0.png", "p1.png", "p2.png", "p3.png"]),
+        ("single", ["q0.jpg", "q3.jpg"]),
+        ("per image", ["p4.png", "q1.jpg", "q2.jpg"]),
+    ]
+
+
+def test_exif_data_that_are_none_do_not_matter(tmp_path):
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.jpg", exif=b"Exif\0\0" + bytes(range(200)))
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x920A] = TiffImagePlugin.IFDRational(1, 0)
+    Image.new("RGB", (60, 40)).save(tmp_path / "b.jpg", exif=exif)
+    for name in ("a.jpg", "b.jpg"):
+        assert read_shot(tmp_path / name) == Shot((60, 40), "JPEG")
+
+
+def test_formats_that_the_library_does_not_read_are_copied(scene):
+    """By what a file holds, whatever it is called; the others are not written anew."""
+    folder, colmap, _ = scene()
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(folder / "p1.webp", lossless=True)
+    Image.fromarray(pixels).save(folder / "p2.jpg", "WEBP", lossless=True)
+    for name in ("p1.png", "p2.png"):
+        (folder / name).unlink()
+    held = {}
+    real = colmap.match_exhaustive
+
+    def match(database, **options):
+        held.update({path.name: (path.is_symlink(), load_image(path)) for path in colmap.folder.iterdir()})
+        real(database, **options)
+
+    colmap.match_exhaustive = match
+    colmap.cameras = {f"{i:06d}.png": camera for i, camera in enumerate(colmap.cameras.values())}
+    with pytest.warns(DataWarning, match=r"p4\.png"):
+        find_cameras(folder)
+    assert sorted(held) == [f"{i:06d}.png" for i in range(5)]
+    for name in ("000001.png", "000002.png"):
+        assert not held[name][0]
+        np.testing.assert_array_equal(held[name][1], pixels)
+    assert load_dataset(folder, test_every=0).train[1].name.endswith("p1.webp")
+
+
+def test_broken_photographs_are_left_out_before_the_search(scene):
+    folder, colmap, _ = scene()
+    whole = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    Image.fromarray(whole).save(folder / "q.jpg", quality=95)
+    (folder / "q.jpg").write_bytes((folder / "q.jpg").read_bytes()[:2000])
+    with pytest.warns(DataWarning) as warned:
+        find_cameras(folder)
+    assert "1 of 6 photographs cannot be read and are left out: q.jpg (" in str(warned[0].message)
+    assert "truncated" in str(warned[0].message)
+    assert colmap.names == [f"p{i}.png" for i in range(5)]
+
+
+def test_photographs_that_are_all_broken_are_refused(scene):
+    folder, colmap, _ = scene()
+    for i in range(3):
+        (folder / f"p{i}.png").write_bytes(b"none")
+    with pytest.raises(ValueError, match=r"2 photographs can be read, at least 3 must be; .*p0\.png: not an"):
+        find_cameras(folder)
+    assert not colmap.lenses
+
+
+def test_photographs_that_match_each_other_only_are_named_as_such(scene):
+    folder, colmap, _ = scene()
+    for name in ("q0.png", "q1.png", "q2.png"):
+        save(folder / name, np.zeros((40, 60, 3), np.uint8))
+    colmap.apart = ["q1.png", "q0.png", "q2.png", "p0.png"]
+    with pytest.warns(DataWarning) as warned:
+        find_cameras(folder)
+    messages = [str(warning.message).partition(": ")[2] for warning in warned]
+    assert messages == [
+        "1 of 8 photographs found no place among the others and are left out: p4.png",
+        "3 of 8 photographs match each other, but nothing joins them to the rest: left out: q0.png, q1.png,"
+        " q2.png",
+    ]
+
+
+def test_the_library_takes_no_more_threads_than_are_given(scene, monkeypatch):
+    folder, colmap, _ = scene()
+    seen = []
+    options = {"max_image_size": 1600, "num_threads": 1, "max_num_features": 3000, "first_octave": -1}
+    extract, mapping = colmap.extract_features, colmap.incremental_mapping
+
+    def extracting(*args, sift_options, **more):
+        seen.append(dict(sift_options))
+        del sift_options["num_threads"]
+        extract(*args, sift_options=sift_options, **more)
+
+    def matching(database, *, device, sift_options):
+        seen.append(sift_options)
+
+    def finding(database, folder, work, options):
+        seen.append(options.num_threads)
+        return mapping(database, folder, work, options)
+
+    monkeypatch.setattr(colmap, "extract_features", extracting)
+    monkeypatch.setattr(colmap, "match_exhaustive", matching)
+    monkeypatch.setattr(colmap, "incremental_mapping", finding)
+    with pytest.warns(DataWarning):
+        find_cameras(folder, threads=1)
+    assert seen == [options, {"num_threads": 1}, 1]
+
+
+def test_options_of_threads_are_those_of_the_library():
+    pycolmap = pytest.importorskip("pycolmap")
+    assert poses._incremental_options(pycolmap, 3).num_threads == 3
+    if hasattr(pycolmap, "FeatureMatchingOptions"):
+        assert reconstruction._feature_options(pycolmap, 9, 9, 3)["extraction_options"].num_threads == 3
+        assert reconstruction._matching_options(pycolmap, 3)["matching_options"].num_threads == 3
+    if hasattr(pycolmap, "global_mapping"):
+        assert poses._global_options(pycolmap, 3)["options"].num_threads == 3
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are others there")
+def test_a_signal_is_answered_as_before_the_library_was_loaded():
+    """pycolmap answers SIGTERM with a stack trace. And Pillow, loaded after it, ends the process."""
+    pytest.importorskip("pycolmap")
+    code = """if 1:
+        import io, os, signal
+        from meshsplats.training.reconstruction import _imported
+        signal.signal(signal.SIGTERM, lambda number, frame: print("tidied", flush=True))
+        _imported()
+        from PIL import Image
+        Image.effect_noise((800, 600), 99).convert("RGB").save(io.BytesIO(), "PNG")
+        os.kill(os.getpid(), signal.SIGTERM)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "tidied\n", "")
+
+
+def test_photographs_that_are_added_later_are_named_and_found_on_demand(scene):
+    folder, colmap, _ = scene()
+    with pytest.warns(DataWarning, match="left out"):
+        ensure_cameras(folder)
+    asked = len(colmap.calls)
+    assert ensure_cameras(folder) is None  # the one without a place is not new
+    save(folder / "q.png", np.full((40, 60, 3), 9, np.uint8))
+    save(folder / "mesh.npz.preview.png", np.full((40, 60, 3), 9, np.uint8))
+    (folder / "mesh.npz").write_bytes(b"")
+    with pytest.warns(DataWarning, match=r"1 photographs were added .*: q\.png; estimate_cameras finds"):
+        assert ensure_cameras(folder) is None
+    assert len(colmap.calls) == asked
+    colmap.lenses.clear()
+    with pytest.warns(DataWarning, match="2 of 6 photographs match no others"):
+        assert ensure_cameras(folder, replacing=True) is None
+    assert colmap.names == [*(f"p{i}.png" for i in range(5)), "q.png"]
+    assert ensure_cameras(folder) is None
+
+
+def test_cameras_of_others_are_never_replaced(scene):
+    folder, colmap, _ = scene()
+    content = '{"frames": [{"file_path": "p0.png"}]}'
+    (folder / "transforms.json").write_text(content)
+    options = PhotographOptions(estimate_cameras=True)
+    with pytest.raises(OptionsError, match=r"transforms\.json has cameras of another program; move it away"):
+        options.with_cameras(folder, print)
+    assert not colmap.calls
+    assert (folder / "transforms.json").read_text() == content
+
+
+def test_a_resumed_run_keeps_the_cameras_that_it_began_with(scene):
+    folder, colmap, _ = scene()
+    options = PhotographOptions(estimate_cameras=True)
+    with pytest.warns(DataWarning):
+        options.with_cameras(folder, print)
+    asked = len(colmap.calls)
+    options.with_cameras(folder, print, resumed=True)
+    assert len(colmap.calls) == asked
+
+
+def test_previews_of_results_are_no_photographs(tmp_path):
+    folder = photographs(tmp_path, 3)
+    for name in ("mesh.npz.preview.png", "p7.preview.png"):
+        save(folder / name, np.zeros((40, 60, 3), np.uint8))
+    (folder / "mesh.npz").write_bytes(b"")
+    names = [path.name for path in bare_photographs(folder)]
+    assert names == ["p0.png", "p1.png", "p2.png", "p7.preview.png"]
 
 
 class WithPairs(Colmap):
@@ -245,11 +448,10 @@ class WithPairs(Colmap):
             connection.execute("create table images (image_id integer, name text)")
             connection.execute("create table descriptors (image_id integer, rows, cols, data blob)")
             for i, name in enumerate(names):
-                rows = np.full((2, 128), 10 * i + 1, np.uint8)
+                rows = np.full((2 if i else 0, 128), 10 * i + 1, np.uint8)
                 connection.execute("insert into images values (?, ?)", (7 * i, name))
-                if i:  # the first has no features
-                    values = (7 * i, *rows.shape, rows.tobytes())
-                    connection.execute("insert into descriptors values (?, ?, ?, ?)", values)
+                values = (7 * i, *rows.shape, rows.tobytes() or None)  # the first has no features
+                connection.execute("insert into descriptors values (?, ?, ?, ?)", values)
             connection.commit()
 
     def match_image_pairs(self, database, *, pairing_options, device):

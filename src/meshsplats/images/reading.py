@@ -25,6 +25,8 @@ _TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 """``Header.turn`` by EXIF's orientation; 0 for others."""
 _HEIF = re.compile(rb"....ftyp(heic|heix|heim|heis|hevc|hevx|mif1|msf1)", re.DOTALL)
 """How HEIF files begin, as iPhones take photographs."""
+_MODEL, _EXIF_IFD, _FOCAL, _FOCAL_OF_FILM = 0x0110, 0x8769, 0x920A, 0xA405
+"""Tags of EXIF data: camera, the part about the photograph, focal length in mm, and in mm of 35 mm film."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,20 @@ class Header:
     turn: int = 0
     """Quarter turns clockwise after which the image, as it is stored, is upright: EXIF's orientation, without
     its mirroring."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """How a photograph was taken, as far as its file tells."""
+
+    size: tuple[int, int]
+    """Width and height in pixels."""
+    format: str
+    """As Pillow names it."""
+    camera: str = ""
+    """Model; empty if it is not known."""
+    focal: float = 0.0
+    """Focal length in mm, of 35 mm film where that is known; 0 if none is."""
 
 
 def read_header(path: Path) -> Header:
@@ -68,13 +84,35 @@ def load_image(path: str | os.PathLike[str], data: bytes | None = None) -> np.nd
         except FileFormatError:
             raise
         except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
-            raise FileFormatError(f"{path}: a broken image: {str(error)[:120]}") from None
+            raise _broken(path, error) from None
+
+
+def read_shot(path: Path) -> Shot:
+    """How a photograph was taken. FileFormatError if it is broken: it is decoded, a JPEG coarsely."""
+    with _opened(path) as image:
+        size, kind = image.size, str(image.format)
+        try:
+            image.draft("RGB", (1, 1))
+            image.load()
+        except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
+            raise _broken(path, error) from None
+        try:
+            exif = image.getexif()
+            more = exif.get_ifd(_EXIF_IFD)
+            focal = float(more.get(_FOCAL_OF_FILM) or more.get(_FOCAL) or 0)
+            return Shot(size, kind, str(exif.get(_MODEL, "")), focal if focal > 0 else 0.0)
+        except (OSError, ValueError, SyntaxError, TypeError, ArithmeticError, LookupError, struct.error):
+            return Shot(size, kind)  # as any program may write there what it likes
 
 
 def read_exif(path: Path) -> bytes:
     """The EXIF data of an image; empty if it has none."""
     with _opened(path) as image:
         return bytes(image.getexif().tobytes())
+
+
+def _broken(path: str | os.PathLike[str], error: BaseException) -> FileFormatError:
+    return FileFormatError(f"{path}: a broken image: {str(error)[:120]}")
 
 
 def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...]:

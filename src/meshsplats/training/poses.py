@@ -6,7 +6,7 @@ import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ MANY = 60
 """Photographs from which on poses are first found all together: of 292 of a room in 51 s, all right, where
 one after the other took 108 s and placed none, with contradictions that were tolerated; of 50 of a phone, one
 after the other is right, and all together are two wrong."""
+FEWEST_APART = 3
+"""Photographs that are named as a group of their own if they have poses together, but not with the rest."""
 _MAX_IMAGES = 2**31 - 1
 """By which COLMAP's database makes one number of the two of a pair."""
 
@@ -42,6 +44,8 @@ class Poses:
     """Strong pairs that agree with it..."""
     contradicting: tuple[tuple[int, int], ...]
     """... and the image numbers of those that do not. Pairs with a photograph that has no pose do neither."""
+    apart: tuple[tuple[str, ...], ...] = ()
+    """Names of photographs that have poses together, but not with these, in groups."""
 
     @property
     def doubtful(self) -> bool:
@@ -61,6 +65,7 @@ def find_poses(
     work: Path,
     count: int,
     say: Callable[[str], None] = lambda text: None,
+    threads: int | None = None,
 ) -> Poses | None:
     """The poses of the ``count`` photographs in the folder ``images`` by the matches in COLMAP's
     ``database``; None if too few match.
@@ -74,12 +79,15 @@ def find_poses(
     say("finding the cameras: poses")
 
     def one_by_one() -> Poses | None:
-        options = _incremental_options(pycolmap)
+        options = _incremental_options(pycolmap, threads)
         return _judged(pycolmap.incremental_mapping(database, images, work, options=options).values(), pairs)
 
     def together() -> Poses | None:
         (work / "together").mkdir()
-        return _judged(pycolmap.global_mapping(database, images, work / "together").values(), pairs)
+        options = _global_options(pycolmap, threads)
+        return _judged(
+            pycolmap.global_mapping(database, images, work / "together", **options).values(), pairs
+        )
 
     if not hasattr(pycolmap, "global_mapping"):  # an older version
         return one_by_one()
@@ -133,13 +141,39 @@ def judge(model: Any, pairs: Mapping[tuple[int, int], int]) -> Poses:
 
 def _judged(models: Iterable[Any], pairs: Mapping[tuple[int, int], int]) -> Poses | None:
     """The largest of ``models``; None if there is none."""
-    best = max(models, key=lambda model: model.num_reg_images(), default=None)
-    return None if best is None else judge(best, pairs)
+    found = sorted(models, key=lambda model: model.num_reg_images(), reverse=True)
+    if not found:
+        return None
+    taken = set(_placed(found[0]))
+    apart = []
+    for model in found[1:]:
+        group = [name for name in _placed(model) if name not in taken]
+        taken.update(group)
+        if len(group) >= FEWEST_APART:
+            apart.append(tuple(sorted(group)))
+    return replace(judge(found[0], pairs), apart=tuple(apart))
 
 
-def _incremental_options(pycolmap: Any) -> Any:
+def _placed(model: Any) -> list[str]:
+    """Names of the photographs that have a pose in ``model``."""
+    return [image.name for image in model.images.values() if image.has_pose]
+
+
+def _global_options(pycolmap: Any, threads: int | None) -> dict[str, Any]:
+    """Options of ``global_mapping``."""
+    if threads is None:
+        return {}
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = threads
+    return {"options": options}
+
+
+def _incremental_options(pycolmap: Any, threads: int | None) -> Any:
     """Options of ``incremental_mapping``, with the names of the library's version."""
     options = pycolmap.IncrementalPipelineOptions()
+    if threads is not None:
+        options.num_threads = threads
+    options.min_model_size = FEWEST_APART
     options.ba_global_max_refinements = REFINEMENTS
     options.ba_global_points_ratio = GROWTH
     frames = "ba_global_frames_ratio"

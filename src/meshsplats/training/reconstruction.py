@@ -5,23 +5,29 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
+import signal
 import sqlite3
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshsplats._files.atomic import write_bytes, write_text
+from meshsplats._core.library import thread_count
+from meshsplats._files.atomic import together, write_bytes, write_text
+from meshsplats._json import read_json
 from meshsplats.datasets.image_files import Shelf
 from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
-from meshsplats.images.reading import load_image, read_exif, read_header
+from meshsplats.formats.outputs import PREVIEW
+from meshsplats.images.reading import Shot
 from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
+from meshsplats.training.photo_files import by_lens, for_pycolmap, read_shots
 from meshsplats.training.poses import find_poses
 from meshsplats.training.suspects import shortened
 
@@ -39,6 +45,9 @@ DOUBLED_UP_TO = 100
 0.14 % of their spread in the median, 0.4 % at most."""
 MAX_FEATURES = 3000
 """Features of an image: matching takes the square of that for each pair."""
+TRIED = "estimated_from"
+"""Key of ``CAMERAS`` that marks the file as ours: the photographs that cameras were looked for, also those
+that found no place."""
 FEWEST = 3
 """Photographs that must find their place."""
 NEEDS = "photographs without cameras need the library pycolmap: pip install 'meshsplats[photos]'"
@@ -47,47 +56,94 @@ NEEDS = "photographs without cameras need the library pycolmap: pip install 'mes
 def bare_photographs(folder: Path) -> list[Path]:
     """The image files in ``folder``/images or ``folder``/input, else in ``folder`` itself, sorted; none for a
     data set that has cameras."""
-    if not folder.is_dir() or find_layout(folder) is not None:
-        return []
+    return [] if not folder.is_dir() or find_layout(folder) is not None else _photographs(folder)
+
+
+def _photographs(folder: Path) -> list[Path]:
     for name in image_folders(folder):
-        if found := Shelf(folder / name).images():
-            return [folder / name / image for image in found]
+        paths = [folder / name / image for image in Shelf(folder / name).images()]
+        if found := [path for path in paths if not _is_preview(path)]:
+            return found
     return []
 
 
+def _tried(cameras: Path) -> set[str] | None:
+    """The photographs that ``find_cameras`` looked at, whose file ``cameras`` is; None for that of another
+    program."""
+    content = read_json(cameras)
+    names = content.get(TRIED) if isinstance(content, dict) else None
+    return set(map(str, names)) if isinstance(names, list) else None
+
+
+def _is_preview(path: Path) -> bool:
+    """Whether the image was drawn of a result that lies beside it."""
+    end = f".{PREVIEW}"
+    return path.name.endswith(end) and path.with_name(path.name.removesuffix(end)).exists()
+
+
 def ensure_cameras(
-    folder: Path, *, replacing: bool = False, say: Callable[[str], None] = lambda text: None
+    folder: Path,
+    *,
+    replacing: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+    threads: int | None = None,
 ) -> Path | None:
-    """Finds the cameras of the photographs in ``folder`` if it has none. Returns the file of its cameras if
-    they are not of ``find_cameras``.
+    """Finds the cameras of the photographs in ``folder`` if it has none, or ``replacing`` those that
+    ``find_cameras`` found. Returns the file of its cameras if they are not of ``find_cameras``.
 
     Raises FileFormatError if cameras that are not read belong to the photographs, unless ``replacing`` them:
     estimated ones would have another frame, without a word. Otherwise errors are those of ``find_cameras``.
+
+    Warns with a DataWarning about photographs that were added since the cameras were found.
     """
+    layout = find_layout(folder)
+    if layout is not None:
+        tried = _tried(layout.source) if layout.source == folder / CAMERAS else None
+        if tried is None:
+            return layout.source
+        added = [path for path in _photographs(folder) if path.relative_to(folder).as_posix() not in tried]
+        if replacing:
+            find_cameras(folder, say, threads, replacing=True)
+        elif added:
+            warnings.warn(
+                f"{folder}: {len(added)} photographs were added since the cameras were found, and are left"
+                f" out: {shortened([path.name for path in added])}; ``estimate_cameras`` finds those of all",
+                DataWarning,
+                stacklevel=2,
+            )
+        return None
     if not bare_photographs(folder):
-        layout = find_layout(folder)
-        return None if layout is None or layout.source == folder / CAMERAS else layout.source
+        return None
     if not replacing and (there := unread_cameras(folder)):
         raise FileFormatError(f"{folder}: {there}; ``estimate_cameras`` finds cameras in their place")
-    find_cameras(folder, say)
+    find_cameras(folder, say, threads)
     return None
 
 
-def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -> None:
+def find_cameras(
+    folder: Path,
+    say: Callable[[str], None] = lambda text: None,
+    threads: int | None = None,
+    *,
+    replacing: bool = False,
+) -> None:
     """Finds the cameras of the photographs in ``folder`` (``bare_photographs``) and writes
     ``transforms.json`` and ``sparse_points.ply`` there, as nerfstudio has them, whole or not at all.
 
-    ``say`` is called with a line about each stage. Takes minutes.
+    ``say`` is called with a line about each stage. ``threads``: None for all processors.
+    ``replacing``: both files are there, and are replaced. Takes minutes.
 
     Raises:
         MissingDependencyError: pycolmap is not installed.
-        ValueError: fewer than ``FEWEST`` photographs, or so few that match each other.
-        FileExistsError: ``sparse_points.ply`` is there already.
+        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other.
+        FileExistsError: ``sparse_points.ply`` is there already, unless ``replacing`` it.
         OSError: the folder cannot be written.
 
-    Warns with a DataWarning about photographs that found no place, and about places that contradict matches.
+    Warns with a DataWarning about photographs that are broken or found no place, and about places that
+    contradict matches.
     """
-    photographs = bare_photographs(folder)
+    photographs = _photographs(folder) if replacing else bare_photographs(folder)
+    tried = [path.relative_to(folder).as_posix() for path in photographs]
     if len(photographs) < FEWEST:
         raise ValueError(
             f"{folder}: {len(photographs)} photographs without cameras; at least {FEWEST} are needed, some"
@@ -95,37 +151,27 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
         )
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder}: no permission to write the cameras beside the photographs")
-    if (folder / POINTS).exists():
+    if not replacing and (folder / POINTS).exists():
         raise FileExistsError(
             errno.EEXIST,
             "is in the place of the points that come with the cameras: move it away",
             str(folder / POINTS),
         )
-    try:
-        import pycolmap
-    except ImportError:
-        raise MissingDependencyError(NEEDS) from None
+    pycolmap = _imported()
+    shots = _whole(folder, photographs, threads)
+    photographs = list(shots)
     place = photographs[0].parent
     prefix = f"{place.name}/" if place != folder else ""
-    sizes = {(header.width, header.height) for header in map(read_header, photographs)}
     pycolmap.logging.minloglevel = 3
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as work:
-        database = os.path.join(work, "database.db")
-        images = _for_pycolmap(photographs, Path(work))
+        database = Path(work, "database.db")
+        images = for_pycolmap(shots, Path(work))
         place = images[0].parent
-        mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
         say(f"finding the cameras of {len(photographs)} photographs: features")
-        pycolmap.extract_features(
-            database,
-            place,
-            [path.name for path in images],  # else all images in folders below, too
-            camera_mode=mode,
-            device=pycolmap.Device.cpu,
-            **_feature_options(pycolmap, max(max(size) for size in sizes), len(images)),
-        )
-        _match(pycolmap, Path(database), [path.name for path in images], say)
-        poses = find_poses(pycolmap, Path(database), place, Path(work), len(images), say)
+        _extract(pycolmap, database, images, list(shots.values()), threads)
+        _match(pycolmap, database, [path.name for path in images], say, threads)
+        poses = find_poses(pycolmap, database, place, Path(work), len(images), say, threads)
     count = 0 if poses is None else poses.model.num_reg_images()
     if poses is None or count < FEWEST:
         raise ValueError(
@@ -136,14 +182,19 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
     best = poses.model
     named = {image.name: path.name for image, path in zip(images, photographs, strict=True)}
     placed = {named[image.name] for image in best.images.values() if image.has_pose}
-    lost = [path.name for path in photographs if path.name not in placed]
-    if lost:
-        warnings.warn(
-            f"{folder}: {len(lost)} of {len(photographs)} photographs match no others and are left out:"
-            f" {shortened(lost)}",
-            DataWarning,
-            stacklevel=2,
-        )
+    groups = [[named[name] for name in group] for group in poses.apart]
+    apart = {name for group in groups for name in group}
+    lost = [path.name for path in photographs if path.name not in placed | apart]
+    for names, text in (
+        (lost, "found no place among the others and are left out"),
+        *((group, "match each other, but nothing joins them to the rest: left out") for group in groups),
+    ):
+        if names:
+            warnings.warn(
+                f"{folder}: {len(names)} of {len(photographs)} photographs {text}: {shortened(names)}",
+                DataWarning,
+                stacklevel=2,
+            )
     if poses.doubtful:
         suspects = shortened([named[name] for name in poses.suspects()])
         warnings.warn(
@@ -153,24 +204,77 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
             DataWarning,
             stacklevel=2,
         )
-    cameras = json.dumps(_transforms(best, prefix, named), indent=1) + "\n"
-    write_bytes(folder / POINTS, _points(best))
-    try:
-        write_text(folder / CAMERAS, cameras)
-    except BaseException:
-        (folder / POINTS).unlink(missing_ok=True)
-        raise
+    cameras = _transforms(best, prefix, named) | {TRIED: tried}
+    with together():
+        write_bytes(folder / POINTS, _points(best))
+        write_text(folder / CAMERAS, json.dumps(cameras, indent=1) + "\n")
     say(f"cameras of {count} photographs and {len(best.points3D):,} points: {folder / CAMERAS}")
 
 
-def _match(pycolmap: Any, database: Path, names: list[str], say: Callable[[str], None]) -> None:
+def _imported() -> Any:
+    """pycolmap, but not its answer to SIGTERM, which is a stack trace, and leaves temporary files behind."""
+    with suppress(ImportError):
+        import_module("PIL.Image")  # first: loaded after pycolmap, it ends the process where it writes PNG
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingDependencyError(NEEDS) from None
+    if threading.current_thread() is threading.main_thread():
+        handler = signal.getsignal(signal.SIGTERM)
+        if handler is not None:
+            signal.signal(signal.SIGTERM, handler)
+    return pycolmap
+
+
+def _whole(folder: Path, photographs: list[Path], threads: int | None) -> dict[Path, Shot]:
+    """How ``photographs`` were taken, without those that are broken."""
+    shots, broken = read_shots(photographs, thread_count(threads))
+    if len(shots) < FEWEST and broken:
+        reason = next(iter(broken.values()))
+        raise ValueError(
+            f"{folder}: {len(shots)} photographs can be read, at least {FEWEST} must be; {reason}"
+        )
+    if broken:
+        names = shortened([path.name for path in broken])
+        warnings.warn(
+            f"{folder}: {len(broken)} of {len(photographs)} photographs cannot be read and are left out:"
+            f" {names} ({next(iter(broken.values()))})",
+            DataWarning,
+            stacklevel=3,
+        )
+    return shots
+
+
+def _extract(
+    pycolmap: Any, database: Path, images: list[Path], shots: list[Shot], threads: int | None
+) -> None:
+    """Writes the features of ``images`` to COLMAP's database, with a camera for each lens of ``shots``."""
+    options = _feature_options(pycolmap, max(max(shot.size) for shot in shots), len(images), threads)
+    shared, alone = by_lens(shots)
+    modes = pycolmap.CameraMode
+    for places, mode in (*((group, modes.SINGLE) for group in shared), (alone, modes.PER_IMAGE)):
+        if places:
+            pycolmap.extract_features(
+                database,
+                images[0].parent,
+                [images[i].name for i in places],  # else all images in folders below, too
+                camera_mode=mode,
+                device=pycolmap.Device.cpu,
+                **options,
+            )
+
+
+def _match(
+    pycolmap: Any, database: Path, names: list[str], say: Callable[[str], None], threads: int | None
+) -> None:
     """Matches the features of all pairs of the images ``names``, or where these are many, of those that look
     alike."""
     count = len(names)
+    given = _matching_options(pycolmap, threads)
     # Older versions of the library have no function for given pairs.
     if count <= ALL_UP_TO or not hasattr(pycolmap, "match_image_pairs"):
         say(f"finding the cameras: {count * (count - 1) // 2:,} pairs")
-        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu, **given)
         return
     pairs = alike_pairs(_descriptors(database, names))
     say(f"finding the cameras: {len(pairs):,} pairs of photographs that look alike")
@@ -178,7 +282,18 @@ def _match(pycolmap: Any, database: Path, names: list[str], say: Callable[[str],
     chosen.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = chosen
-    pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+    pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu, **given)
+
+
+def _matching_options(pycolmap: Any, threads: int | None) -> dict[str, Any]:
+    """Options of ``match_exhaustive`` and ``match_image_pairs`` in the library's version."""
+    if threads is None:
+        return {}
+    if hasattr(pycolmap, "FeatureMatchingOptions"):
+        options = pycolmap.FeatureMatchingOptions()
+        options.num_threads = threads
+        return {"matching_options": options}
+    return {"sift_options": {"num_threads": threads}}
 
 
 def _descriptors(database: Path, names: list[str]) -> list[np.ndarray]:
@@ -186,46 +301,26 @@ def _descriptors(database: Path, names: list[str]) -> list[np.ndarray]:
     query = "select name, rows, cols, data from descriptors join images using (image_id)"
     with closing(sqlite3.connect(database)) as connection:
         table = connection.execute(query).fetchall()
-    found = {name: np.frombuffer(data, np.uint8).reshape(rows, width) for name, rows, width, data in table}
+    # Of an image without features, data is NULL.
+    found = {
+        name: np.frombuffer(data or b"", np.uint8).reshape(rows, width) for name, rows, width, data in table
+    }
     return [found.get(name, np.zeros((0, 128), np.uint8)) for name in names]
 
 
-def _feature_options(pycolmap: Any, side: int, count: int) -> dict[str, Any]:
+def _feature_options(pycolmap: Any, side: int, count: int, threads: int | None) -> dict[str, Any]:
     """Options of ``extract_features`` in the library's version, for ``count`` images of that longest
     ``side``."""
     doubled = side < DOUBLED_BELOW and count <= DOUBLED_UP_TO
     sift = {"max_num_features": MAX_FEATURES, "first_octave": -1 if doubled else 0}
+    general = {"max_image_size": MAX_SIDE} | ({} if threads is None else {"num_threads": threads})
     if hasattr(pycolmap, "FeatureExtractionOptions"):
         options = pycolmap.FeatureExtractionOptions()
-        options.max_image_size = MAX_SIDE
-        for name, value in sift.items():
-            setattr(options.sift, name, value)
+        for place, values in ((options, general), (options.sift, sift)):
+            for name, value in values.items():
+                setattr(place, name, value)
         return {"extraction_options": options}
-    return {"sift_options": {"max_image_size": MAX_SIDE, **sift}}
-
-
-def _for_pycolmap(photographs: list[Path], work: Path) -> list[Path]:
-    """Files that pycolmap reads, in one folder, one for each of ``photographs``: themselves, or in the folder
-    ``work`` copies where some are HEIF images, and links where names have blanks, which its lists of pairs
-    do not allow."""
-    heif = any(path.suffix.lower() in (".heic", ".heif") for path in photographs)
-    if not heif and not any(" " in path.name or path.name.startswith("#") for path in photographs):
-        return photographs
-    from PIL import Image
-
-    folder = work / "images"
-    folder.mkdir()
-    copies = [folder / f"{i:06d}{'.png' if heif else path.suffix}" for i, path in enumerate(photographs)]
-    for path, copy in zip(photographs, copies, strict=True):
-        if heif:
-            pixels = load_image(path)
-            Image.fromarray(pixels[..., :3]).save(copy, exif=read_exif(path), compress_level=1)
-        else:
-            try:
-                copy.symlink_to(path.absolute())
-            except OSError:  # Windows lets only some users make links
-                shutil.copyfile(path, copy)
-    return copies
+    return {"sift_options": {**general, **sift}}
 
 
 def _transforms(model: Any, prefix: str, named: Mapping[str, str]) -> dict[str, Any]:
