@@ -20,11 +20,13 @@ from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.merging_views import convert_within_limits, simplify_for_views
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
+from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.comparison import fidelity
 from meshsplats.evaluation.viewers import SIDE, VIEWS
 from meshsplats.formats.base_meshes import load_vertex_colored
 from meshsplats.formats.gaussians import save_gaussian_blocks, save_gaussians
+from meshsplats.formats.gltf.reader import listed_order
 from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh_blocks
 from meshsplats.formats.outputs import scaled, splat_options
@@ -188,13 +190,16 @@ class Converter:
         times: dict[str, float],
         opening: Camera | None = None,
         measured: Sequence[Camera] | None = None,
+        order: DrawOrder | None = None,
     ) -> dict[str, Any]:
         """Writes ``mesh``, which is prepared, and its preview. Its part of the result; ``times``: of what was
         done before, in seconds; ``measured``: views that the alpha mode is chosen by, by default the
-        ``cameras``."""
+        ``cameras``; ``order``: one that the mesh has already."""
         start, files, threads = time.perf_counter(), self.product.files, self.threads
-        choice = files.choice(mesh, job.outputs, cameras if measured is None else measured, threads)
-        order = files.order(mesh, job.outputs, cameras, threads)
+        choice = None
+        if order is None:
+            choice = files.choice(mesh, job.outputs, cameras if measured is None else measured, threads)
+            order = files.order(mesh, job.outputs, cameras, threads)
         chosen = time.perf_counter()
         placed = self.callbacks.place(scaled(mesh, self.product.scale))
         with self._recorded(job):
@@ -211,12 +216,16 @@ class Converter:
         }
 
     def _mesh_again(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
-        """A mesh in another format."""
+        """A mesh in another format, as a .glb in the order of blending that its file has."""
         start = time.perf_counter()
-        mesh = self.product.files.prepared(self._upright(load_vertex_colored(job.source)))
+        files = self.product.files
+        mesh = files.prepared(self._upright(load_vertex_colored(job.source)))
+        order, is_glb = None, job.source.suffix.lower() in (".glb", ".gltf")
+        if is_glb and files.measures(job.outputs) and not files.lit and files.compression == "none":
+            order = listed_order(job.source, mesh)
         times = {"read": time.perf_counter() - start}
         seen = [camera.relative_to(mesh.origin) for camera in cameras or ()]
-        return {**self._finish(mesh, job, seen, times), "fidelity": None}
+        return {**self._finish(mesh, job, seen, times, order=order), "fidelity": None}
 
     def _splats(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         start, product = time.perf_counter(), self.product

@@ -460,6 +460,9 @@ def test_an_order_for_viewers_that_cull(tmp_path, capsys):
     assert not material(out)["doubleSided"]
     assert main(["info", str(out)]) == 0
     assert "for viewers that cull: every triangle twice, in 3 nodes" in capsys.readouterr().out
+    assert run(out, "--scale", 0.01, "--no-sidecar", "--no-preview", "-o", tmp_path / "small.glb") == 0
+    assert main(["info", str(tmp_path / "small.glb")]) == 0
+    assert "every triangle twice, in 3 nodes" in capsys.readouterr().out
     solved = load_mesh(out)
     np.testing.assert_array_equal(
         solved.faces, convert(nested_balls(0.95), cameras=load_cameras(three[1])).faces

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from meshsplats import DataWarning, FileFormatError, SplatMesh, load_mesh, save_mesh
 from meshsplats.draw_order import DrawOrder
 from meshsplats.formats.gltf import copies
+from meshsplats.formats.gltf.reader import listed_order
 from meshsplats.formats.meshes import expected_bytes
 
 
@@ -30,7 +31,12 @@ def test_the_mesh_is_that_of_a_file_without_copies(tmp_path_factory, seed, nodes
     rng = np.random.default_rng(seed)
     mesh = random_mesh(rng, *rng.integers(3, 40, 2), extras=extras)
     folder = tmp_path_factory.mktemp("ordered")
-    save_mesh(mesh, folder / "ordered.glb", order=random_order(rng, len(mesh.faces), nodes))
+    order = random_order(rng, len(mesh.faces), nodes)
+    save_mesh(mesh, folder / "ordered.glb", order=order)
+    found = listed_order(folder / "ordered.glb", mesh)
+    if found is not None:  # a triangle that is there twice may be in two nodes
+        np.testing.assert_array_equal(found.listed(mesh.faces), order.listed(mesh.faces))
+        np.testing.assert_array_equal(found.starts, order.starts)
     save_mesh(mesh, folder / "blend.glb", alpha="blend")
     got, plain = load_mesh(folder / "ordered.glb"), load_mesh(folder / "blend.glb")
     assert_same(got, plain)
@@ -54,6 +60,16 @@ def ordered_fixture(request, tmp_path):
     mesh = random_mesh(rng, 30, 40)
     save_mesh(mesh, tmp_path / "ordered.glb", order=random_order(rng, 40, request.param))
     return mesh, tmp_path / "ordered.glb"
+
+
+def test_the_order_is_read_again(ordered, tmp_path):
+    mesh, path = ordered
+    order = listed_order(path, load_mesh(path))
+    assert order is not None
+    save_mesh(load_mesh(path), tmp_path / "again.glb", order=order)
+    assert (tmp_path / "again.glb").read_bytes() == path.read_bytes()
+    save_mesh(mesh, tmp_path / "blend.glb", alpha="blend")
+    assert listed_order(tmp_path / "blend.glb", mesh) is None
 
 
 def test_every_triangle_is_there_with_both_windings(ordered):

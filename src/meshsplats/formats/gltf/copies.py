@@ -88,6 +88,21 @@ def without_copies(faces: np.ndarray, own: Own) -> np.ndarray | None:
     return result[place] if (np.sort(place) == np.arange(half)).all() else None
 
 
+def order_of(faces: np.ndarray, listed: np.ndarray, starts: np.ndarray) -> DrawOrder | None:
+    """The order that gives ``listed`` (2 f, 3), with nodes from ``starts`` on, of ``faces`` (f, 3), those of
+    the mesh; None if there is none."""
+    both = np.concatenate([faces, faces[:, [0, 2, 1]]])
+    ours, theirs = (np.lexsort(rows.T[::-1]) for rows in (both, listed))
+    if len(both) != len(listed) or (both[ours] != listed[theirs]).any():
+        return None
+    copies = np.empty(len(both), np.int32)
+    copies[theirs] = ours
+    try:
+        return DrawOrder(copies, starts)
+    except ValueError:
+        return None  # a triangle that is in several nodes
+
+
 def _sorted(faces: np.ndarray) -> np.ndarray:
     """The order of ``faces`` by their corners, whatever their winding: that of a fan around its first vertex,
     (0, 1, 2), (0, 2, 3), ..., (0, 8, 1)."""

@@ -152,7 +152,7 @@ def own_triangles(
     vertices = None
     good = True
     if copies.counts(entry) > 1:
-        vertex = _raw(document, dict_or_empty(entry.get("vertex")), np.int32, (v,))
+        vertex = listed_vertices(document, entry, v)
         vertices = None if vertex is None else copies.joined_vertices(vertex)
         good &= vertices is not None
         if vertex is not None:
@@ -166,6 +166,12 @@ def own_triangles(
             " altered them; take the file that meshsplats wrote"
         )
     return found, vertices
+
+
+def listed_vertices(document: GltfDocument, entry: dict[str, Any], v: int) -> np.ndarray | None:
+    """(v,) those of the mesh that the nodes of a file with copies list one after another; None for a file of
+    one node, which has them in the order of the mesh, and where another program has altered it."""
+    return _raw(document, dict_or_empty(entry.get("vertex")), np.int32, (v,))
 
 
 def in_order_of_splats(document: GltfDocument, entry: Any, faces: np.ndarray) -> dict[str, np.ndarray]:

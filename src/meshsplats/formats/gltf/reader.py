@@ -12,6 +12,7 @@ import numpy as np
 from meshsplats._arrays import joined_rows
 from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.colors import linear_to_srgb
+from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import NoTextureWarning
 from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
 from meshsplats.formats.gltf import copies
@@ -21,6 +22,7 @@ from meshsplats.formats.gltf.own import (
     grid_of,
     in_order_of_splats,
     is_own_placement,
+    listed_vertices,
     origin_of,
     our_note,
     own_triangles,
@@ -86,6 +88,28 @@ def listed_nodes(path: Path) -> int:
     """
     meshes = [place.mesh for place in placed_meshes(GltfDocument(path))]
     return copies.counts(our_note(meshes[0]).get("copies")) if meshes else 0
+
+
+def listed_order(path: Path, mesh: SplatMesh) -> DrawOrder | None:
+    """The order in which a file lists the triangles of ``mesh``, which was read from it; None without one.
+
+    Raises FileFormatError for a broken file.
+    """
+    document = GltfDocument(path)
+    meshes = [place.mesh for place in shown_meshes(document)]
+    entry = dict_or_empty(our_note(meshes[0]).get("copies")) if meshes else {}
+    if not copies.counts(entry) or copies.counts(entry) != len(meshes):
+        return None
+    listed, first = [], 0
+    for each in meshes:
+        primitive = document.objects(each.get("primitives"), "primitives of a mesh")[0]
+        places = document.accessor(dict_or_empty(primitive.get("attributes")).get("POSITION"), "POSITION")
+        count = len(places)
+        listed.append(primitive_faces(document, primitive, count) + first)
+        first += count
+    vertex = listed_vertices(document, entry, first)
+    faces, starts = np.concatenate(listed), np.cumsum([0, *map(len, listed)])
+    return copies.order_of(mesh.faces, faces if vertex is None else vertex[faces], starts)
 
 
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
