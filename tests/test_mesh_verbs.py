@@ -338,9 +338,8 @@ def test_a_transformed_mesh_is_seen_as_its_transformed_splats_are(mirror):
     mesh = convert(cloud)
     moved = mesh.transformed(matrix)
     towards = cloud.transformed(matrix)
-    camera = look_at(
-        towards.means.mean(axis=0) + (0, 0, -10), towards.means.mean(axis=0), width=48, height=40
-    )
+    middle = towards.means.mean(axis=0)
+    camera = look_at(middle - np.array([0, 0, 10]), middle, width=48, height=40)
     expected = render(convert(towards), camera, samples=2).color
     assert np.quantile(np.abs(render(moved, camera, samples=2).color - expected), 0.98) < 2e-3
     np.testing.assert_allclose(moved.up, matrix[:3, :3] @ mesh.up / 2, atol=1e-6)

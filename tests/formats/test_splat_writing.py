@@ -150,6 +150,7 @@ def test_positions_of_spz_are_within_half_a_step(tmp_path):
         assert 0.4 * step < np.abs(back.means - cloud.means).max() <= 0.5 * step + 1e-7
 
 
+@pytest.mark.filterwarnings("ignore:.*SPZ stores deviations:meshsplats.errors.DataWarning")
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 100.0])
 def test_spz_is_as_fine_as_its_splats_in_any_unit(tmp_path, unit):
     cloud = cloud_of(degree=0)
@@ -167,6 +168,23 @@ def test_far_splats_that_leave_spz_too_few_steps_are_told(tmp_path):
         ms.save_gaussians(far, tmp_path / "a.spz")
     back = ms.load_gaussians(tmp_path / "a.spz")
     assert abs(float(back.means.max()) - 3e6) <= 0.25
+
+
+def test_scales_out_of_the_range_of_spz_are_told(tmp_path, recwarn):
+    cloud = cloud_of(50)
+    count = len(cloud)
+    for unit, words in (
+        (1e-6, f"{count} visible splats become larger and 0 smaller"),
+        (1e6, rf"0 .*{count} smaller"),
+    ):
+        with pytest.warns(DataWarning, match=rf"a.spz: SPZ stores deviations .*{words}"):
+            ms.save_gaussians(cloud.transformed(np.eye(3) * unit), tmp_path / "a.spz")
+    recwarn.clear()
+    unseen = np.where(np.arange(count)[:, None] == 0, np.float32(1e3), cloud.scales)
+    flat = np.where(np.arange(3) == 2, np.float32(0), unseen)
+    opacities = np.where(np.arange(count) == 0, np.float32(1e-3), cloud.opacities)
+    ms.save_gaussians(replace(cloud, scales=flat, opacities=opacities), tmp_path / "a.spz")
+    assert not [w for w in recwarn if "deviations" in str(w.message)]
 
 
 def test_spz_keeps_an_order_in_which_splats_repeat_each_other(tmp_path):

@@ -26,6 +26,14 @@ from meshsplats.gaussians import GaussianCloud
 _FEWEST_BITS, _MOST_BITS = 12, 22
 _STEPS = 8
 """Steps of positions, at least, in the deviation that most splats exceed along their second axis."""
+_SMALLEST, _LARGEST = math.exp(-10), math.exp(255 / 16 - 10)
+"""Range of deviations, scene units."""
+_STEP = math.exp(1 / 16)
+"""Of deviations, a factor."""
+_VISIBLE = 1 / 255
+"""Least opacity that renderers draw."""
+_SHOWS = 10
+"""What is smaller than a tenth of most splats, and becomes no larger than that, does not show."""
 _FIRST_BUCKET, _BUCKET = 8, 16
 """Steps of 1/128 in a step of harmonics of degree 1 and beyond."""
 _GZIP_LEVEL, _REPEATED_LEVEL, _ZSTD_LEVEL = 4, 2, 9
@@ -37,6 +45,7 @@ def write_spz(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     compress = _compressor(writing.where) if writing.spz_version == 4 else None
     warn_of_losses(cloud, writing.where, keeps=("antialiased",))
     bits = _fraction_bits(cloud, writing.where)
+    _warn_of_sizes(cloud, writing.where)
     if compress is None:
         path.write_bytes(_version_3(cloud, bits))
         return
@@ -49,7 +58,9 @@ def write_spz(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
 
 
 def spz_bytes(cloud: GaussianCloud, where: object) -> bytes:
-    """A file of version 3 of ``cloud``; a DataWarning names ``where`` if its positions are too coarse."""
+    """A file of version 3 of ``cloud``; a DataWarning names ``where`` if its positions are too coarse, or
+    its scales are out of range."""
+    _warn_of_sizes(cloud, where)
     return _version_3(cloud, _fraction_bits(cloud, where))
 
 
@@ -81,7 +92,7 @@ def _fraction_bits(cloud: GaussianCloud, where: object) -> int:
     room = 23 - math.frexp(farthest)[1] if farthest else _MOST_BITS
     if round(farthest * 2.0**room) > 2**23 - 1:  # rounded up to the end of the range
         room -= 1
-    size = float(np.median(np.sort(cloud.scales, axis=1)[:, 1]))
+    size = _usual_size(cloud)
     wanted = math.ceil(math.log2(_STEPS / size)) if size else _MOST_BITS
     bits = max(0, min(max(wanted, _FEWEST_BITS), _MOST_BITS, room))
     if farthest * 2.0**bits > 2**23 or (size and size * 2.0**bits < 1):
@@ -93,6 +104,28 @@ def _fraction_bits(cloud: GaussianCloud, where: object) -> int:
             stacklevel=4,
         )
     return bits
+
+
+def _usual_size(cloud: GaussianCloud) -> float:
+    """The deviation that most splats exceed along their second axis."""
+    return float(np.median(np.sort(cloud.scales, axis=1)[:, 1]))
+
+
+def _warn_of_sizes(cloud: GaussianCloud, where: object) -> None:
+    """Warns of visible splats that the range of scales makes smaller, or larger where that shows: of a scene
+    whose splats are small as a whole."""
+    sizes = np.sort(cloud.scales[cloud.opacities >= _VISIBLE], axis=1)
+    smaller = int((sizes[:, 2] > _LARGEST * _STEP).sum())
+    shows = _usual_size(cloud) < _SHOWS * _SMALLEST
+    larger = int((sizes[:, 1] < _SMALLEST / _STEP).sum()) if shows else 0
+    if smaller or larger:
+        warnings.warn(
+            f"{where}: SPZ stores deviations from {_SMALLEST:.2g} to {_LARGEST:.0f} scene units; {larger:,}"
+            f" visible splats become larger and {smaller:,} smaller: .sog and .ply keep their sizes, or scale"
+            " the scene",
+            DataWarning,
+            stacklevel=4,
+        )
 
 
 def _streams(cloud: GaussianCloud, bits: int, order: np.ndarray | slice) -> list[bytes]:
