@@ -81,6 +81,11 @@ def whole(path: Path, count: int) -> None:
         ("dense/0/sparse", "dense/0/images"),  # COLMAP's automatic reconstruction
         ("dense/sparse", "dense/images"),  # its undistortion
         ("sparse/0", "sparse/0"),
+        ("model", "images"),
+        ("Sparse/0", "images"),
+        ("colmap_text", "."),
+        ("0", "images"),
+        ("images", "images"),
     ],
 )
 def test_models_and_images_in_their_usual_places(tmp_path, model, images):
@@ -92,7 +97,7 @@ def test_models_and_images_in_their_usual_places(tmp_path, model, images):
     assert layout is not None
     assert layout.source == tmp_path / model
     assert bare_photographs(tmp_path) == []
-    if model not in ("colmap", "distorted/sparse/0"):
+    if model not in ("colmap", "distorted/sparse/0", "model", "Sparse/0", "colmap_text", "0"):
         whole(tmp_path / model, 4)
 
 
@@ -114,6 +119,31 @@ def test_a_model_without_its_images_does_not_hide_the_undistorted_one(tmp_path):
     frame = {"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()}
     write_json(other / "transforms.json", {"fl_x": 10, "frames": [frame]})
     assert [view.name for view in load_dataset(other, test_every=0).train] == ["images/a.png"]
+
+
+def test_several_models_in_folders_of_other_names_are_named_and_not_replaced(tmp_path):
+    names = [f"im{i}.png" for i in range(4)]
+    pictures(tmp_path / "images", names)
+    for place in ("first", "second/0"):
+        text_model(tmp_path / place, names)
+    message = "first/ and second/0/ hold cameras of COLMAP for its images: move all but one elsewhere"
+    with pytest.raises(FileFormatError, match=message):
+        load_dataset(tmp_path)
+    with pytest.raises(FileFormatError, match=f"{message}; .*estimate_cameras"):
+        ensure_cameras(tmp_path)
+
+
+def test_a_model_of_other_images_is_named_and_not_replaced(tmp_path):
+    pictures(tmp_path / "images", ["a.png", "b.png"])
+    text_model(tmp_path / "model", ["elsewhere.png"])
+    with pytest.raises(FileFormatError, match="model/ in it looks like one"):
+        ensure_cameras(tmp_path)
+
+
+def test_data_sets_in_a_folder_are_not_read_as_one(tmp_path):
+    pictures(text_model(tmp_path / "one", ["a.png"]), ["a.png"])
+    with pytest.raises(FileFormatError, match="one/ in it looks like one"):
+        load_dataset(tmp_path)
 
 
 def test_the_larger_dense_model_is_taken(tmp_path):

@@ -165,7 +165,8 @@ def load_dataset(
     - nerfstudio: ``transforms.json``, also named itself as ``path``;
     - COLMAP in other places: ``colmap/sparse/0/``, ``dense/0/`` or ``dense/``, which undistortion writes, the
       model beside the images, as RealityCapture exports it, or the folder of a model itself;
-    - LLFF: ``poses_bounds.npy``.
+    - LLFF: ``poses_bounds.npy``;
+    - COLMAP in a folder of any name, or ``0/`` in it, if no other one has a model of the images, too.
 
     ``masks/``, or the masks that a file names, say which pixels count. Photographs of lenses that are not
     pinholes are undistorted when they are read; pixels that the lens did not see are black and masked. Only

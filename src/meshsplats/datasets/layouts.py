@@ -67,6 +67,9 @@ def find_layout(path: Path) -> Layout | None:
         others.append(found)
     if (path / POSES_BOUNDS).is_file():
         return _llff(path)
+    beneath = _beneath(path)
+    if len(beneath) == 1:
+        return beneath[0]
     return others[0] if others else None
 
 
@@ -95,6 +98,14 @@ def _unusual(path: Path) -> Iterator[Layout]:
             yield from _candidates(above.parent, [model])
         if path.absolute().name == "sparse":
             yield from _candidates(above, [model])
+
+
+def _beneath(path: Path) -> list[Layout]:
+    """The best model in each folder of ``path`` that names images of ``path`` itself."""
+    images = image_folders(path)
+    models = (_models(path, name, path) for name in _folders(path))
+    found = (_best([m for m in some if m.has_images and m.images in images]) for some in models)
+    return [layout for layout in found if layout is not None]
 
 
 def _models(path: Path, place: str, root: Path) -> list[Layout]:
@@ -187,6 +198,9 @@ def what_is_there(path: Path) -> str:
         "no data set of a known layout: expected transforms_train.json, transforms.json, poses_bounds.npy, or"
         " cameras and images, .bin or .txt, in sparse/0/ or beside the images"
     )
+    if beneath := _beneath(path):
+        places = " and ".join(f"{layout.source.relative_to(path).as_posix()}/" for layout in beneath)
+        return f"{places} hold cameras of COLMAP for its images: move all but one elsewhere"
     inner = [name for name in names if _looks_like_one(path / name)]
     if inner:
         return f"{wanted}. {inner[0]}/ in it looks like one"
@@ -212,7 +226,8 @@ def unread_cameras(path: Path) -> str:
     names = [name for name in os.listdir(path) if not is_hidden(name)]
     alone = path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent)
     inner = any(_looks_like_one(path / name) for name in names)
-    if alone or inner or any(name.startswith("sparse") and (path / name).is_dir() for name in names):
+    sparse = any(name.casefold().startswith("sparse") and (path / name).is_dir() for name in names)
+    if alone or inner or sparse or len(_beneath(path)) > 1:
         return what_is_there(path)
     return cameras_of_others(path)
 
@@ -220,5 +235,5 @@ def unread_cameras(path: Path) -> str:
 def _looks_like_one(path: Path) -> bool:
     if any((path / name).is_file() for name in _NAMED):
         return True
-    places = ("sparse", *(f"sparse/{name}" for name in _numbered(path / "sparse")))
+    places = (".", "sparse", *_numbered(path), *(f"sparse/{name}" for name in _numbered(path / "sparse")))
     return find_model(path, places) is not None
