@@ -79,7 +79,7 @@ class Train(TrainingCommand):
         super().check()
 
     def prepared(self, config: FinetuneConfig) -> Self:
-        folder = self.target.with_cameras(self.input, say)
+        folder = self.target.with_cameras(self.input, say, self.threads, resumed=self.resume)
         return replace(self, input=folder)._sized(folder, config)
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:

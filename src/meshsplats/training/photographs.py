@@ -36,7 +36,8 @@ class PhotographOptions:
     masks: Masks = "count"
     """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
     estimate_cameras: bool = False
-    """Find the cameras of the photographs though the folder holds some of a kind that is not read."""
+    """Find the cameras of the photographs though the folder holds some of a kind that is not read, or those
+    that were found of fewer photographs."""
     frames: int | None = None
     """Frames to take of a video. Default: two per second, 40 to 120."""
     cache: float = 2.0
@@ -50,16 +51,24 @@ class PhotographOptions:
     def cache_bytes(self) -> int:
         return int(self.cache * 1e9)
 
-    def with_cameras(self, source: Path, say: Say) -> Path:
+    def with_cameras(
+        self, source: Path, say: Say, threads: int | None = None, *, resumed: bool = False
+    ) -> Path:
         """The folder of the photographs at ``source``, a folder or a video, with cameras, which are found
-        where there are none. ``say`` gets lines about it. OptionsError if they are not to be found."""
+        where there are none, by as many ``threads``, or by all processors. ``say`` gets lines about it.
+        ``resumed``: for a run that goes on with those that it began with. OptionsError if they are not to be
+        found."""
         from meshsplats.training.reconstruction import ensure_cameras
         from meshsplats.training.video import photographs_of
 
         folder = photographs_of(source, self.frames, say)
-        there = ensure_cameras(folder, replacing=self.estimate_cameras, say=say)
+        replacing = self.estimate_cameras and not resumed
+        there = ensure_cameras(folder, replacing=replacing, say=say, threads=threads)
         if there is not None and self.estimate_cameras:
-            raise OptionsError(f"``estimate_cameras`` has no effect: {there} has cameras")
+            raise OptionsError(
+                f"``estimate_cameras`` has no effect: {there} has cameras of another program; move it away to"
+                " have others found"
+            )
         return folder
 
     def load(self, folder: Path, config: TrainConfig) -> tuple[Dataset, Background]:
