@@ -42,7 +42,7 @@ class Texture:
             at = np.asarray(uv[:, axis], np.float64) * side - 0.5
             first = np.floor(at)
             shares.append((at - first)[:, None])
-            places.append([self._wrapped(first + step, side, self.wrap[axis]) for step in (0, 1)])
+            places.append([self.wrapped(first + step, side, self.wrap[axis]) for step in (0, 1)])
         rows = [
             self.pixels[places[1][j], places[0][0]] * (1 - shares[0])
             + self.pixels[places[1][j], places[0][1]] * shares[0]
@@ -56,7 +56,8 @@ class Texture:
         return np.clip(color, 0, 1)
 
     @staticmethod
-    def _wrapped(index: np.ndarray, side: int, mode: Wrap) -> np.ndarray:
+    def wrapped(index: np.ndarray, side: int, mode: Wrap) -> np.ndarray:
+        """int64 pixels that whole numbers ``index`` stand for along a side of ``side`` pixels."""
         if mode == "clamp":
             return np.clip(index, 0, side - 1).astype(np.int64)
         if mode == "mirror":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -243,6 +244,41 @@ def test_texels_that_nobody_saw_are_filled_from_near():
     assert (result[5:35, 2] == [1, 0, 0]).all()
     assert (result[5:35, 31] == [0, 0, 1]).all()
     np.testing.assert_array_equal(filled(texels, 0 * weight), np.full_like(texels, 0.5))
+
+
+def test_the_factor_of_a_texture_is_drawn_and_what_cannot_be_is_refused():
+    points, faces = unit_ball(2)
+    camera = cameras(1)[0]
+    pixels = np.full((8, 8, 4), 255, np.uint8)
+    red = BaseMesh(
+        points,
+        faces,
+        uv=np.full((len(faces), 3, 2), 0.5),
+        face_texture=np.zeros(len(faces), np.int32),
+        textures=(Texture(pixels, factor=(1, 0.25, 0, 1)),),
+    )
+    shown = red.colors_at(np.zeros(1, int), np.full((1, 3), 1 / 3))[0, :3]
+    assert draw_surface(red, camera)[32, 32] == pytest.approx(shown, abs=1e-6)
+    some = np.where(np.arange(len(faces)) < 3, -1, 0)
+    with pytest.raises(ValueError, match=f"this mesh has 1, on {len(faces) - 3} of {len(faces)} faces"):
+        draw_surface(replace(red, face_texture=some), camera)
+
+
+@pytest.mark.parametrize("wrap", [("repeat", "mirror"), ("mirror", "clamp"), ("clamp", "repeat")])
+def test_textures_are_drawn_beyond_their_borders_as_they_wrap(wrap):
+    """A square that fills the image, with its texture from -1.25 to 1.75 along each side."""
+    points = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 4, 4), np.uint8)
+    uv = points[faces, :2] * np.float32(1.5) + np.float32(0.25)
+    base = BaseMesh(points, faces, uv=uv, face_texture=[0, 0], textures=(Texture(pixels, wrap),))
+    image = draw_surface(base, Camera(np.eye(4), 32, 32, 32, 32, 64, 64))
+    at = (np.arange(128) + 0.5) / 64 - 1
+    samples = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) * 1.5 + 0.25
+    expected = base.textures[0].at(samples)[:, :3].reshape(64, 2, 64, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image, expected, atol=1e-3)
+    with pytest.raises(ValueError, match="repeated too often to be drawn"):
+        draw_surface(replace(base, uv=uv * np.float32(1e9)), Camera(np.eye(4), 8, 8, 8, 8, 16, 16))
 
 
 def test_surfaces_without_a_texture_are_drawn():

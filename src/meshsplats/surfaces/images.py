@@ -16,9 +16,9 @@ from meshsplats._core.surfaces import (
     texture_samples,
 )
 from meshsplats._kinds import need
-from meshsplats.base_mesh import BaseMesh
+from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.camera import Camera
-from meshsplats.formats.surfaces.corners import plain_mesh
+from meshsplats.formats.surfaces.corners import check_texture, opaque_pixels, plain_mesh
 from meshsplats.mesh import Triangles
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
@@ -33,6 +33,8 @@ from meshsplats.rendering.edges import (
 
 SAMPLES = 2
 """Samples along each side of a pixel."""
+_MOST_TEXELS = 1 << 28
+"""Numbers of a texture that is repeated, 1 GiB."""
 
 
 class Surface(NamedTuple):
@@ -172,13 +174,40 @@ def draw_surface(
         camera: viewpoint, lens and size of the image.
         background: RGB, (3,) or (h, w, 3).
         threads: at most this many; all processors by default.
+
+    Raises ValueError for a mesh with several textures, with a texture on some faces only, or with one that is
+    repeated too often to be drawn: ``bind`` and ``render`` show these.
     """
     need(BaseMesh, base=base)
     need(Camera, camera=camera)
-    if base.textured and base.uv is not None and len(base.textures) == 1:
-        texels = base.textures[0].pixels[..., :3].astype(np.float32) / 255
-        surface = Surface(base.vertices.astype(np.float64), base.faces, base.uv, texels)
+    check_texture(base)
+    if base.textured and base.uv is not None:
+        surface = Surface(base.vertices.astype(np.float64), base.faces, *_unrolled(base))
         camera = camera.with_near_plane(base.vertices)
         behind = np.asarray(background, np.float32)
         return SurfaceImage(surface, camera, behind, gradients=False, threads=threads).color
     return render(plain_mesh(base), camera, background=background, samples=SAMPLES, threads=threads).color
+
+
+def _unrolled(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates (f, 3, 2) float32 of ``base`` and texels (th, tw, 3), of its texture as far as the
+    coordinates go: beyond its borders as it wraps."""
+    assert base.uv is not None
+    texture, texels = base.textures[0], opaque_pixels(base.textures[0])
+    uv = base.uv.astype(np.float64)
+    for axis, mode in enumerate(texture.wrap):
+        side = texels.shape[1 - axis]
+        along = uv[..., axis] * side
+        first, last = int(np.floor(along.min() - 0.5)), int(np.floor(along.max() + 0.5))
+        beyond = 1 if mode == "clamp" else 0  # the half pixel inside each border has the border's colour
+        if first >= -beyond and last < side + beyond:
+            continue
+        count = last - first + 1
+        if count * texels.size // side > _MOST_TEXELS:
+            raise ValueError(
+                f"the texture is repeated too often to be drawn, from {'uv'[axis]} {along.min() / side:.3g}"
+                f" to {along.max() / side:.3g}: render(bind(base, layers=1).mesh, camera) draws it"
+            )
+        texels = np.take(texels, Texture.wrapped(np.arange(first, last + 1), side, mode), axis=1 - axis)
+        uv[..., axis] = (along - first) / count
+    return uv.astype(np.float32), np.ascontiguousarray(texels)

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats.surfaces.corners import check_texture, corners_of, plain_mesh, texture_file
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer.packing import vertex_order
@@ -59,7 +58,7 @@ def pack_surface(base: BaseMesh) -> PackedSurface:
     white = np.ones((len(corners.vertices), 4), np.float32)
     shape = SplatMesh(corners.vertices, corners.faces, white, up=base.up, origin=base.origin)
     packer, texture = Packer(), base.textures[0]
-    suffix, picture = texture_file(replace(base, textures=(_plain(texture),)))
+    suffix, picture = texture_file(base)
     header = {
         "kind": "coordinates",
         "row": packer.add_rows(np.rint(corners.uv[vertex_order(shape)] * float(STEPS)).astype(np.int64)),
@@ -68,13 +67,3 @@ def pack_surface(base: BaseMesh) -> PackedSurface:
         "type": _TYPES[suffix],
     }
     return PackedSurface(shape, quantise_mesh(shape), packer.finish(header), picture)
-
-
-def _plain(texture: Texture) -> Texture:
-    """``texture`` with its factor in its pixels."""
-    if texture.factor == (1.0, 1.0, 1.0, 1.0):
-        return texture
-    pixels = texture.pixels.copy()
-    shown = np.clip(srgb_to_linear(pixels[..., :3] / np.float32(255)) * texture.factor[:3], 0, 1)
-    pixels[..., :3] = np.rint(255 * linear_to_srgb(shown.astype(np.float32)))
-    return Texture(pixels, texture.wrap)

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._geometry import vertex_normals
-from meshsplats.base_mesh import BaseMesh
+from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.formats.surfaces.tangents import corner_frames
 from meshsplats.images.writing import encode_image
 from meshsplats.mesh import SplatMesh
@@ -71,13 +72,22 @@ def smooth_normals(base: BaseMesh) -> np.ndarray:
 def texture_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]:
     """The suffix and the content of the file of the texture of ``base``: `.png`, `.jpg` or `.webp`; by
     default PNG, or JPEG of quality 95 where that is large. Alpha is left out, as surfaces are opaque."""
-    pixels = base.textures[0].pixels[..., :3].astype(np.float32) / 255
+    pixels = opaque_pixels(base.textures[0])
     if suffix is None:
         content = encode_image("a.png", pixels)
         if len(content) <= LARGE_PNG:
             return ".png", content
         suffix = ".jpg"
     return suffix, encode_image(f"a{suffix}", pixels)
+
+
+def opaque_pixels(texture: Texture) -> np.ndarray:
+    """(h, w, 3) float32 display RGB of ``texture``, with its factor."""
+    pixels = texture.pixels[..., :3].astype(np.float32) / 255
+    if texture.factor == (1.0, 1.0, 1.0, 1.0):
+        return pixels
+    shown = np.clip(srgb_to_linear(pixels) * np.array(texture.factor[:3], np.float32), 0, 1)
+    return linear_to_srgb(shown)
 
 
 def normal_file(base: BaseMesh, suffix: str | None = None) -> tuple[str, bytes]:
@@ -96,7 +106,10 @@ def has_whole_texture(base: BaseMesh) -> bool:
 def check_texture(base: BaseMesh) -> None:
     """ValueError for a mesh that is not textured as a surface is: with one texture on all faces, or none."""
     if base.textured and not has_whole_texture(base):
-        raise ValueError(f"a surface has one texture on all faces, this mesh has {len(base.textures)}")
+        raise ValueError(
+            f"a surface has one texture on all faces, this mesh has {len(base.textures)}, on"
+            f" {int(base.textured_faces().sum()):,} of {len(base.faces):,} faces"
+        )
 
 
 def plain_mesh(base: BaseMesh) -> SplatMesh:

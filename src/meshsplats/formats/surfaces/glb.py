@@ -18,7 +18,8 @@ from meshsplats.formats.surfaces.convex import convex_parts
 from meshsplats.formats.surfaces.corners import corners_of, normal_file, texture_file
 
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
-_CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987
+_WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
+_LINEAR, _MIPMAPS = 9729, 9987
 _WEBP = "EXT_texture_webp"
 _NAMES = {None: "surface", "drawn": "surface-col", "only": "surface-colonly", "convex": "surface"}
 """By the suffixes Godot makes a collider; with the second it leaves out the mesh."""
@@ -45,6 +46,7 @@ def write_surface_glb(
     if shape.uv is not None:
         attributes["TEXCOORD_0"] = chunk.attribute(shape.uv)
         suffix, content = texture_file(base, image)
+        wrap_s, wrap_t = (_WRAPS[mode] for mode in base.textures[0].wrap)
         pbr["baseColorTexture"] = {"index": 0}
         pictures = [("surface", suffix, content)]
         if shape.tangents is not None and not unlit:
@@ -65,7 +67,7 @@ def write_surface_glb(
                 for name, kind, data in pictures
             ],
             "samplers": [
-                {"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP},
+                {"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": wrap_s, "wrapT": wrap_t},
             ],
         }
     elif shape.colors is not None:

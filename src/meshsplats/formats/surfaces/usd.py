@@ -74,7 +74,7 @@ def _stage(base: BaseMesh, unlit: bool, pictures: list[str], collision: str | No
         uv[..., 1] = 1 - uv[..., 1]  # USD's v is up
         st = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", types.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
         st.Set(Vt.Vec2fArray.FromNumpy(uv.reshape(-1, 2)))
-        texture = texture_reader(stage, at, f"./{pictures[0]}", ("clamp", "clamp"))
+        texture = texture_reader(stage, at, f"./{pictures[0]}", base.textures[0].wrap)
         color: Any = texture.CreateOutput("rgb", types.Float3)
     elif base.colors is not None:
         linear = np.ascontiguousarray(srgb_to_linear(base.colors[:, :3]), np.float32)
