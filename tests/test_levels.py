@@ -416,6 +416,13 @@ def test_wrong_options(splats, tmp_path, capsys, options, message):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply"]
 
 
+def test_only_known_endings_are_no_folders(splats, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "chain.glb", *QUICK) == 2
+    assert "-o must name a folder, got 'chain.glb'" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "chain_1.1", *QUICK, "--max-splats", 200) == 0
+    assert (tmp_path / "chain_1.1" / "levels.json").is_file()
+
+
 def test_folders_that_are_in_the_way(splats, tmp_path, capsys):
     out = tmp_path / "mine"
     out.mkdir()

@@ -169,6 +169,16 @@ def test_usd_names_the_texture(tmp_path, suffix):
     assert not UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(tmp_path / f"a{suffix}")))[2]
     names = {p.name for p in tmp_path.iterdir()}
     assert names == ({f"a{suffix}"} if suffix == ".usdz" else {f"a{suffix}", "a.png"})
+    if suffix == ".usdz":
+        with zipfile.ZipFile(tmp_path / "a.usdz") as package:
+            assert package.testzip() is None
+            assert {entry.date_time for entry in package.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_a_usdz_holds_no_webp(tmp_path):
+    with pytest.raises(ValueError, match=r"holds no WebP: leave out image"):
+        save_base(tetrahedron(), tmp_path / "a.usdz", image="webp")
+    assert not list(tmp_path.iterdir())
 
 
 def test_prints_are_solids_in_millimetres_with_z_up(tmp_path):
@@ -181,6 +191,7 @@ def test_prints_are_solids_in_millimetres_with_z_up(tmp_path):
     rows = np.frombuffer(data, kind, offset=84)
     with zipfile.ZipFile(tmp_path / "a.3mf") as package:
         model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+        assert {entry.date_time for entry in package.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     space = {"m": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"}
     assert model.get("unit") == "millimeter"
     points = np.array([[float(v.get(k)) for k in "xyz"] for v in model.iterfind(".//m:vertex", space)])

@@ -21,7 +21,7 @@ from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, write_configuration
 from meshsplats.errors import FileFormatError
 from meshsplats.file_options import ChainOptions, LevelTuning
-from meshsplats.formats.outputs import CONFIGURATION, placed
+from meshsplats.formats.outputs import CONFIGURATION, check_folder_name, placed
 from meshsplats.order import Order
 
 if TYPE_CHECKING:
@@ -121,8 +121,7 @@ class Levels(Command):
         option.check_resumption(self.resume, self.force)
         optional_up(self.up)
         self.tuning.config()
-        if self.output.suffix:
-            raise UsageError(f"-o must name a folder, got {self.output.name!r}")
+        check_folder_name(self.output)
         check_folder(self.output, resume=self.resume, replace_old=self.force)
 
     def _begin(self) -> None:

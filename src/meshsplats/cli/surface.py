@@ -79,8 +79,9 @@ class Surface(Command):
             for path, base in made
         ]
         for path, base in made:
-            look = f"{len(base.textures[0].pixels)} texels" if base.textures else "colours of vertices"
-            lines.append(f"{path} ({len(base.faces):,} triangles, {look}, {size_of(path)})")
+            look = f"{len(base.textures[0].pixels)} texels, " if base.textures else "colours of vertices, "
+            look = "" if path.suffix.lower() in PRINTED else look
+            lines.append(f"{path} ({len(base.faces):,} triangles, {look}{size_of(path)})")
         lines.append(f"in {seconds:.1f} s")
         lines += [] if self.files.no_preview else [f"preview: {run.preview}"]
         if self.output.suffix.lower() not in (*PRINTED, ".usdz"):

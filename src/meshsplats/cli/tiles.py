@@ -14,7 +14,7 @@ from meshsplats.cli.common import ClusterOptions, SplatOptions, resumable, say_o
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.progress import terminal_bar
 from meshsplats.cli.records import write_configuration
-from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
+from meshsplats.formats.outputs import CONFIGURATION, beside, check_folder_name, check_outputs
 from meshsplats.tiles.options import TileOptions, TilingOptions
 
 
@@ -89,7 +89,6 @@ class Tiles(Command):
         """The options of the library; UsageError or ValueError where they are wrong."""
         if not self.input:
             raise UsageError("give a splat file or a folder of them")
-        if self.output.suffix:
-            raise UsageError(f"-o must name a folder, got {self.output.name!r}")
+        check_folder_name(self.output)
         option.check_resumption(self.resume, self.force)
         return self.tiles.tile_options("world" if self.origin == "keep" else "local")

@@ -215,6 +215,8 @@ def check_writing(
     if unlit and suffix not in SHADED:
         raise ValueError(f"unlit applies to {', '.join(SHADED)} only, not to {suffix}")
     need_choice(TextureImage, optional=True, image=image)
+    if image == "webp" and suffix == ".usdz":
+        raise ValueError("a .usdz holds no WebP: leave out image, which makes it png, or save as .usdc")
     need_choice(Collision, optional=True, collision=collision)
     if collision is not None and suffix not in SHADED:
         raise ValueError(f"collision applies to {', '.join(SHADED)} only, not to {suffix}")

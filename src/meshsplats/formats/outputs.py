@@ -159,6 +159,12 @@ def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | No
         return None
 
 
+def check_folder_name(path: Path) -> None:
+    """OptionsError if ``path``, which is to be a folder, is named as a file of splats or of a mesh."""
+    if path.suffix.lower() in (*written_mesh_suffixes(), *written_suffixes(), ".json"):
+        raise OptionsError(f"``output`` must name a folder, got {path.name!r}")
+
+
 def check_outputs(
     paths: Sequence[Path], force: bool, folder: Path | None = None, *, inputs: Sequence[Path] = ()
 ) -> None:

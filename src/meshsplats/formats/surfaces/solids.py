@@ -51,13 +51,20 @@ def write_stl(base: BaseMesh, path: Path) -> None:
         file.write(rows.tobytes())
 
 
+def _entry(name: str) -> zipfile.ZipInfo:
+    """A file of a package, without a date: the same surface makes the same bytes."""
+    entry = zipfile.ZipInfo(name)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    return entry
+
+
 def write_3mf(base: BaseMesh, path: Path) -> None:
     """Writes the triangles of ``base`` as a 3D Manufacturing Format package (core specification 1.3)."""
     vertices = upright(base)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as package:
-        package.writestr("[Content_Types].xml", _TYPES)
-        package.writestr("_rels/.rels", _RELATIONS)
-        with package.open("3D/3dmodel.model", "w", force_zip64=True) as file:
+        package.writestr(_entry("[Content_Types].xml"), _TYPES)
+        package.writestr(_entry("_rels/.rels"), _RELATIONS)
+        with package.open(_entry("3D/3dmodel.model"), "w", force_zip64=True) as file:
             file.write(_MODEL.encode())
             line = '<vertex x="%.9g" y="%.9g" z="%.9g"/>'
             file.write((line * len(vertices) % tuple(vertices.ravel().tolist())).encode())

@@ -12,7 +12,9 @@ with the mark of ColorSpaceAPI that says so; or, as ``linear``, converted for re
 
 from __future__ import annotations
 
+import struct
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,8 @@ from meshsplats.gaussians import GaussianCloud
 PRIM = "ParticleField3DGaussianSplat"
 DISPLAY, LINEAR = "srgb_rec709_scene", "lin_rec709_scene"
 """Names of colour spaces."""
+_NO_DATE = struct.pack("<2H", 0, 1 << 5 | 1)
+"""Time and date of 1980-01-01 in a zip archive."""
 _SH = "radiance:sphericalHarmonics"
 _EXTENT = 3.0
 """Standard deviations that a splat is taken to reach."""
@@ -53,11 +57,22 @@ def write_usd_splats(cloud: GaussianCloud, path: Path, writing: Writing) -> None
 
 
 def packed(layer: Path, path: Path) -> None:
-    """Writes a .usdz package of a ``layer`` and what it refers to."""
+    """Writes a .usdz package of a ``layer`` and what it refers to, without dates: the same scene makes the
+    same bytes."""
     from pxr import UsdUtils
 
     if not UsdUtils.CreateNewUsdzPackage(str(layer), str(path)):
         raise OSError(f"usd-core could not write {path}")
+    with open(path, "r+b") as file:
+        with zipfile.ZipFile(file) as package:
+            entries, central = package.infolist(), package.start_dir
+        for entry in entries:
+            file.seek(central + 28)
+            lengths = struct.unpack("<3H", file.read(6))  # of the name, of more fields, and of a comment
+            for at in (entry.header_offset + 10, central + 12):
+                file.seek(at)
+                file.write(_NO_DATE)
+            central += 46 + sum(lengths)
 
 
 def export(stage: Any, path: Path) -> None:
