@@ -79,7 +79,9 @@ def test_images_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, monk
 
     reads = []
     original = photographs.load_image
-    monkeypatch.setattr(photographs, "load_image", lambda path: reads.append(path.name) or original(path))
+    monkeypatch.setattr(
+        photographs, "load_image", lambda path, **_: reads.append(path.name) or original(path)
+    )
     folder = simple_colmap(tmp_path, 4)
     dataset = load_dataset(folder, test_every=0, cache_bytes=3 * 12 * 8 * 3)  # three of the four
     assert reads == []

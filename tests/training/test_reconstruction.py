@@ -401,7 +401,7 @@ def test_photographs_that_are_added_later_are_named_and_found_on_demand(scene):
         assert ensure_cameras(folder) is None
     assert len(colmap.calls) == asked
     colmap.lenses.clear()
-    with pytest.warns(DataWarning, match="2 of 6 photographs match no others"):
+    with pytest.warns(DataWarning, match="2 of 6 photographs found no place"):
         assert ensure_cameras(folder, replacing=True) is None
     assert colmap.names == [*(f"p{i}.png" for i in range(5)), "q.png"]
     assert ensure_cameras(folder) is None

@@ -200,7 +200,7 @@ class PhotoFile:
         return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
 
     def _read(self) -> ViewImage:
-        pixels = load_image(self.path)
+        pixels = load_image(self.path, to_srgb=True)
         color = pixels[..., :3]
         share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
         size = (self.lens.width, self.lens.height)

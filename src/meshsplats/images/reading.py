@@ -8,13 +8,14 @@ import re
 import struct
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from meshsplats.choices import MAX_SIDE
-from meshsplats.errors import FileFormatError, MissingDependencyError
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 
 MAX_PIXELS = 1 << 26
 """Images of more pixels than this (67 million) are refused: a small file can claim any size."""
@@ -23,6 +24,10 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 _ORIENTATION = 0x112
 _TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 """``Header.turn`` by EXIF's orientation; 0 for others."""
+MAX_PROFILE = 1 << 22
+"""Bytes of a colour profile; those of printers have up to three million."""
+ROUNDING = 3
+"""Levels of 255 by which a profile that is sRGB by another name differs from it, at most."""
 _HEIF = re.compile(rb"....ftyp(heic|heix|heim|heis|hevc|hevx|mif1|msf1)", re.DOTALL)
 """How HEIF files begin, as iPhones take photographs."""
 _MODEL, _EXIF_IFD, _FOCAL, _FOCAL_OF_FILM = 0x0110, 0x8769, 0x920A, 0xA405
@@ -61,12 +66,15 @@ def read_header(path: Path) -> Header:
         return Header(image.width, image.height, _has_alpha(image), _turn(image))
 
 
-def load_image(path: str | os.PathLike[str], data: bytes | None = None) -> np.ndarray:
+def load_image(
+    path: str | os.PathLike[str], data: bytes | None = None, *, to_srgb: bool = False
+) -> np.ndarray:
     """uint8 (h, w, 3) RGB, or (h, w, 4) straight RGBA if the image has alpha.
 
     Args:
         path: the image file.
         data: an image inside another file, which ``path`` then names in messages.
+        to_srgb: whether an embedded colour profile counts. One that is broken does not, with a DataWarning.
 
     Raises:
         FileFormatError: the image is broken, too large, or of no known format.
@@ -80,11 +88,56 @@ def load_image(path: str | os.PathLike[str], data: bytes | None = None) -> np.nd
                 return np.repeat(np.rint(grey / 257).astype(np.uint8)[..., None], 3, axis=2)
             if image.mode == "F":
                 raise FileFormatError(f"{path}: holds floating-point values; convert it to 8 bits")
-            return np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"))
+            plain = image.convert("RGBA" if _has_alpha(image) else "RGB")
+            return np.asarray(_in_srgb(image, plain, path) if to_srgb else plain)
         except FileFormatError:
             raise
         except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
             raise _broken(path, error) from None
+
+
+def _in_srgb(image: Any, plain: Any, path: str | os.PathLike[str]) -> Any:
+    """``plain``, which ``image`` is as RGB or RGBA, with the colours that the profile of ``image`` means."""
+    profile = image.info.get("icc_profile")
+    if not profile:
+        return plain
+    try:
+        mode, transform = _srgb_transform(profile)
+        if transform is None:
+            return plain
+        if (mode == "CMYK") != (image.mode == "CMYK") or (mode == "L" and image.mode not in ("L", "LA")):
+            raise ValueError(f"it is not one for {image.mode} images")
+        colors = transform.apply(image if image.mode == mode else plain.convert(mode))
+    except (OSError, ValueError, TypeError, ImportError, MemoryError) as error:
+        reason = str(error)[:120]
+        warnings.warn(f"{path}: its colour profile is ignored: {reason}", DataWarning, stacklevel=3)
+        return plain
+    if plain.mode == "RGBA":
+        colors.putalpha(plain.getchannel("A"))
+    return colors
+
+
+@lru_cache(maxsize=16)
+def _srgb_transform(profile: bytes) -> tuple[str, Any]:
+    """The mode of images that an ICC ``profile`` is for, and Pillow's transform of them to sRGB; None if it
+    changes nothing. ValueError if the profile is broken, or of no such images."""
+    from PIL import Image, ImageCms
+
+    if len(profile) > MAX_PROFILE:
+        raise ValueError(f"{len(profile):,} bytes are too many")
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[source.profile.xcolor_space.strip()]
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, "RGB")
+    except (ImageCms.PyCMSError, KeyError) as error:
+        raise ValueError(f"not a profile of colours: {error}") from None
+    if mode == "RGB":
+        steps = np.arange(0, 256, 51, dtype=np.uint8)
+        colors = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3)
+        changed = np.asarray(transform.apply(Image.fromarray(colors)))
+        if np.abs(changed.astype(int) - colors).max() <= ROUNDING:
+            return mode, None
+    return mode, transform
 
 
 def read_shot(path: Path) -> Shot:
