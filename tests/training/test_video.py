@@ -245,11 +245,26 @@ def test_the_frames_of_a_video_are_made_once(tmp_path):
     assert not is_video(folder)
 
 
+def test_frames_of_another_video_of_that_name_are_refused(tmp_path):
+    clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(20)]))
+    other = write_video(tmp_path / "walk.mov", passing([3 * i for i in range(20)]))
+    folder = photographs_of(clip, 5)
+    with pytest.raises(
+        ValueError, match=r"the frames of another video \(walk\.mp4\): give walk\.mov another"
+    ):
+        photographs_of(other)
+    assert photographs_of(clip) == folder
+    clip.replace(other)  # the same video
+    assert photographs_of(other) == folder
+    (folder / "video.json").unlink()  # made by an earlier version
+    assert photographs_of(other) == folder
+
+
 def test_train_takes_a_video(tmp_path, monkeypatch, capsys):
     clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(20)]))
     asked = []
 
-    def no_cameras(folder, say):
+    def no_cameras(folder, say, threads):
         asked.append(folder)
         raise ValueError("none found")
 

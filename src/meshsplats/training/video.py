@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import tempfile
 import time
 import warnings
@@ -11,7 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._files.atomic import write_text
 from meshsplats._foreign import VIDEO_SUFFIXES
+from meshsplats._json import read_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image
@@ -22,6 +26,10 @@ FEWEST_FRAMES, MOST_FRAMES = 40, 120
 faster than their number."""
 IMAGES = "images"
 """Folder of the frames in that of a video."""
+RECORD = "video.json"
+"""File beside it: the name of the video, and what tells it from others."""
+RECORD_BYTES = 1 << 16
+END_BYTES = 1 << 20
 LOOK_SIDE, MOTION_SIDE = 480, 64
 """Longest side of a frame as it is searched for edges, and sides of the picture that motion is told by."""
 STILL = 0.05
@@ -58,8 +66,8 @@ def photographs_of(
     """The folder of photographs at ``path``: of a video, one beside it, NAME-frames, which is made by
     ``save_frames`` with so many ``frames`` unless it is there; else ``path`` itself.
 
-    Raises ValueError for ``frames`` without a video, and for another number of them than are there; otherwise
-    errors are those of ``save_frames``.
+    Raises ValueError for ``frames`` without a video, and for another number of them than are there, or those
+    of another video; otherwise errors are those of ``save_frames``.
     """
     if not is_video(path):
         if frames is not None:
@@ -69,6 +77,15 @@ def photographs_of(
     if not (folder / IMAGES).is_dir():
         save_frames(path, folder, frames, say)
         return folder
+    record = folder / RECORD
+    if record.is_file():
+        made_of = read_json(record, RECORD_BYTES)
+        if not isinstance(made_of, dict) or made_of.get("sha256") != _digest(path):
+            name = made_of.get("name") if isinstance(made_of, dict) else None
+            raise OptionValueError(
+                f"{folder} has the frames of another video ({name}): give {path.name} another name, or remove"
+                " the folder"
+            )
     there = len(list((folder / IMAGES).glob("*.jpg")))
     if frames not in (None, there):
         raise OptionValueError(
@@ -110,6 +127,7 @@ def save_frames(
     chosen = choose_frames(frames, count or usual_count(frames.seconds))
     say(f"{len(chosen)} of {len(frames.sharpness):,} frames: {folder / IMAGES}")
     wanted = {int(frame): place for place, frame in enumerate(chosen)}
+    record = {"name": video.name, "sha256": _digest(video)}
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as beside:
         made = Path(beside) / folder.name
         (made / IMAGES).mkdir(parents=True)
@@ -119,8 +137,20 @@ def save_frames(
                 save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", turned / np.float32(255))
             if index == chosen[-1]:
                 break
+        write_text(made / RECORD, json.dumps(record) + "\n")
         made.rename(folder)
     return len(chosen)
+
+
+def _digest(video: Path) -> str:
+    """SHA-256 of the size and of the ends of a file: videos are too large to be read whole for this."""
+    size = video.stat().st_size
+    found = hashlib.sha256(str(size).encode())
+    with open(video, "rb") as file:
+        found.update(file.read(END_BYTES))
+        file.seek(max(size - END_BYTES, 0))
+        found.update(file.read(END_BYTES))
+    return found.hexdigest()
 
 
 def usual_count(seconds: float) -> int:
