@@ -114,3 +114,9 @@ def test_quaternions_are_not_normalised_but_checked():
     assert GaussianCloud(quaternions=unit, **cloud).quaternions is unit
     with pytest.raises(ValueError, match="row 1 has length 2"):
         GaussianCloud(quaternions=unit * np.array([[1], [2], [1]]), **cloud)
+
+
+@pytest.mark.parametrize("length", [1e30, 1e-30])
+def test_an_up_direction_of_any_length_is_normalised(length):
+    mesh = SplatMesh(np.eye(3), [[0, 1, 2]], np.ones((3, 4)), up=(0, 0, length))
+    np.testing.assert_array_equal(mesh.up, [0, 0, 1])

@@ -126,7 +126,7 @@ def checkpoint(path: Path) -> str:
 
 def gsplat_export(path: Path) -> str:
     """The command that saves the splats of a checkpoint of gsplat's trainer as .ply."""
-    read = f"torch.load({path.name!r}, map_location='cpu', weights_only=True)['splats']"
+    read = f"torch.load({str(path)!r}, map_location='cpu', weights_only=True)['splats']"
     save = f"ms.save_gaussians(ms.gaussians_from_tensors({read}), {path.stem + '.ply'!r})"
     return f'python -c "import torch, meshsplats as ms; {save}"'
 

@@ -368,6 +368,14 @@ def test_gltf_textures_of_unknown_kinds_are_told(tmp_path):
 # ---- Others
 
 
+def test_normal_maps_hold_bytes():
+    given = {"vertices": np.eye(3), "faces": [[0, 1, 2]], "uv": np.zeros((1, 3, 2)), "face_texture": [-1]}
+    with pytest.raises(ValueError, match="normal_map must fit uint8, got values from 300 to 300"):
+        BaseMesh(**given, normal_map=np.full((2, 2, 3), 300))
+    with pytest.raises(TypeError, match="normal_map must hold integers, got dtype float64"):
+        BaseMesh(**given, normal_map=np.full((2, 2, 3), 0.5))
+
+
 def test_other_formats(tmp_path):
     mesh = load_mesh_quietly(gltf(tmp_path))
     save_mesh(mesh, tmp_path / "m.ply")

@@ -213,7 +213,7 @@ def checkpoint(path: Path, content: object) -> Path:
         (
             "ckpt_29999_rank0.pt",
             {"step": 1, "splats": {"means": 0, "sh0": 1}},
-            r"it is gsplat's.*torch\.load\('ckpt",
+            r"it is gsplat's.*torch\.load\('.+ckpt",
         ),
         ("ckpt.zip", {"step": 1, "splats": {"means": 0, "sh0": 1}}, "it is gsplat's"),
         (

@@ -447,6 +447,12 @@ def test_shells_of_a_mirrored_base_stay_on_their_side(lift):
     np.testing.assert_allclose(turned.vertices, prior.mesh.vertices * (-1, -1, 1), atol=1e-6)
 
 
+@pytest.mark.parametrize(("name", "value"), [("triangles", 2.5), ("layers", 1.5)])
+def test_numbers_of_triangles_and_layers_are_whole(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be a whole number, got {value}"):
+        bind(cube(), **{name: value})
+
+
 def test_another_topology_is_refused():
     prior = bind(cube())
     with pytest.raises(ValueError, match="the base has 8 vertices, got positions of 7"):

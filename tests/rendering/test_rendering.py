@@ -344,6 +344,11 @@ def test_background():
     )
 
 
+def test_an_attribute_without_columns_is_drawn_alone():
+    mesh = replace(soup(1), attributes={"none": np.zeros((60, 0))})
+    assert render(mesh, camera(), attributes=["none"]).attributes["none"].shape == (29, 37, 0)
+
+
 @pytest.mark.parametrize("samples", [1, 2])
 def test_attributes_are_blended_as_colours_are(samples):
     mesh = soup(4)

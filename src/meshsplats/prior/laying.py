@@ -8,7 +8,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._kinds import need, need_all, need_choice
+from meshsplats._kinds import as_whole, need, need_all, need_choice
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
@@ -88,12 +88,10 @@ def bind(
     """
     need(BaseMesh, base=base)
     need_all(View, views=views)
-    if not 1 <= layers <= MAX_LAYERS:
-        raise ValueError(f"layers must be a number from 1 to {MAX_LAYERS}, got {layers}")
+    layers = _whole("layers", layers, MAX_LAYERS)
     if spacing is not None and not np.isfinite(spacing):
         raise ValueError(f"spacing must be a finite length, got {spacing}")
-    if not 1 <= triangles <= MAX_PER_FACE:
-        raise ValueError(f"triangles must be a number from 1 to {MAX_PER_FACE}, got {triangles}")
+    triangles = _whole("triangles", triangles, MAX_PER_FACE)
     source = _color_source(base, colors, views)
     solid, areas = _faces_with_area(base)
     counts = counts_by_area(areas, triangles) if by_area else np.full(len(solid), triangles)
@@ -232,3 +230,10 @@ def _colors(
     if source == "views":
         rgba[:, :3] = colors_from_views(binding, views, threads=threads)
     return rgba
+
+
+def _whole(name: str, value: object, most: int) -> int:
+    number = as_whole(name, value)
+    if not 1 <= number <= most:
+        raise ValueError(f"{name} must be a number from 1 to {most}, got {number}")
+    return number

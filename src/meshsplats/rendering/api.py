@@ -151,14 +151,15 @@ def render(
         columns = {name: value if value.ndim == 2 else value[:, None] for name, value in chosen.items()}
         widths = {name: column.shape[1] for name, column in columns.items()}
         values = np.ascontiguousarray(np.concatenate(list(columns.values()), axis=1))
+        values = values if values.shape[1] else None
 
     def named(sums: np.ndarray | None) -> dict[str, np.ndarray]:
         """The attributes by name, of (h, w, c) ``sums`` over all of them."""
         parts = {}
+        none = np.zeros((camera.height, camera.width, 0), np.float32)  # attributes without columns alone
         start = 0
         for name, width in widths.items():
-            assert sums is not None
-            part = sums[:, :, start : start + width]
+            part = none if sums is None else sums[:, :, start : start + width]
             parts[name] = part[:, :, 0] if mesh.attributes[name].ndim == 1 else part
             start += width
         return parts
