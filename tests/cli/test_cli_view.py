@@ -6,6 +6,7 @@ import base64
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -60,6 +61,15 @@ def test_splats_become_a_page_with_both(folder, tmp_path, capsys):
     assert settings(page)["title"] == "scene"
     assert has_splats(page)
     assert toml.load(tmp_path / "page.html.config.toml")["command"] == "view"
+
+
+def test_a_file_of_a_common_name_has_the_name_of_its_folder(folder, tmp_path):
+    model = tmp_path / "vase" / "point_cloud" / "iteration_7"
+    model.mkdir(parents=True)
+    shutil.copy(folder / "scene.ply", model / "point_cloud.ply")
+    page = tmp_path / "page.html"
+    assert main(["view", str(model / "point_cloud.ply"), "-o", str(page), "--without-splats"]) == 0
+    assert settings(page)["title"] == "vase"
 
 
 def test_options_reach_the_page(folder, tmp_path):

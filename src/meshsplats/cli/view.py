@@ -15,6 +15,7 @@ from meshsplats.cli.common import PartOptions, SplatOptions, named
 from meshsplats.cli.messages import UsageError, say, shown_path
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
+from meshsplats.formats.splat_paths import subject_name
 from meshsplats.viewer import content
 from meshsplats.viewer.content import Content
 from meshsplats.viewer.files import EXCLUSIVE, ViewingOptions, shown_file
@@ -59,13 +60,12 @@ class View(Command):
         viewing = self.viewing
         viewing.check()
         if self.output is not None:
-            inputs = [self.input, viewing.splats, viewing.surface, viewing.cameras]
-            outputs = [self.output, beside(self.output, CONFIGURATION)]
-            check_outputs(outputs, self.force, inputs=[path for path in inputs if path is not None])
+            inputs = filter(None, [self.input, viewing.splats, viewing.surface, viewing.cameras])
+            check_outputs([self.output, beside(self.output, CONFIGURATION)], self.force, inputs=[*inputs])
         shown = shown_file(self.input, viewing, say=say, threads=self.threads)
         self._announce(shown.content)
         name = shown_path(self.input)
-        page, result = shown.page("scene" if name == "-" else Path(name).resolve().stem)
+        page, result = shown.page("scene" if name == "-" else subject_name(Path(name).resolve()))
         if self.output is not None:
             self._write(self.output, page, result)
         else:
