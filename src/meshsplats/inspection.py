@@ -19,8 +19,8 @@ from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds, warn_of_strays_in, warn_of_unseen
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.datasets.layouts import Layout, find_layout
+from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.level_tables import find_table, load_table, table_in_words
 from meshsplats.formats.gaussians import format_of, load_gaussians, moving_splats

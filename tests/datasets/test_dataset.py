@@ -75,7 +75,7 @@ def test_a_view_checks_that_its_image_has_the_cameras_size():
 
 
 def test_images_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, monkeypatch):
-    from meshsplats.datasets import image_files as photographs
+    from meshsplats.datasets import photo_file as photographs
 
     reads = []
     original = photographs.load_image

@@ -314,10 +314,22 @@ def test_no_images_at_all_says_where_they_were_expected(tmp_path):
     assert len(load_dataset(folder, downscale=2).views) == 2
 
 
-def test_an_incomplete_smaller_folder_is_refused(tmp_path):
+def test_images_that_a_smaller_folder_lacks_are_made_smaller(tmp_path):
     folder = simple_colmap(tmp_path, 2)
-    save(folder / "images_2/p00.png", np.zeros((4, 6, 3), np.uint8))
-    refused(folder, "'images_2' has no such image", downscale=2)
+    save(folder / "images_2/p00.png", np.full((4, 6, 3), 255, np.uint8))
+    views = load_dataset(folder, downscale=2, test_every=0).train
+    assert [view.load().color.shape for view in views] == [(4, 6, 3)] * 2
+    assert [bool((view.load().color == 255).all()) for view in views] == [True, False]
+
+
+def test_images_that_were_thrown_away_do_not_come_back_from_a_smaller_folder(tmp_path):
+    folder = simple_colmap(tmp_path, 5)
+    for i in range(5):
+        save(folder / f"images_2/p{i:02d}.png", np.zeros((4, 6, 3), np.uint8))
+    (folder / "images/p01.png").unlink()
+    for downscale in (1, 2):
+        with pytest.warns(DataWarning, match=r"1 images are missing; their .*\(images/p01\.png\)"):
+            assert len(load_dataset(folder, downscale=downscale).views) == 4
 
 
 def test_images_of_another_shape_are_refused(tmp_path):

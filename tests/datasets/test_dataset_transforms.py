@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -206,6 +207,26 @@ def test_smaller_copies_of_nested_folders(tmp_path):
     view = load_dataset(tmp_path, downscale=2, test_every=0).train[0]
     assert view.image.min() == 1
     assert view.camera.fx == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "read"),
+    [
+        ("Masks", "f1.png", True),
+        ("mask", "f1.png", False),
+        ("images_masks", "f1.png.png", False),
+        ("mask", "other.png", None),
+    ],
+)
+def test_folders_that_look_like_masks_are_read_or_named(tmp_path, name, file, read):
+    folder = studio(tmp_path)
+    save(tmp_path / name / file, np.zeros((8, 12), np.uint8))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        views = load_dataset(folder, test_every=0).train
+    text = "".join(str(warning.message) for warning in caught)
+    assert [view.mask is not None for view in views] == [False, read is True, False]
+    assert (f"{name}/ looks like masks" in text) == (read is False)
 
 
 def test_masks_by_name_and_by_folder(tmp_path):

@@ -16,9 +16,10 @@ from meshsplats._kinds import need_path
 from meshsplats._origin import choose_origin
 from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.colmap import read_model
-from meshsplats.datasets.image_files import Album, Frame, PhotoFile, Taken, split
+from meshsplats.datasets.image_files import Album, Frame, Taken, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
 from meshsplats.datasets.llff import read_poses_bounds
+from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.transforms import read_transforms
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View
 from meshsplats.errors import DataWarning, FileFormatError

@@ -1,9 +1,9 @@
-"""Photographs in a data set's folder: found without leaving it, measured by their headers, read when
-needed."""
+"""Photographs in a data set's folder: found without leaving it, and measured by their headers."""
 
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 import warnings
 from collections import Counter
@@ -15,10 +15,11 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.choices import Masks, Missing
-from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, pinholes, undistort
-from meshsplats.datasets.views import ImageCache, ViewImage
+from meshsplats.datasets.lens import Lens, Pinhole, pinholes
+from meshsplats.datasets.photo_file import PhotoFile
+from meshsplats.datasets.views import ImageCache
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.images.reading import Header, load_image, read_header
+from meshsplats.images.reading import Header, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
@@ -169,81 +170,6 @@ def _stem_of(name: str) -> str:
     return _fold(name[: len(name) - len(suffix)] if suffix.lower() in (*READABLE, *UNREADABLE) else name)
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoFile:
-    """A photograph, read, brought to size and undistorted when it is asked for."""
-
-    name: str
-    """As the data set has it."""
-    path: Path
-    lens: Lens
-    """The lens before the image at the size it is used in."""
-    pinhole: Pinhole
-    mask: Path | None
-    has_alpha: bool
-    store: ImageCache = field(repr=False)
-    cut_out: bool = False
-    """Whether the mask is the subject's outline: what is outside is clear."""
-    turn: int = 0
-    """``Header.turn`` of the photograph."""
-
-    def load(self) -> ViewImage:
-        image = self.store.find(self)
-        if image is None:
-            image = self._read()
-            self.store.keep(self, image)
-        return image
-
-    @property
-    def nbytes(self) -> int:
-        masked = (self.mask is not None and not self.cut_out) or not self.lens.is_pinhole
-        return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
-
-    def _read(self) -> ViewImage:
-        pixels = load_image(self.path, to_srgb=True)
-        color = pixels[..., :3]
-        share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
-        size = (self.lens.width, self.lens.height)
-        if self.cut_out:
-            inside = _resized(self._light(), (color.shape[1], color.shape[0]))
-            share = inside if share is None else share * inside
-        if share is None:
-            color = _resized(color, size)
-        else:
-            # Colours of clear pixels mean nothing: mixing must see each as much as it is opaque.
-            layers = [*(color[..., i].astype(np.float32) / 255 * share for i in range(3)), share]
-            color = np.stack([_resized(layer, size) for layer in layers], axis=-1).astype(np.float16)
-        mask = None if self.mask is None or self.cut_out else _resized(self._light(), size) >= WHOLE
-        if not self.lens.is_pinhole:
-            color, seen = undistort(color, self.lens, self.pinhole)
-            if mask is not None:
-                counts = undistort(mask.astype(np.float32)[..., None], self.lens, self.pinhole)[0]
-                seen = counts[..., 0] >= WHOLE  # 0 where nothing was seen
-            mask = seen
-        if share is None:
-            return ViewImage(color, None, mask)
-        return ViewImage(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
-
-    def _light(self) -> np.ndarray:
-        """(h, w) float32: 1 where the mask is light (128 of 255 or more) and, with alpha, opaque; else 0."""
-        assert self.mask is not None
-        pixels = load_image(self.mask)
-        light = pixels[..., :3].max(axis=2)
-        if pixels.shape[2] == 4:
-            light = np.minimum(light, pixels[..., 3])
-        return (light >= 128).astype(np.float32)
-
-
-def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """``pixels`` (h, w) float32 or (h, w, 3) uint8 at ``size`` (width, height): each new pixel is the mean of
-    those it covers."""
-    from PIL import Image
-
-    if (pixels.shape[1], pixels.shape[0]) == size:
-        return pixels
-    return np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
-
-
 Taken = list[tuple[Camera, PhotoFile]]
 """The views made from one photograph: one, or the six of a panorama."""
 
@@ -272,8 +198,8 @@ class Album:
         """Cameras and photographs of each frame whose image is there, in order."""
         self.missing, self.no_mask, self.renamed = [], [], []
         result: list[Taken] = []
-        masks = (self.folder / "masks").is_dir()
         frames = list(frames)
+        masks = self._mask_folder(frames, where)
         labels = [f"{where}: image {frame.name[:60]!r}" for frame in frames]
         for frame, label, (full, small) in zip(frames, labels, self._files(frames, labels), strict=True):
             if frame.lens is None or (full is None and small is None):
@@ -308,6 +234,9 @@ class Album:
             (find(self.folder, frame.file, label), self._smaller(frame.file, label))
             for frame, label in zip(frames, labels, strict=True)
         ]
+        if any(full is not None for full, _ in found):
+            # What was thrown away there does not come back from the smaller copies.
+            found = [(full, small if full is not None else None) for full, small in found]
         lacking = [i for i, paths in enumerate(found) if paths == (None, None)]
         if not lacking:
             return found
@@ -326,23 +255,34 @@ class Album:
         return self._shelf.by_last_parts(name, self.images)
 
     def _smaller(self, name: str, where: str) -> Path | None:
-        """The copy in ``images_<downscale>/``, if there is such a folder."""
+        """The copy in ``images_<downscale>/``, if there is one."""
         parts = PurePosixPath(name.replace("\\", "/")).parts
         if self.downscale == 1 or len(parts) < 2:
             return None
         for i in reversed(range(len(parts) - 1)):
             beside = PurePosixPath(*parts[:i], f"{parts[i]}_{self.downscale}")
             if (self.folder / beside).is_dir():
-                found = find(self.folder, str(beside.joinpath(*parts[i + 1 :])), where, other_suffix=True)
-                if found is None:
-                    raise FileFormatError(
-                        f"{where}: {str(beside)!r} has no such image; complete that folder, or remove it:"
-                        f" images are then made smaller here"
-                    )
-                return found
+                name = str(beside.joinpath(*parts[i + 1 :]))
+                return find(self.folder, name, where, other_suffix=True)
         return None
 
-    def _mask(self, frame: Frame, image: Path | None, where: str, folder: bool) -> Path | None:
+    def _mask_folder(self, frames: Sequence[Frame], where: str) -> str:
+        """The folder of the masks, empty if there is none. Warns of one that has another name."""
+        folders = _folders(self.folder)
+        if found := sorted((name for name in folders if name.casefold() == "masks"), reverse=True):
+            return found[0]  # in small letters, if it is there twice
+        paths = [PurePosixPath(frame.file.replace("\\", "/")) for frame in frames if not frame.mask]
+        places, files = {path.parts[0] for path in paths if path.parts}, [path.name for path in paths]
+        for name in folders:
+            if "mask" not in name.casefold() or name in places:
+                continue
+            shelf = Shelf(self.folder / name)
+            if any(shelf.alike(file) or shelf.alike(f"{file}.png") for file in files):
+                text = "looks like masks of the photographs, which are read from masks/: rename it"
+                warnings.warn(f"{where}: {name}/ {text}", DataWarning, stacklevel=4)
+        return ""
+
+    def _mask(self, frame: Frame, image: Path | None, where: str, folder: str) -> Path | None:
         if frame.mask is not None:
             found = find(self.folder, frame.mask, where)
             if found is None:
@@ -356,7 +296,7 @@ class Album:
         for name in dict.fromkeys(names):  # as the file has it, and as it is
             parts = PurePosixPath(name).parts
             below = len(parts) > 1 and parts[0].casefold().startswith(("images", "input"))
-            inner = PurePosixPath("masks", *(parts[1:] if below else parts))
+            inner = PurePosixPath(folder, *(parts[1:] if below else parts))
             for candidate in (f"{inner}.png", str(inner.with_suffix(".png")), str(inner)):
                 found = find(self.folder, candidate, where)
                 if found is not None:
@@ -405,12 +345,18 @@ class Album:
             return f"; {near[0]} is there, which another image of the file may mean, too: rename it"
         if near:
             return f"; {' and '.join(near[:3])} may both be meant: keep one of them"
-        with os.scandir(self.folder) as entries:
-            folders = sorted(e.name for e in entries if e.is_dir() and not is_hidden(e.name))
+        small = re.compile(r".*_[0-9]+")  # smaller copies, of what was thrown away, perhaps
+        folders = [folder for folder in _folders(self.folder) if not small.fullmatch(folder)]
         elsewhere = [folder for folder in folders if Shelf(self.folder / folder).alike(name)]
         if elsewhere:
             return f"; {elsewhere[0]}/ has an image of that name: name that folder 'images'"
         return ""
+
+
+def _folders(folder: Path) -> list[str]:
+    """Names of the folders in ``folder`` that are not hidden, sorted."""
+    with os.scandir(folder) as entries:
+        return sorted(entry.name for entry in entries if entry.is_dir() and not is_hidden(entry.name))
 
 
 def _first(names: Sequence[str]) -> str:

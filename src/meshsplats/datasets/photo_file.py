@@ -1,0 +1,87 @@
+"""A photograph of a data set, which is read when it is needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, undistort
+from meshsplats.datasets.views import ImageCache, ViewImage
+from meshsplats.images.reading import load_image
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoFile:
+    """A photograph, read, brought to size and undistorted when it is asked for."""
+
+    name: str
+    """As the data set has it."""
+    path: Path
+    lens: Lens
+    """The lens before the image at the size it is used in."""
+    pinhole: Pinhole
+    mask: Path | None
+    has_alpha: bool
+    store: ImageCache = field(repr=False)
+    cut_out: bool = False
+    """Whether the mask is the subject's outline: what is outside is clear."""
+    turn: int = 0
+    """``Header.turn`` of the photograph."""
+
+    def load(self) -> ViewImage:
+        image = self.store.find(self)
+        if image is None:
+            image = self._read()
+            self.store.keep(self, image)
+        return image
+
+    @property
+    def nbytes(self) -> int:
+        masked = (self.mask is not None and not self.cut_out) or not self.lens.is_pinhole
+        return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
+
+    def _read(self) -> ViewImage:
+        pixels = load_image(self.path, to_srgb=True)
+        color = pixels[..., :3]
+        share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
+        size = (self.lens.width, self.lens.height)
+        if self.cut_out:
+            inside = _resized(self._light(), (color.shape[1], color.shape[0]))
+            share = inside if share is None else share * inside
+        if share is None:
+            color = _resized(color, size)
+        else:
+            # Colours of clear pixels mean nothing: mixing must see each as much as it is opaque.
+            layers = [*(color[..., i].astype(np.float32) / 255 * share for i in range(3)), share]
+            color = np.stack([_resized(layer, size) for layer in layers], axis=-1).astype(np.float16)
+        mask = None if self.mask is None or self.cut_out else _resized(self._light(), size) >= WHOLE
+        if not self.lens.is_pinhole:
+            color, seen = undistort(color, self.lens, self.pinhole)
+            if mask is not None:
+                counts = undistort(mask.astype(np.float32)[..., None], self.lens, self.pinhole)[0]
+                seen = counts[..., 0] >= WHOLE  # 0 where nothing was seen
+            mask = seen
+        if share is None:
+            return ViewImage(color, None, mask)
+        return ViewImage(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
+
+    def _light(self) -> np.ndarray:
+        """(h, w) float32: 1 where the mask is light (128 of 255 or more) and, with alpha, opaque; else 0."""
+        assert self.mask is not None
+        pixels = load_image(self.mask)
+        light = pixels[..., :3].max(axis=2)
+        if pixels.shape[2] == 4:
+            light = np.minimum(light, pixels[..., 3])
+        return (light >= 128).astype(np.float32)
+
+
+def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """``pixels`` (h, w) float32 or (h, w, 3) uint8 at ``size`` (width, height): each new pixel is the mean of
+    those it covers."""
+    from PIL import Image
+
+    if (pixels.shape[1], pixels.shape[0]) == size:
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
