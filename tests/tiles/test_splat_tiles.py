@@ -254,3 +254,45 @@ def test_the_validator_of_khronos_finds_nothing_but_the_names_of_the_extension(t
     assert [m for m in messages if m["code"] not in known] == []
     unused = [m["pointer"] for m in messages if m["code"] == "UNUSED_OBJECT"]
     assert unused in ([], ["/bufferViews/0"])
+
+
+@pytest.mark.parametrize("as_splats", [True, False])
+def test_tiles_of_a_globe_are_at_their_place_on_it(tmp_path, as_splats):
+    """Splats of Munich, in the axes of the globe, as the first tileset says and the second one, too."""
+    longitude, latitude = np.radians([11.5, 48.2])
+    up = np.array(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    )
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0])
+    place = np.stack([east, np.cross(up, east), up], axis=1)
+    radius = 6378137.0 / np.sqrt(1 - 0.00669437999 * np.sin(latitude) ** 2)
+    ecef = radius * up * [1, 1, 1 - 0.00669437999]
+    local = replace(splats(60), up=np.array([0.0, 0, 1]), origin=np.zeros(3))
+    ms.save_gaussians(local, tmp_path / "a.ply")
+    build_tiles(ms.stream_gaussians(tmp_path / "a.ply"), tmp_path / "first", replace(OPTIONS, up=(0, 0, 1)))
+    table = tmp_path / "first" / "tileset.json"
+    document = json.loads(table.read_text())
+    del document["extras"]  # of another program
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([place, ecef])
+    document["root"]["transform"] = matrix.T.ravel().tolist()
+    table.write_text(json.dumps(document))
+
+    source = ms.stream_gaussians(table)
+    build_tiles(source, tmp_path / "second", TileOptions(max_triangles=400, as_splats=as_splats))
+    root = json.loads((tmp_path / "second" / "tileset.json").read_text())["root"]
+    found = np.array(root["transform"]).reshape(4, 4).T
+    center = found @ [*root["boundingVolume"]["box"][:3], 1]
+    middle = place @ ((local.means.min(axis=0) + local.means.max(axis=0)) / 2) + ecef
+    np.testing.assert_allclose(center[:3], middle, atol=0.5)
+    np.testing.assert_allclose(found[:3, 2], up, atol=1e-9)
+    if as_splats:
+        again, before = ms.load_gaussians(tmp_path / "second"), ms.load_gaussians(table)
+        rows = nearest(before, again)
+        assert len(set(rows)) == len(rows) == len(before)
+        offset = again.origin - before.origin
+        np.testing.assert_allclose(again.means + offset, before.means[rows], atol=0.01)
+        np.testing.assert_allclose(again.up, before.up, atol=1e-9)
+    else:
+        tileset = Tileset(tmp_path / "second")
+        np.testing.assert_allclose(tileset.origin, source.origin)

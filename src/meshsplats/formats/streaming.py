@@ -93,6 +93,12 @@ class SplatStream:
             with content.open() as file, closing(open_splats(content, kind, file, self._reading)) as splats:
                 yield splats, to_y_down(kind, self.axes, splats.to_y_down)
 
+    @property
+    def from_file_axes(self) -> np.ndarray:
+        """(3, 3) float64 from the axes of the (first) file to those of the blocks."""
+        with self._opened(self.paths[0]) as (_, turn):
+            return turn
+
     def _looked_at(self, path: Path, *, alone: bool) -> np.ndarray:
         """(3,) the origin of the file ``path`` by itself if it is ``alone``, else a sample (k, 3) of its
         positions in the world; with y down."""

@@ -43,7 +43,15 @@ from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, harmonics_degree, stored_survey
 from meshsplats.tiles.options import TileOptions
-from meshsplats.tiles.tileset import Node, Tileset, is_ours, is_tile_file, tile_path, write_tilesets
+from meshsplats.tiles.tileset import (
+    Node,
+    Tileset,
+    is_ours,
+    is_tile_file,
+    on_globe,
+    tile_path,
+    write_tilesets,
+)
 
 JOURNAL = Path("work", "journal.jsonl")
 """Inside the folder of an unfinished tileset."""
@@ -228,7 +236,8 @@ class _Build:
         splats = sum(node.splats for node in leaves)
         up = unit_up(self._options.up or DEFAULT_UP)
         of_splats = self._options.as_splats
-        write_tilesets(self._out, nodes, root, up, splats, self._origin, of_splats=of_splats)
+        axes = self._source.from_file_axes if on_globe(self._origin, up) else None
+        write_tilesets(self._out, nodes, root, up, splats, self._origin, axes, of_splats=of_splats)
         alpha = self._alpha(scene, nodes)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())

@@ -26,6 +26,7 @@ from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import tile_frame
 from meshsplats.formats.gltf.splat_tiles import CONTENT
+from meshsplats.formats.gltf.splat_tilesets import GLOBE, axes_of
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import NAME
@@ -84,6 +85,7 @@ def write_tilesets(
     up: np.ndarray,
     splats: int,
     origin: np.ndarray,
+    axes: np.ndarray | None = None,
     *,
     of_splats: bool = False,
 ) -> None:
@@ -91,13 +93,16 @@ def write_tilesets(
     tiles are no meshes.
 
     Tiles are relative to the point ``origin`` (3,) of the world, to which the transform of the root moves
-    them.
+    them, with z up; or on the globe to their place in its own axes, from which ``axes`` (3, 3) lead to the
+    world's.
     """
     note: dict[str, Any] = {"up": [float(x) for x in up], "splats": splats}
     if of_splats:
         note["contents"] = "splats"
     if origin.any():
         note["origin"] = origin.tolist()
+    if axes is not None:
+        note["axes"] = axes.tolist()
     files = [key for key in sorted(nodes) if key != root and _starts_file(key, nodes, root)]
     for key in [*files, root]:
         own = "" if key == root else _group(key)
@@ -112,16 +117,26 @@ def write_tilesets(
         if key == root:
             document["extras"] = {"meshsplats": note}
         if key == root and origin.any():
-            document["root"] |= {"transform": _transform(up, origin)}
+            document["root"] |= {"transform": _transform(up, origin, axes)}
         path = folder.joinpath(*_folders(own), NAME)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n")
 
 
-def _transform(up: np.ndarray, origin: np.ndarray) -> list[float]:
-    """The transform of the root, column by column: a translation to ``origin``."""
+def on_globe(origin: np.ndarray, up: np.ndarray) -> bool:
+    """Whether ``origin`` (3,) is a point on the ground of the Earth, in metres from its middle, where ``up``
+    (3,), a unit vector, points away from that. Of projected coordinates it does not."""
+    radius = float(np.linalg.norm(origin))
+    return GLOBE[0] < radius < GLOBE[1] and bool(origin @ up > 0.99 * radius)
+
+
+def _transform(up: np.ndarray, origin: np.ndarray, axes: np.ndarray | None) -> list[float]:
+    """The transform of the root, column by column: a translation to ``origin``, after a turn back from z up
+    where there are ``axes``, those of the globe."""
     matrix = np.eye(4)
     matrix[:3, 3] = tile_frame(up) @ origin
+    if axes is not None:
+        matrix[:3] = axes.T @ np.column_stack([tile_frame(up).T, origin])
     return [float(x) + 0.0 for x in matrix.T.ravel()]
 
 
@@ -253,6 +268,9 @@ class Tileset:
         """(3,) float64 point of the world that the tiles are relative to."""
         if "origin" in note:
             self.origin = _numbers(note["origin"], 3, "the origin", self.path)
+        self._axes: np.ndarray | None = None
+        if "axes" in note:
+            self._axes = axes_of(note["axes"], self.path)
         _error(document, self.path)
         self._to_world = tile_frame(self.up).T
         self._count = 0
@@ -294,7 +312,7 @@ class Tileset:
         entry = dict(_object(document, "root", self.path))
         if "transform" in entry or self.origin.any():
             found = _numbers(entry.pop("transform", None), 16, "the transform of the root", self.path)
-            wanted = np.array(_transform(self.up, self.origin))
+            wanted = np.array(_transform(self.up, self.origin, self._axes))
             if np.abs(found - wanted).max() > 1e-9 * max(1.0, float(np.abs(wanted).max())):
                 raise FileFormatError(
                     f"{self.path}: the transform of the root is not the one to the tileset's origin: another"

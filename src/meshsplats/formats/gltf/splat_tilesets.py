@@ -41,7 +41,7 @@ _PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
 _LOOKED_AT = 8
 """Tiles that tell whether a tileset is one of splats."""
 _LEGACY = {b"b3dm", b"i3dm", b"pnts", b"cmpt", b"subt"}
-_GLOBE, _FLATTENING = (6.3e6, 6.45e6), 1.0067394967  # metres; (a / b)^2 of WGS 84
+GLOBE, _FLATTENING = (6.3e6, 6.45e6), 1.0067394967  # metres from its middle; (a / b)^2 of WGS 84
 
 
 class _Tile(NamedTuple):
@@ -50,6 +50,17 @@ class _Tile(NamedTuple):
     path: Path
     matrix: np.ndarray
     """(4, 4) float64 from its frame to the tileset's."""
+
+
+def axes_of(value: object, path: Path) -> np.ndarray:
+    """(3, 3) float64 turn from the axes of a globe to those of the world, of the note of a tileset."""
+    try:
+        axes = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        axes = np.zeros(0)
+    if axes.shape != (3, 3) or not np.abs(axes @ axes.T - np.eye(3)).max() < 1e-6:
+        raise FileFormatError(f"{path}: the axes must be a rotation, 3 rows of 3 numbers")
+    return axes
 
 
 class _Tree:
@@ -65,20 +76,23 @@ class _Tree:
         note = extras.get("meshsplats") if isinstance(extras, dict) else None
         self.own_up: np.ndarray | None = None
         """(3,) float64 direction that points up in the world of a tileset of ``meshsplats tiles``."""
+        self.own_axes: np.ndarray | None = None
+        """(3, 3) float64 from its frame to that world."""
         self.of_meshes = note is not None
         if isinstance(note, dict) and note.get("contents") == "splats":
             self.of_meshes = False
             self.own_up = self._numbers(note.get("up"), 3, "the up direction", path)
             if not self.own_up.any():
                 raise FileFormatError(f"{path}: the up direction must not be 0")
+            self.own_axes = axes_of(note["axes"], path) if "axes" in note else tile_frame(self.own_up).T
 
     def tiles(self) -> list[_Tile]:
         return self._below(self.root, self._path, np.eye(4), "", 0)
 
     def up(self) -> np.ndarray:
         """(3,) float64: z, or away from the ground for a tileset of others on the globe."""
-        if self.own_up is not None:
-            return np.array([0.0, 0, 1])
+        if self.own_up is not None and self.own_axes is not None:
+            return np.asarray(self.own_axes.T @ (self.own_up / np.linalg.norm(self.own_up)))
         tile = self.root
         volume = self._object(tile, "boundingVolume", self._path)
         if isinstance(region := volume.get("region"), list):
@@ -90,7 +104,7 @@ class _Tree:
         name, length = ("sphere", 4) if "sphere" in volume else ("box", 12)
         center = self._numbers(volume.get(name), length, f"a {name}", self._path)[:3]
         place = (self._matrix(tile, self._path) @ [*center, 1])[:3]
-        if not _GLOBE[0] < np.linalg.norm(place) < _GLOBE[1]:
+        if not GLOBE[0] < np.linalg.norm(place) < GLOBE[1]:
             return np.array([0.0, 0, 1])
         normal: np.ndarray = place * [1, 1, _FLATTENING]
         return normal / np.linalg.norm(normal)
@@ -209,8 +223,8 @@ class SplatTileset(Splats):
             raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
         self._tiles = tree.tiles()
         self.up = tree.up()
-        if tree.own_up is not None:
-            self.to_y_down = tile_frame(tree.own_up).T
+        if tree.own_axes is not None:
+            self.to_y_down = tree.own_axes
 
     @cached_property
     def _sample(self) -> np.ndarray:
