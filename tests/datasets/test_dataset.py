@@ -23,7 +23,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.gaussians import GaussianCloud
 
 
@@ -155,6 +155,18 @@ def test_masks_of_a_subject_cut_it_out(tmp_path):
     np.testing.assert_allclose(half_cut.alpha, [[1, 1, 0.5, 0, 0, 0]] * 4)
     color = (inside[..., None] * opaque / 255).reshape(4, 2, 6, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(half_cut.load().over((0, 0, 0)), color, atol=1e-3)
+
+
+def test_held_out_views_in_which_nothing_counts_are_not_scored(tmp_path):
+    folder = simple_colmap(tmp_path, 9)
+    for i in range(9):
+        save(folder / f"masks/p{i:02d}.png", np.full((8, 12), 0 if i in (5, 8) else 255, np.uint8))
+    dataset = load_dataset(folder)
+    with pytest.warns(DataWarning, match=r"1 of 2 held-out photographs are not scored.*: p08\.png"):
+        left = dataset.scorable()
+    assert [view.name for view in left.test] == ["p00.png"]
+    assert left.train == dataset.train
+    assert left.scorable() is left
 
 
 def test_a_subject_needs_masks(tmp_path):

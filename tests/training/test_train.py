@@ -45,6 +45,7 @@ from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.previews import SIDE
 from meshsplats.training import growing, starting_fans, train, train_config
+from meshsplats.training import run as run_module
 from meshsplats.training.as_splats import HALVED, splats_of_fans
 from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growth import (
@@ -117,6 +118,27 @@ def same(a: SplatMesh, b: SplatMesh) -> bool:
         np.array_equal(getattr(a, n), getattr(b, n))
         for n in ("vertices", "faces", "colors", "face_splat", "harmonics", "plain_colors")
     )
+
+
+@pytest.fixture
+def halted(monkeypatch, start):
+    """A training ends with its look at the photographs, whose names the error has."""
+
+    class HaltedError(Exception):
+        pass
+
+    def look(views):
+        raise HaltedError(" ".join(view.name for view in views))
+
+    monkeypatch.setattr(run_module, "starting_fans", lambda *given: start)
+    monkeypatch.setattr(run_module, "find_suspects", look)
+    return HaltedError
+
+
+def test_held_out_photographs_are_looked_at_too(ball, halted):
+    with pytest.raises(halted) as found:
+        train(ball, steps=1)
+    assert str(found.value).split() == [view.name for view in ball.views]
 
 
 def blurred(layer: np.ndarray | None) -> np.ndarray | None:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats.datasets.image_files import PhotoFile
-from meshsplats.datasets.views import Dataset, View, ViewImage
+from meshsplats.datasets.photo_file import PhotoFile
+from meshsplats.datasets.views import SHOWN, Dataset, View, ViewImage
 from meshsplats.errors import DataWarning
 
 OPAQUE = 0.5
@@ -25,8 +25,6 @@ LOOKED_AT = 24
 """Views with alpha, at most and evenly spread, that tell: each must be read."""
 WHOLE = 0.999
 """Alpha from which nothing behind a pixel shows in its colour."""
-SHOWN = 5
-"""Names in a message, at most."""
 
 
 @dataclass(frozen=True, eq=False)

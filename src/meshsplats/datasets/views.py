@@ -4,6 +4,7 @@ from splats."""
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -15,10 +16,13 @@ from meshsplats._kinds import need, need_all
 from meshsplats._origin import in_words, zero_origin
 from meshsplats.camera import Camera
 from meshsplats.choices import Look
+from meshsplats.errors import DataWarning
 
 CACHE_BYTES = 2 << 30
 """Default limit on the images of a data set that are kept in memory after their first use, bytes."""
 WHITE = (1.0, 1.0, 1.0)
+SHOWN = 5
+"""Names in a message, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +214,21 @@ class Dataset:
         train, test = (with_near_planes(views, points) for views in (self.train, self.test))
         return replace(self, train=train, test=test)
 
+    def scorable(self) -> Dataset:
+        """The same without held-out views in which no pixel counts, which have no score. Reads those that
+        have masks. Warns with a DataWarning that names them."""
+        kept = tuple(view for view in self.test if _counts(view))
+        if len(kept) == len(self.test):
+            return self
+        names = [view.name for view in self.test if view not in kept]
+        warnings.warn(
+            f"{len(names)} of {len(self.test)} held-out photographs are not scored, as no pixel of them counts:"
+            f" {', '.join(names[:SHOWN])}{', ...' if len(names) > SHOWN else ''}. Are their masks right?",
+            DataWarning,
+            stacklevel=3,
+        )
+        return replace(self, test=kept)
+
     def over(self, background: Sequence[float]) -> Dataset:
         """The same views with another ``background`` for images with alpha."""
         red, green, blue = map(float, background)
@@ -218,6 +237,14 @@ class Dataset:
             return tuple(replace(view, background=(red, green, blue)) for view in views)
 
         return replace(self, train=changed(self.train), test=changed(self.test))
+
+
+def _counts(view: View) -> bool:
+    """Whether any pixel does."""
+    if getattr(view.source, "mask", view) is None:  # an image, or a photograph that has not been read
+        return True
+    mask = view.mask
+    return mask is None or bool(mask.any())
 
 
 def with_near_planes(views: Sequence[View], points: np.ndarray) -> tuple[View, ...]:

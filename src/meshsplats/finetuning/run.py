@@ -12,6 +12,7 @@ import numpy as np
 from meshsplats._arrays import checked_array
 from meshsplats._kinds import need
 from meshsplats._origin import need_one_origin
+from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import Dataset
 from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import OtherRunError
@@ -158,6 +159,8 @@ def ready_loop(
     if frozen is not None:
         frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
     check_phases(config, mesh, engine(run.device, run.threads), frozen)
+    if not are_rendered(dataset.test):
+        dataset = dataset.scorable()
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     config = for_views(config, dataset.train)
     journal = None if run.folder is None else Journal(run.folder)

@@ -91,7 +91,7 @@ class PhotographOptions:
                 f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
                 " are needed to train on (``test_every`` 0 holds none out)"
             )
-        dataset = with_clear_pixels_masked(dataset)
+        dataset = with_clear_pixels_masked(dataset).scorable()
         if config.background in BACKGROUNDS:
             found = Background(BACKGROUNDS[config.background], "given")
         elif has_silhouettes(dataset.train):

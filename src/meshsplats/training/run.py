@@ -98,7 +98,7 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
-    dataset = with_clear_pixels_masked(dataset)
+    dataset = with_clear_pixels_masked(dataset).scorable()
     config = for_views(config, dataset.train)
     engine(run.device, run.threads).check()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
@@ -116,7 +116,7 @@ def train(
                     stacklevel=2,
                 )
             mesh = starting_fans(dataset, config, points, run.threads)
-            for message in find_suspects(dataset.train).messages():
+            for message in find_suspects(dataset.views).messages():
                 warnings.warn(message, DataWarning, stacklevel=2)
         if config.exposure is None:
             config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
