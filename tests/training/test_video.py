@@ -16,6 +16,7 @@ from PIL import Image, ImageFilter
 from meshsplats.cli import main
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.training import video as module
+from meshsplats.training.photographs import PhotographOptions
 from meshsplats.training.video import (
     Frames,
     choose_frames,
@@ -269,12 +270,43 @@ def test_train_takes_a_video(tmp_path, monkeypatch, capsys):
         raise ValueError("none found")
 
     monkeypatch.setattr("meshsplats.training.reconstruction.find_cameras", no_cameras)
+    monkeypatch.setattr("meshsplats.training.reconstruction.check_library", lambda: None)
     words = ["train", str(clip), "-o", str(tmp_path / "mesh.npz")]
     assert main([*words, "--frames", "6"]) == 1
     assert asked == [tmp_path / "walk-frames"]
     assert "6 of 20 frames" in capsys.readouterr().err
     assert main([*words, "--frames", "7"]) == 1
     assert "has 6 frames, not 7" in capsys.readouterr().err
+
+
+def test_what_is_needed_is_asked_before_the_look_at_a_video(tmp_path, monkeypatch):
+    clip = write_video(tmp_path / "walk.mp4", passing([0, 5]))
+    monkeypatch.setattr(module, "look_at_frames", lambda *given: pytest.fail("looked"))
+    with monkeypatch.context() as patch:
+        patch.setattr("meshsplats.training.reconstruction.find_spec", lambda name: None)
+        with pytest.raises(MissingDependencyError, match=r"meshsplats\[photos\]"):
+            PhotographOptions().with_cameras(clip, print)
+    monkeypatch.setattr(module.os, "access", lambda *given: False)
+    with pytest.raises(PermissionError, match="no permission to write the frames"):
+        photographs_of(clip)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--test-every", "1", "--test-every must be 0"),
+        ("--downscale", "0", "--downscale must be a whole number from 1 to 64, got 0"),
+        ("--frames", "1", "--frames must be at least 2, got 1"),
+    ],
+)
+def test_wrong_options_are_refused_before_cameras_are_found(
+    tmp_path, monkeypatch, capsys, option, value, message
+):
+    monkeypatch.setattr(PhotographOptions, "with_cameras", lambda *given, **more: pytest.fail("looked"))
+    (tmp_path / "photos").mkdir()
+    words = ["train", str(tmp_path / "photos"), "-o", str(tmp_path / "mesh.npz"), option, value]
+    assert main(words) == 1
+    assert message in capsys.readouterr().err
 
 
 def test_without_its_library_the_extra_is_named(tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ from meshsplats.datasets.llff import read_poses_bounds
 from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.transforms import read_transforms
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError, OptionValueError
 
 Views = tuple[list[View], list[View]]
 MAX_LIST_BYTES = 16 << 20
@@ -144,6 +144,20 @@ def _views(train: list[Taken], test: list[Taken]) -> Views:
     return flat(train), flat(test)
 
 
+def check_reading(downscale: int, test_every: int) -> None:
+    """OptionValueError if ``load_dataset`` would refuse one of these."""
+    for option, value, least, most in (
+        ("downscale", downscale, 1, MOST_DOWNSCALE),
+        ("test_every", test_every, 0, 10**9),
+    ):
+        if int(value) != value or not least <= value <= most:
+            raise OptionValueError(f"``{option}`` must be a whole number from {least} to {most}, got {value}")
+    if test_every == 1:
+        raise OptionValueError(
+            "``test_every`` must be 0 (no test views) or at least 2: 1 leaves nothing to train with"
+        )
+
+
 def load_dataset(
     path: str | os.PathLike[str],
     *,
@@ -203,12 +217,7 @@ def load_dataset(
     taken if no other can be meant.
     """
     need_path(path=path)
-    for option, value, least, most in (
-        ("downscale", downscale, 1, MOST_DOWNSCALE),
-        ("test_every", test_every, 0, 10**9),
-    ):
-        if int(value) != value or not least <= value <= most:
-            raise ValueError(f"{option} must be a whole number from {least} to {most}, got {value}")
+    check_reading(downscale, test_every)
     color = np.asarray(background, np.float64)
     if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
         raise ValueError(f"background must be three numbers in [0, 1], got {background!r}")
@@ -216,8 +225,6 @@ def load_dataset(
         raise ValueError(f"missing must be 'few', 'error' or 'skip', got {missing!r}")
     if masks not in get_args(Masks):
         raise ValueError(f"masks must be 'count' or 'subject', got {masks!r}")
-    if test_every == 1:
-        raise ValueError("test_every must be 0 (no test views) or at least 2: 1 leaves nothing to train with")
     store = ImageCache(cache_bytes)
     train, test = read_folder(Path(path), int(downscale), int(test_every), store, missing, masks)
     photographs = [view.source for view in (*train, *test) if isinstance(view.source, PhotoFile)]

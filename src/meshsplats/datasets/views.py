@@ -221,9 +221,10 @@ class Dataset:
         if len(kept) == len(self.test):
             return self
         names = [view.name for view in self.test if view not in kept]
+        shown = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
         warnings.warn(
-            f"{len(names)} of {len(self.test)} held-out photographs are not scored, as no pixel of them counts:"
-            f" {', '.join(names[:SHOWN])}{', ...' if len(names) > SHOWN else ''}. Are their masks right?",
+            f"{len(names)} of {len(self.test)} held-out photographs are not scored, as no pixel of them"
+            f" counts: {shown}. Are their masks right?",
             DataWarning,
             stacklevel=3,
         )

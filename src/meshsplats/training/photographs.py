@@ -45,7 +45,12 @@ class PhotographOptions:
 
     def check(self) -> None:
         """ValueError for values out of range."""
+        from meshsplats.datasets.folder import check_reading
+
         check_cache(self.cache)
+        check_reading(1 if self.downscale is None else self.downscale, self.test_every)
+        if self.frames is not None and self.frames < 2:
+            raise OptionValueError(f"``frames`` must be at least 2, got {self.frames}")
 
     @property
     def cache_bytes(self) -> int:
@@ -58,9 +63,11 @@ class PhotographOptions:
         where there are none, by as many ``threads``, or by all processors. ``say`` gets lines about it.
         ``resumed``: for a run that goes on with those that it began with. OptionsError if they are not to be
         found."""
-        from meshsplats.training.reconstruction import ensure_cameras
-        from meshsplats.training.video import photographs_of
+        from meshsplats.training.reconstruction import check_library, ensure_cameras
+        from meshsplats.training.video import frames_of, is_video, photographs_of
 
+        if is_video(source) and not frames_of(source).is_dir():
+            check_library()  # before the frames are chosen, which takes long
         folder = photographs_of(source, self.frames, say)
         replacing = self.estimate_cameras and not resumed
         there = ensure_cameras(folder, replacing=replacing, say=say, threads=threads)

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +210,12 @@ def find_cameras(
         write_bytes(folder / POINTS, _points(best))
         write_text(folder / CAMERAS, json.dumps(cameras, indent=1) + "\n")
     say(f"cameras of {count} photographs and {len(best.points3D):,} points: {folder / CAMERAS}")
+
+
+def check_library() -> None:
+    """MissingDependencyError unless what finds cameras is installed."""
+    if find_spec("pycolmap") is None:
+        raise MissingDependencyError(NEEDS)
 
 
 def _imported() -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tempfile
 import time
 import warnings
@@ -60,6 +61,11 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
+def frames_of(video: Path) -> Path:
+    """The folder of the frames of ``video``."""
+    return video.with_name(f"{video.stem}-frames")
+
+
 def photographs_of(
     path: Path, frames: int | None = None, say: Callable[[str], None] = lambda text: None
 ) -> Path:
@@ -73,7 +79,7 @@ def photographs_of(
         if frames is not None:
             raise ValueError(f"a number of frames is for a video, and {path} is none")
         return path
-    folder = path.with_name(f"{path.stem}-frames")
+    folder = frames_of(path)
     if not (folder / IMAGES).is_dir():
         save_frames(path, folder, frames, say)
         return folder
@@ -114,12 +120,15 @@ def save_frames(
         MissingDependencyError: PyAV is not installed.
         FileFormatError: not a video that can be read, or one of larger frames than images may have.
         FileExistsError: ``folder`` is there.
+        PermissionError: nothing may be written beside it.
         ValueError: ``count`` below 2.
 
     Warns with a DataWarning where a video cannot be read to its end.
     """
     if count is not None and count < 2:
         raise ValueError(f"at least 2 frames are needed, got {count}")
+    if not os.access(folder.parent, os.W_OK):
+        raise PermissionError(f"{folder.parent}: no permission to write the frames there")
     if folder.exists():
         raise FileExistsError(f"{folder}: is there already, without frames: move it away")
     say(f"looking at the frames of {video.name}")
