@@ -13,7 +13,10 @@ _HEAD = 4096
 """First bytes of a file that suffice here."""
 _MAX_PICKLE = 1 << 20
 """Bytes of a pickle that are searched for names; it is never unpickled."""
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
+    *(".3gp", ".mts", ".m2ts", ".mpg", ".mpeg"),
+)
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".dng")
 
 
@@ -54,7 +57,13 @@ _KINDS: Sequence[_Kind] = (
     _Kind(".pkl .pickle", rb"\x80[\2-\5][^\0]", _PICKLE),
     _Kind(".npy", rb"\x93NUMPY", "a NumPy array, not a scene"),
     _Kind(
-        ".jpg .jpeg .png .webp .tif .tiff .bmp .gif .heic .heif .exr .dng .cr2 .cr3 .nef .arw",
+        ".dng .cr2 .cr3 .nef .arw .orf .raf .rw2 .raw",
+        b"",
+        "a raw photograph, which is not read: develop it to JPEG or TIFF first",
+    ),
+    _Kind(".avif .jxl .jp2", b"", "an image of a kind that is not read: convert it to JPEG or PNG first"),
+    _Kind(
+        ".jpg .jpeg .png .webp .tif .tiff .bmp .gif .heic .heif .exr",
         rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|II\*\0|MM\0\*|v/1\x01|....ftyp(heic|heix|mif1|avif)",
         "an image; 'meshsplats train' makes a mesh of a folder of photographs",
     ),

@@ -292,9 +292,11 @@ def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
     assert run(*arguments, *options, "--resume", "--force") == 1
     assert re.search(message, capsys.readouterr().err)
     assert run(*arguments, "--resume", "--force") == 0
+    assert run(*arguments[:-1], "1", "--resume", "--force") == 1
+    assert "has taken 2 steps already, 1 were requested\n" in capsys.readouterr().err
     save_gaussians(make_scene(301), tmp_path / "scene.ply")
     assert run(*arguments, "--resume", "--force") == 1
-    assert "No option differs, so the files themselves have changed" in capsys.readouterr().err
+    assert "Options that differ: none, so the files have changed" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -368,6 +368,10 @@ def test_of_several_models_the_one_with_the_most_images_is_taken(tmp_path):
         assert len(load_dataset(folder).views) == 2
 
 
+def photograph(path):
+    save(path, np.zeros((4, 6, 3), np.uint8))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -379,6 +383,11 @@ def test_of_several_models_the_one_with_the_most_images_is_taken(tmp_path):
         (lambda f: simple_colmap(f / "inner"), "inner/ in it looks like one"),
         (lambda f: (f / "notes.md").touch(), r"it holds notes\.md"),
         (lambda f: (f / "clip.MP4").touch(), r"clip\.MP4 in it is a video: 'meshsplats train"),
+        (lambda f: (f / "clip.mts").touch(), r"clip\.mts in it is a video: 'meshsplats train"),
+        (lambda f: (f / "a.dng").touch(), r"a\.dng in it is a raw photograph, .*: develop it to JPEG"),
+        (lambda f: (f / "a.avif").touch(), r"a\.avif in it is an image .*: convert it to JPEG"),
+        (lambda f: photograph(f / "a.jpg"), "of photographs without, 'meshsplats train' finds the cameras"),
+        (lambda f: photograph(f / "DCIM/100APPLE/a.jpg"), "there are photographs in DCIM/100APPLE/: give"),
         (lambda f: (f / "scan.las").touch(), r"scan\.las in it is a point cloud"),
     ],
 )

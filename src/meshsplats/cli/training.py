@@ -273,8 +273,8 @@ class TrainingCommand(Command):
     def _naming_options(self, error: OtherRunError, files: RunFiles) -> Exception:
         """``error`` with the options that differ from those of the run that was to be resumed."""
         differ = differences(files.command, self._name, self, _CHANGEABLE)
-        if differ is None:
+        with_length = differences(files.command, self._name, self, _CHANGEABLE - {*LENGTHS})
+        if differ is None or (with_length and not differ):
             return error
-        if not differ:
-            return OtherRunError(f"{error}. No option differs, so the files themselves have changed")
-        return OtherRunError(f"{error}. Options that differ: {in_plain_words(self, differ)}")
+        named = in_plain_words(self, differ)
+        return OtherRunError(f"{error}. Options that differ: {named or 'none, so the files have changed'}")

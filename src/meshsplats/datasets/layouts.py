@@ -217,7 +217,20 @@ def what_is_there(path: Path) -> str:
     kinds = ((name, what_it_is(path / name)) for name in names[:_SAMPLE] if (path / name).is_file())
     if known := next(((name, what) for name, what in kinds if what and not is_readable(name)), None):
         return f"{wanted}; {known[0]} in it is {known[1]}"
+    if any(Shelf(path / name).images() for name in image_folders(path)):
+        return f"{wanted}; of photographs without, 'meshsplats train' finds the cameras"
+    if deeper := _photographs_beneath(path):
+        return f"{wanted}; there are photographs in {deeper}/: give that folder"
     return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"
+
+
+def _photographs_beneath(path: Path) -> str:
+    """The first folder with photographs, up to two below ``path``; empty if there is none."""
+    for first in _folders(path):
+        for place in (first, *(f"{first}/{second}" for second in _folders(path / first))):
+            if Shelf(path / place).images():
+                return place
+    return ""
 
 
 def unread_cameras(path: Path) -> str:
