@@ -252,6 +252,28 @@ def test_any_number_of_splats_and_the_ends_of_ranges(tmp_path, suffix, n):
     assert back.opacities.max() == 1
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("suffix", [".sog", ".ply"])
+@pytest.mark.parametrize(("n", "degree", "exploded"), [(1, 0, 1), (3000, 1, 1), (20, 0, 20)])
+def test_splats_whose_size_has_exploded_are_read_again(tmp_path, suffix, n, degree, exploded):
+    cloud = cloud_of(n, degree)
+    for size in (3e19, float(np.finfo(np.float32).max)):
+        cloud.scales[:exploded] = size
+        again = written(cloud, tmp_path / f"splats{suffix}")
+        assert len(again) == n
+        np.testing.assert_allclose(again.scales.max(), size, rtol=1e-3)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_harmonics_that_have_exploded_are_clipped_in_sog(tmp_path):
+    cloud = cloud_of(3000, 1)
+    cloud.sh[0, 1:] = 1e30
+    with pytest.warns(DataWarning, match="harmonics of 1 splats are beyond 1e\\+09"):
+        again = written(cloud, tmp_path / "splats.sog")
+    assert len(again) == len(cloud)
+    assert again.sh[:, 1:].max() == 1e9
+
+
 def test_the_same_splats_give_the_same_bytes(tmp_path):
     cloud = cloud_of(5000, degree=1)
     for suffix in (".compressed.ply", ".splat", ".spz", ".sog", ".glb"):

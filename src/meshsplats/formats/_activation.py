@@ -6,6 +6,8 @@ import numpy as np
 
 MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
 """Stored for a scale of 0, whose logarithm is not finite: -87.3."""
+MAX_LOG_SCALE = 88.72283
+"""Stored for the largest float32, whose logarithm, rounded to float32, is that of infinity."""
 MIN_LOGIT, MAX_LOGIT = -30.0, 20.0
 """Stored for opacities of 0 and 1; the float32 sigmoid of 20 is exactly 1."""
 
@@ -23,9 +25,9 @@ def activated_opacities(logits: np.ndarray, out: np.ndarray | None = None) -> np
 
 
 def log_scales(scales: np.ndarray) -> np.ndarray:
-    """float32 logarithms of ``scales``, at least ``MIN_LOG_SCALE``."""
+    """float32 logarithms of ``scales``, from ``MIN_LOG_SCALE`` to ``MAX_LOG_SCALE``."""
     with np.errstate(divide="ignore"):
-        return np.maximum(np.log(scales), MIN_LOG_SCALE).astype(np.float32, copy=False)
+        return np.clip(np.log(scales), MIN_LOG_SCALE, MAX_LOG_SCALE).astype(np.float32, copy=False)
 
 
 def logits(opacities: np.ndarray) -> np.ndarray:

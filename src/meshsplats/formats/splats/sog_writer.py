@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import io
 import json
+import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshsplats.errors import MissingDependencyError
+from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.formats._activation import log_scales
 from meshsplats.formats.splats._palette import palette
 from meshsplats.formats.splats._quantising import (
@@ -30,6 +32,8 @@ from meshsplats.gaussians import GaussianCloud
 _PALETTE = 1 << 16
 _COLUMNS = 64
 """Palette entries in each row of their image."""
+_MOST_HARMONIC = 1e9
+"""Largest harmonic: beyond, squares of distances between them would not be finite in float32."""
 
 
 def write_sog(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
@@ -60,7 +64,7 @@ def write_sog(cloud: GaussianCloud, path: Path, writing: Writing) -> None:
     images["sh0.webp"] = _image(colors, as_bytes(cloud.opacities * 255))
     meta["sh0"] = {"codebook": _listed(book), "files": ["sh0.webp"]}
     if cloud.sh_degree:
-        meta["shN"] = _harmonics(cloud, importance, images)
+        meta["shN"] = _harmonics(_bounded(cloud, writing.where), importance, images)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, data in (images | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()}).items():
             # A fixed date: the same splats give the same bytes.
@@ -99,8 +103,22 @@ def _means(cloud: GaussianCloud, images: dict[str, bytes]) -> dict[str, Any]:
 def _importance(cloud: GaussianCloud) -> np.ndarray:
     """(n,) float32: how much the errors of each splat count, by how large and opaque it is; 1 on average, and
     no splat for nothing."""
-    extent = np.sqrt(np.sort(cloud.scales, axis=1)[:, 1:].prod(axis=1)) * cloud.opacities
+    # float64: products of scales that have exploded are beyond float32.
+    sizes = np.sort(cloud.scales, axis=1)[:, 1:].astype(np.float64)
+    extent = np.sqrt(sizes.prod(axis=1)) * cloud.opacities
     return (np.sqrt(extent / max(float(extent.mean()), 1e-30)) + np.float32(0.1)).astype(np.float32)
+
+
+def _bounded(cloud: GaussianCloud, where: Path) -> GaussianCloud:
+    """``cloud`` with harmonics that a palette can hold; a DataWarning counts splats that had others."""
+    beyond = int((np.abs(cloud.sh[:, 1:]) > _MOST_HARMONIC).any(axis=(1, 2)).sum())
+    if not beyond:
+        return cloud
+    message = f"{where}: harmonics of {beyond:,} splats are beyond {_MOST_HARMONIC:g} and were clipped"
+    warnings.warn(message, DataWarning, stacklevel=5)
+    return replace(
+        cloud, sh=np.concatenate([cloud.sh[:, :1], cloud.sh[:, 1:].clip(-_MOST_HARMONIC, _MOST_HARMONIC)], 1)
+    )
 
 
 def _harmonics(cloud: GaussianCloud, importance: np.ndarray, images: dict[str, bytes]) -> dict[str, Any]:
