@@ -16,6 +16,7 @@ from _pages import cameras_fixture, cloud_fixture, mesh_fixture  # noqa: F401 - 
 
 import meshsplats as ms
 from meshsplats.viewer import page as pages
+from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.page import PageOptions, make_page, script
 from meshsplats.viewer.unpacking import unpack_mesh
 from meshsplats.webgpu import kernels
@@ -134,6 +135,20 @@ def test_a_page_begins_before_the_subject_and_upright(mesh):
     center = matrix[:, :3] @ settings["center"] + matrix[:, 3]
     assert center[2] > settings["radius"]
     assert abs(center[0]) < 0.5 * center[2]
+
+
+def test_what_has_another_origin_is_at_its_place_in_the_page(mesh, cloud):
+    part, far = mesh.take(slice(60)), (10.0, -20.0, 30.0)
+    page = make_page(mesh, coarse=part.relative_to(far), splats=cloud.relative_to(far)).html
+    coarse = unpack_mesh(base64.b64decode(block(page, "coarse")))
+    assert np.abs(coarse.vertices.mean(axis=0) - part.vertices.mean(axis=0)).max() < 0.1
+    wanted = pack_splats(cloud.relative_to(far).relative_to(mesh.origin))
+    assert base64.b64decode(block(page, "splats")) == wanted
+
+
+def test_the_background_of_a_page_is_rgb(mesh):
+    with pytest.raises(ValueError, match=r"background must have shape \(3,\), got \(4,\)"):
+        make_page(mesh, options=PageOptions(background=(1, 1, 1, 1)))
 
 
 def test_a_mesh_without_triangles_makes_no_page():

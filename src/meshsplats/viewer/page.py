@@ -89,23 +89,29 @@ def make_page(
         mesh: the triangles. Normals, attributes and bindings are left out. Or a surface alone, which is drawn
             as a depth buffer does, by WebGL.
         splats: shown beside the mesh or in its place, with colours of degree 0.
-        coarse: the same scene with few triangles: drawn first, while the view moves, and on phones. In the
+        coarse: the same scene with few triangles: drawn first, while the view moves, and on phones, in the
             order of ``mesh``.
         surface: shown beside the mesh or in its place, with its texture as it is, without lights.
         cameras: viewpoints to choose from. The first is where the page begins; without any, it begins before
             the subject.
         options: title, background, up.
 
-    Raises ValueError for a mesh without triangles, a surface with several textures, and for a surface alone
-    with another or a coarse level.
+    ``splats``, ``coarse`` and ``surface`` may have other origins than ``mesh``; ``cameras`` have its own.
+
+    Raises ValueError for a mesh without triangles, a surface with several textures, a surface alone with
+    another or a coarse level, a coarse level that does not know its splats where the mesh is in their order,
+    and a background that is not RGB.
     """
     if not isinstance(mesh, BaseMesh):
         need(SplatMesh, mesh=mesh)
+    need(SplatMesh, coarse=coarse, optional=True)
     need(BaseMesh, surface=surface, optional=True)
     need(GaussianCloud, splats=splats, optional=True)
     need_all(Camera, cameras=cameras)
     need(PageOptions, options=options, optional=True)
     options = options or PageOptions()
+    if np.shape(options.background) != (3,):
+        raise ValueError(f"background must have shape (3,), got {np.shape(options.background)}")
     blocks: dict[str, tuple[str, str]] = {}
     textured = None
     if isinstance(mesh, BaseMesh):
@@ -115,13 +121,13 @@ def make_page(
         mesh, packed = textured.shape, textured.mesh
     else:
         packed = quantise_mesh(mesh)
-        blocks |= _mesh_blocks(mesh, packed, coarse)
+        blocks |= _mesh_blocks(mesh, packed, None if coarse is None else coarse.relative_to(mesh.origin))
         if surface is not None:
             textured = pack_surface(surface.relative_to(mesh.origin))
     if textured is not None:
         blocks |= _surface_blocks(textured)
     if splats is not None:
-        blocks["splats"] = ("text/plain", _base64(pack_splats(splats)))
+        blocks["splats"] = ("text/plain", _base64(pack_splats(splats.relative_to(mesh.origin))))
     views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
     if not views:
