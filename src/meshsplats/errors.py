@@ -66,7 +66,7 @@ class StraysWarning(DataWarning):
 
 
 class NoColorsWarning(DataWarning):
-    """A mesh file without vertex colours was read as grey."""
+    """A mesh file without vertex colours was read as grey, of glTF as white."""
 
 
 class NoTextureWarning(DataWarning):

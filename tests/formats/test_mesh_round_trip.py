@@ -105,10 +105,29 @@ def test_meshes_without_triangles(tmp_path, suffix, vertices):
     assert_same(load_mesh(tmp_path / f"m{suffix}"), mesh)
 
 
-def test_gltf_cannot_hold_a_mesh_without_triangles(tmp_path):
+@pytest.mark.parametrize("suffix", [".npz", ".ply", ".usda"])
+def test_nothing_of_splats_without_triangles_is_lost(tmp_path, recwarn, suffix):
+    if suffix == ".usda":
+        pytest.importorskip("pxr")
+    empty = SplatMesh(
+        np.empty((0, 3)),
+        np.empty((0, 3), int),
+        np.empty((0, 4)),
+        face_splat=np.empty(0, int),
+        depth_group=np.empty(0, int),
+        harmonics=np.empty((0, 3, 3)),
+        order="splat",
+    )
+    save_mesh(empty, tmp_path / f"m{suffix}")
+    assert_same(load_mesh(tmp_path / f"m{suffix}"), empty)
+    assert not [str(each.message) for each in recwarn]
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_formats_that_cannot_hold_a_mesh_without_triangles_say_so(tmp_path, suffix):
     mesh = SplatMesh(np.ones((2, 3)), np.empty((0, 3), int), np.ones((2, 4)))
     with pytest.raises(ValueError, match=r"without triangles.*\.npz"):
-        save_mesh(mesh, tmp_path / "m.glb")
+        save_mesh(mesh, tmp_path / f"m{suffix}")
     assert os.listdir(tmp_path) == []
 
 

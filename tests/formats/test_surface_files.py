@@ -16,6 +16,7 @@ from PIL import Image
 
 from meshsplats import BaseMesh, load_base, load_mesh, look_at, save_base
 from meshsplats.base_mesh import Texture
+from meshsplats.errors import NoColorsWarning
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
 from meshsplats.formats.gltf.cameras import cameras_in_mesh
 from meshsplats.formats.surfaces.convex import THICK, convex_parts
@@ -74,6 +75,18 @@ def test_colours_of_vertices_come_back(tmp_path, suffix):
     np.testing.assert_array_equal(mesh.faces, base.faces)
     np.testing.assert_allclose(mesh.colors, base.colors, atol=1e-3)
     np.testing.assert_allclose(mesh.up, base.up, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply", ".npz", pytest.param(".usdc", marks=needs_usd)])
+def test_a_surface_without_colours_has_none_when_it_is_read(tmp_path, suffix):
+    base = replace(tetrahedron(textured=False), colors=None)
+    save_base(base, tmp_path / f"a{suffix}")
+    again = load_base(tmp_path / f"a{suffix}")
+    assert again.colors is None
+    np.testing.assert_allclose(again.vertices, base.vertices, atol=1e-6)
+    np.testing.assert_array_equal(again.faces, base.faces)
+    with pytest.warns(NoColorsWarning, match="no vertex colours"):
+        load_mesh(tmp_path / f"a{suffix}")
 
 
 def some_views(far: float = 4.0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 
 import numpy as np
 import pytest
@@ -43,3 +44,36 @@ def test_the_factor_is_in_the_pixels(tmp_path, suffix):
 @pytest.mark.parametrize("wrap", [("repeat", "mirror"), ("clamp", "repeat"), ("clamp", "clamp")])
 def test_the_wrap_comes_back(tmp_path, suffix, wrap):
     assert written(square(wrap=wrap), tmp_path / f"a{suffix}").textures[0].wrap == wrap
+
+
+@pytest.mark.parametrize(
+    ("suffix", "wrap"),
+    [
+        (".obj", ("clamp", "clamp")),
+        (".obj", ("repeat", "repeat")),
+        (".ply", ("repeat", "repeat")),
+    ],
+)
+def test_what_formats_of_text_say_comes_back(tmp_path, suffix, wrap):
+    assert written(square(wrap=wrap), tmp_path / f"a{suffix}").textures[0].wrap == wrap
+
+
+@pytest.mark.parametrize(
+    ("suffix", "wrap"),
+    [
+        (".obj", ("clamp", "repeat")),
+        (".obj", ("mirror", "mirror")),
+        (".ply", ("clamp", "clamp")),
+        (".ply", ("repeat", "mirror")),
+    ],
+)
+def test_what_formats_of_text_do_not_say_is_refused(tmp_path, suffix, wrap):
+    base = square(wrap=wrap)
+    with pytest.raises(ValueError, match=f"{suffix}.*this one has wrap .'{wrap[0]}', '{wrap[1]}'.*as .glb"):
+        save_base(base, tmp_path / f"a{suffix}")
+    assert os.listdir(tmp_path) == []
+    assert base.uv is not None
+    inside = BaseMesh(
+        base.vertices, base.faces, uv=base.uv / 2, face_texture=base.face_texture, textures=base.textures
+    )
+    assert written(inside, tmp_path / f"a{suffix}").textured

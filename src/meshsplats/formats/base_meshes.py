@@ -158,8 +158,8 @@ def save_base(
         cameras: (`.glb`, USD) views of a place, the first one to open with, relative to the surface's origin.
 
     Raises:
-        ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, or has
-            several textures.
+        ValueError: the suffix is unknown, the format does not have an option, the mesh is empty, has
+            several textures, or one that wraps at its edges as the format does not say (`.obj`, `.ply`).
         MissingDependencyError: a package is missing.
         OSError: a file cannot be written.
     """
@@ -185,7 +185,7 @@ def save_base(
         ),
         ".obj": lambda to: write_surface_obj(base, to, target, own),
         ".ply": lambda to: write_surface_ply(base, to, target, own),
-        ".npz": lambda to: write_npz(plain_mesh(base), to),
+        ".npz": lambda to: write_npz(plain_mesh(base), to, colored=base.colors is not None),
         ".stl": lambda to: write_stl(base, to),
         ".3mf": lambda to: write_3mf(base, to),
     }

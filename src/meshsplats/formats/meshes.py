@@ -256,7 +256,7 @@ def save_mesh_blocks(
         raise ValueError(f"parts of meshes are written as .ply, got {target.name!r}: for others, build tiles")
     taken = _Taken(splats)
     with atomic_path(target, needs=taken.needs) as temporary:
-        return write_mesh_blocks(taken.counted(parts), temporary)
+        return write_mesh_blocks(taken.counted(parts), temporary, target)
 
 
 class _Taken:

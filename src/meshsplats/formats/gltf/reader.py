@@ -13,7 +13,7 @@ from meshsplats._arrays import joined_rows
 from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.colors import linear_to_srgb
 from meshsplats.draw_order import DrawOrder
-from meshsplats.errors import NoTextureWarning
+from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
 from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
@@ -115,7 +115,7 @@ def listed_order(path: Path, mesh: SplatMesh) -> DrawOrder | None:
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     path = document.path
     placed = shown_meshes(document)
-    pieces, skipped, textured = [], 0, 0
+    pieces, skipped, textured, colored = [], 0, 0, False
     note = our_note(placed[0].mesh) if placed else {}
     if len(placed) != max(1, copies.counts(note.get("copies"))):
         note = {}
@@ -138,6 +138,8 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
                 continue
             material = material_of(document, primitive)
             textured += "baseColorTexture" in pbr_of(material)
+            colored |= "baseColorFactor" in pbr_of(material)
+            colored |= "COLOR_0" in dict_or_empty(primitive.get("attributes"))
             pieces.append(_piece(document, primitive, material, place, stored))
     if skipped:
         warn(f"{path}: {skipped:,} primitives of points or lines were left out")
@@ -146,6 +148,9 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
         warnings.warn(message, NoTextureWarning, stacklevel=3)
     if not pieces:
         raise document.error("the scene holds no triangles")
+    if note and not (textured or colored):
+        message = f"{path}: no vertex colours; the mesh is shown in white"
+        warnings.warn(message, NoColorsWarning, stacklevel=3)
     shift = zero_origin()  # what is ours is relative to its origin already
     if named is not None:
         origin = named

@@ -33,14 +33,17 @@ _NAME = "meshsplats_up_"
 _ROWS = 1 << 14
 
 
-def write_obj(mesh: SplatMesh, path: Path) -> None:
-    """Writes positions, display colours after them (those for programs without harmonics) and triangles as
-    text; nine digits keep float32 exactly.
+def write_obj(mesh: SplatMesh, path: Path, *, colored: bool = True) -> None:
+    """Writes positions, display colours after them (those for programs without harmonics) where the mesh is
+    ``colored``, and triangles as text; nine digits keep float32 exactly.
 
     The format has no opacity: a DataWarning counts translucent vertices. Positions are in the world, turned
     until +y is up; doubles where the mesh has an origin or its up direction is along no axis. The up
-    direction and the origin are in comments, by which ``load_mesh`` gives the same mesh.
+    direction and the origin are in comments, by which ``load_mesh`` gives the same mesh. ValueError for a
+    mesh without triangles, which readers take for none.
     """
+    if not len(mesh.faces):
+        raise ValueError("OBJ cannot hold a mesh without triangles; save it as .npz or .ply")
     lost = [f.name for f in mesh.extras() if f.per == "face"] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
     if translucent:
@@ -55,11 +58,12 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
     rgb = linear_to_srgb(rgb) if mesh.blending == "linear" else rgb
     corner = "%d" if mesh.normals is None else "%d//%d"
     with open(path, "wb") as file:
-        file.write(b"# x y z, then red green blue as display values\n")
+        file.write(b"# x y z, then red green blue as display values\n" if colored else b"")
         file.write(comments(mesh))
         wide = mesh.origin.any() or not _along_axes(_turn(mesh.up))
         xyz = "%r %r %r" if wide else "%.9g %.9g %.9g"
-        write_rows(file, f"v {xyz} %.9g %.9g %.9g\n", turned_positions(mesh), rgb)
+        line, colors = (f"v {xyz} %.9g %.9g %.9g\n", [rgb]) if colored else (f"v {xyz}\n", [])
+        write_rows(file, line, turned_positions(mesh), *colors)
         if mesh.normals is not None:
             write_rows(file, "vn %.9g %.9g %.9g\n", turned_directions(mesh, mesh.normals))
         faces = mesh.faces + 1

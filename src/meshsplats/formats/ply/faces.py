@@ -31,7 +31,7 @@ def read_faces(
     """
     index = _index(face)
     if face.count == 0:
-        return np.empty((0, 3), np.int64), {}
+        return np.empty((0, 3), np.int64), {p.name: np.empty(0, np.int64) for p in _integers(face, names)}
     if index is None or index.dtype.kind not in "iu":
         raise FileFormatError(f"{path}: element 'face' has no list of integers 'vertex_indices'")
     keep = _integers(face, names)

@@ -59,9 +59,10 @@ _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diff
 # -- writing
 
 
-def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
-    """Writes ``mesh`` to ``path`` exactly. ValueError for more than ``MAX_PROPERTIES`` columns per vertex."""
-    layout = _Layout(mesh)
+def write_mesh_ply(mesh: SplatMesh, path: Path, *, colored: bool = True) -> None:
+    """Writes ``mesh`` to ``path`` exactly, its colours only where it is ``colored``. ValueError for more than
+    ``MAX_PROPERTIES`` columns per vertex."""
+    layout = _Layout(mesh, colored)
     with open(path, "wb") as file:
         rows = 0 if mesh.harmonics is None else len(mesh.harmonics)
         file.write(layout.header(len(mesh.vertices), len(mesh.faces), rows))
@@ -70,9 +71,9 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
         layout.write_splats(mesh, file)
 
 
-def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int, int]:
+def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path, where: Path) -> tuple[int, int, int]:
     """Writes one mesh that comes in ``parts``, each with vertex indices of its own; the file is that of
-    ``write_mesh_ply`` for all of them together.
+    ``write_mesh_ply`` for all of them together. ``where``: its name, for messages.
 
     Returns counts of vertices, triangles and splats. Raises ValueError if there are no parts, if they are not
     alike (``SplatMesh.joined``) or have depth groups, and for more than a mesh can number.
@@ -100,9 +101,11 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
             vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
             splats += part.splat_count or 0
             if max(vertices, faces) > np.iinfo(np.int32).max:
-                raise ValueError(f"{path}: more than 2^31 - 1 vertices or triangles; build a tileset instead")
+                raise ValueError(
+                    f"{where}: more than 2^31 - 1 vertices or triangles; build a tileset instead"
+                )
         if layout is None:
-            raise ValueError(f"{path}: no mesh to write")
+            raise ValueError(f"{where}: no mesh to write: parts is empty")
         file.write(layout.header(vertices, faces, splats))
         for spooled in (first, second, third):
             spooled.seek(0)
@@ -113,7 +116,7 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
 class _Layout:
     """Elements and properties of the file of a mesh, and of others with the same optional arrays."""
 
-    def __init__(self, mesh: SplatMesh) -> None:
+    def __init__(self, mesh: SplatMesh, colored: bool = True) -> None:
         check_attribute_names(mesh)
         up = " ".join(repr(float(u)) for u in mesh.up)
         self._head = [
@@ -132,7 +135,8 @@ class _Layout:
         self._names = [*(_LOCAL if mesh.origin.any() else POSITION)]
         if mesh.normals is not None:
             self._names += ["nx", "ny", "nz"]
-        self._names += ["red", "green", "blue", "alpha"]
+        self._colored = colored
+        self._names += ["red", "green", "blue", "alpha"] if colored else []
         self._terms = 0 if mesh.harmonics is None else mesh.harmonics.shape[1]
         self._two_colors = bool(self._terms) or mesh.plain_colors is not None
         if self._two_colors:
@@ -163,7 +167,8 @@ class _Layout:
 
     def write_vertices(self, mesh: SplatMesh, file: IO[bytes]) -> None:
         columns = [mesh.vertices, *([] if mesh.normals is None else [mesh.normals])]
-        columns += [mesh.plain.colors, mesh.colors[:, :3]] if self._two_colors else [mesh.colors]
+        if self._colored:
+            columns += [mesh.plain.colors, mesh.colors[:, :3]] if self._two_colors else [mesh.colors]
         for values in _tables(mesh).values():
             columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
         for start in range(0, len(mesh.vertices), _ROWS):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._geometry import vertex_normals
-from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.base_mesh import BaseMesh, Texture, Wrap
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.formats.surfaces.tangents import corner_frames
 from meshsplats.images.writing import encode_image
@@ -15,6 +15,8 @@ from meshsplats.mesh import SplatMesh
 
 LARGE_PNG = 1 << 20
 """Textures whose PNG is larger than this, in bytes, are written as JPEG where nothing else is asked for."""
+_ROUNDING = 1e-6
+"""Of texture coordinates at the edges of a texture."""
 
 
 class Corners(NamedTuple):
@@ -110,6 +112,13 @@ def check_texture(base: BaseMesh) -> None:
             f"a surface has one texture on all faces, this mesh has {len(base.textures)}, on"
             f" {int(base.textured_faces().sum()):,} of {len(base.faces):,} faces"
         )
+
+
+def wraps_beyond_edges(base: BaseMesh) -> set[Wrap]:
+    """How the texture of ``base`` wraps along those of its sides beyond which coordinates lie."""
+    assert base.uv is not None
+    sides = zip(base.textures[0].wrap, base.uv.reshape(-1, 2).T, strict=True)
+    return {wrap for wrap, at in sides if at.min() < -_ROUNDING or at.max() > 1 + _ROUNDING}
 
 
 def plain_mesh(base: BaseMesh) -> SplatMesh:

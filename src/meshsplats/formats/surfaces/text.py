@@ -16,19 +16,30 @@ from meshsplats.formats.obj.mesh import (
     write_rows,
 )
 from meshsplats.formats.ply.mesh import write_mesh_ply
-from meshsplats.formats.surfaces.corners import normal_file, plain_mesh, smooth_normals, texture_file
+from meshsplats.formats.surfaces.corners import (
+    normal_file,
+    plain_mesh,
+    smooth_normals,
+    texture_file,
+    wraps_beyond_edges,
+)
 
 
 def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
-    """Writes ``base`` to ``path``, which will be ``target``; its material and its texture are beside that."""
+    """Writes ``base`` to ``path``, which will be ``target``; its material and its texture are beside that.
+    ValueError for a texture that is to be wrapped as no `.obj` says."""
     if not base.textured:
-        write_obj(plain_mesh(base), path)
+        write_obj(plain_mesh(base), path, colored=base.colors is not None)
         return
     assert base.uv is not None
+    wraps = wraps_beyond_edges(base)
+    if wraps not in ({"clamp"}, {"repeat"}, set()):
+        raise _not_wrapped(base, "an .obj repeats or clamps its texture along both sides")
     suffix, content = texture_file(base, image)
     material, picture = target.with_suffix(".mtl"), target.with_suffix(suffix)
     write_bytes(picture, content)
-    lines = ["newmtl surface", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {picture.name}"]
+    lines = ["newmtl surface", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1"]
+    lines.append(f"map_Kd {'-clamp on ' if wraps == {'clamp'} else ''}{picture.name}")
     if base.normal_map is not None:
         kind, content = normal_file(base, image)
         relief = target.with_name(f"{target.stem}_normal{kind}")
@@ -50,11 +61,14 @@ def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | Non
 
 def write_surface_ply(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:
     """Writes ``base`` to ``path``, which will be ``target``: as this project's meshes, or with a texture as
-    MeshLab has it, with coordinates of the corners of each face, v up, and a comment TextureFile."""
+    MeshLab has it, with coordinates of the corners of each face, v up, and a comment TextureFile.
+    ValueError for a texture that is not to be repeated."""
     if not base.textured:
-        write_mesh_ply(plain_mesh(base), path)
+        write_mesh_ply(plain_mesh(base), path, colored=base.colors is not None)
         return
     assert base.uv is not None
+    if not wraps_beyond_edges(base) <= {"repeat"}:
+        raise _not_wrapped(base, "programs repeat the texture of a .ply")
     suffix, content = texture_file(base, image)
     picture = target.with_suffix(suffix)
     write_bytes(picture, content)
@@ -79,3 +93,11 @@ def write_surface_ply(base: BaseMesh, path: Path, target: Path, image: str | Non
         file.write("\n".join(header).encode())
         file.write(rows.tobytes())
         file.write(faces.tobytes())
+
+
+def _not_wrapped(base: BaseMesh, why: str) -> ValueError:
+    """That the format does not keep how the texture of ``base`` wraps."""
+    return ValueError(
+        f"{why}, this one has wrap {base.textures[0].wrap!r} and coordinates beyond its edges: save as"
+        " .glb or .usdc"
+    )

@@ -352,7 +352,8 @@ def _restored(
             raise FileFormatError(f"harmonics must have degree 1, 2 or 3, got {str(degree)[:60]}")
         splats, terms = len(np.unique(restored.get("face_splat", ()))), TERMS[degree - 1]
         values = stored("harmonics", np.float32)
-        if splats and values.size == splats * terms * 3 and "colors" in restored:
+        known = {"face_splat", "colors"} <= restored.keys()
+        if known and values.size == splats * terms * 3:
             restored["harmonics"] = values.reshape(splats, terms, 3)
         else:
             lost.append("harmonics")
