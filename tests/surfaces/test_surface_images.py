@@ -281,6 +281,33 @@ def test_textures_are_drawn_beyond_their_borders_as_they_wrap(wrap):
         draw_surface(replace(base, uv=uv * np.float32(1e9)), Camera(np.eye(4), 8, 8, 8, 8, 16, 16))
 
 
+def test_a_texture_that_repeats_often_is_drawn():
+    """A square that fills the image, with 300 x 300 repetitions: side by side, more than a gigabyte."""
+    points = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    pixels = np.random.default_rng(0).integers(0, 256, (64, 64, 4), np.uint8)
+    uv = points[faces, :2] * np.float32(150)
+    base = BaseMesh(points, faces, uv=uv, face_texture=[0, 0], textures=(Texture(pixels),))
+    image = draw_surface(base, Camera(np.eye(4), 50, 50, 50, 50, 100, 100))
+    at = (np.arange(200) + 0.5) / 100 - 1
+    samples = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) * 150
+    expected = base.textures[0].at(samples)[:, :3].reshape(100, 2, 100, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image, expected, atol=0.02)
+
+
+def test_a_clamped_texture_has_its_own_colour_at_each_border():
+    points = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    pixels = np.full((2, 2, 4), 255, np.uint8)
+    pixels[:, 0, :3] = 0
+    uv = (points[faces, :2] + 1) / 2
+    base = BaseMesh(
+        points, faces, uv=uv, face_texture=[0, 0], textures=(Texture(pixels, ("clamp", "clamp")),)
+    )
+    image = draw_surface(base, Camera(np.eye(4), 8, 8, 8, 8, 16, 16))
+    np.testing.assert_allclose(image[8, [0, 3, 12, 15], 0], [0, 0, 1, 1], atol=1e-6)
+
+
 def test_surfaces_without_a_texture_are_drawn():
     points, faces = unit_ball(2)
     camera = cameras(1)[0]

@@ -191,7 +191,7 @@ def draw_surface(
 
 def _unrolled(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates (f, 3, 2) float32 of ``base`` and texels (th, tw, 3), of its texture as far as the
-    coordinates go: beyond its borders as it wraps."""
+    coordinates go: beyond its borders as it wraps. What repeats is left as it is, as it is drawn so."""
     assert base.uv is not None
     texture, texels = base.textures[0], opaque_pixels(base.textures[0])
     uv = base.uv.astype(np.float64)
@@ -199,8 +199,7 @@ def _unrolled(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:
         side = texels.shape[1 - axis]
         along = uv[..., axis] * side
         first, last = int(np.floor(along.min() - 0.5)), int(np.floor(along.max() + 0.5))
-        beyond = 1 if mode == "clamp" else 0  # the half pixel inside each border has the border's colour
-        if first >= -beyond and last < side + beyond:
+        if mode == "repeat" or (first >= 0 and last < side):
             continue
         count = last - first + 1
         if count * texels.size // side > _MOST_TEXELS:
