@@ -83,9 +83,11 @@ def test_one_process_at_a_time_writes_a_folder(scene, tmp_path):
     assert contents(tmp_path) == {}
 
 
-def test_a_run_that_cannot_begin_leaves_no_folder(scene, tmp_path):
+def test_a_run_that_cannot_begin_leaves_folders_as_they_were(scene, tmp_path):
     _, dataset, mesh = scene
     frozen = np.zeros(1, bool)
-    with pytest.raises(ValueError, match="frozen"):
-        finetune(mesh, dataset, steps=1, frozen=frozen, run=RunOptions(tmp_path / "run"))
-    assert not (tmp_path / "run").exists()
+    (tmp_path / "empty").mkdir()
+    for folder in ("run", "empty"):
+        with pytest.raises(ValueError, match="frozen"):
+            finetune(mesh, dataset, steps=1, frozen=frozen, run=RunOptions(tmp_path / folder))
+    assert [path.name for path in tmp_path.rglob("*")] == ["empty"]

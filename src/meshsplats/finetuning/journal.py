@@ -167,6 +167,7 @@ def claimed(run: RunOptions | None, more: tuple[str, ...] = ()) -> Iterator[None
     if run is None or run.folder is None:
         yield
         return
+    was_there = run.folder.is_dir()
     run.folder.mkdir(exist_ok=True)
     try:
         with locked(run.folder / LOCK) as ours:
@@ -178,5 +179,6 @@ def claimed(run: RunOptions | None, more: tuple[str, ...] = ()) -> Iterator[None
                 Journal(run.folder).check_free(more, run.replace_old)
             yield
     finally:
-        with suppress(OSError):
-            run.folder.rmdir()  # where nothing was written
+        if not was_there:
+            with suppress(OSError):
+                run.folder.rmdir()  # where nothing was written
