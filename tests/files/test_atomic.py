@@ -72,6 +72,19 @@ def test_a_folder_takes_the_place_of_one_that_a_killed_run_has_moved(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
 
 
+@posix
+def test_a_folder_takes_the_place_of_a_link_again_and_again(tmp_path):
+    (tmp_path / "disk").mkdir()
+    for name in ("old", "mine"):
+        (tmp_path / "disk" / name).touch()
+    (tmp_path / "site").symlink_to(tmp_path / "disk")
+    for _ in range(2):
+        (tmp_path / "new").mkdir()
+        replace_folder(tmp_path / "new", tmp_path / "site", lambda name: name == "old")
+        assert [path.name for path in (tmp_path / "site").iterdir()] == ["mine"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "site"]
+
+
 def test_a_replaced_file_keeps_its_permissions(tmp_path):
     target = tmp_path / "a.npz"
     target.write_bytes(b"")

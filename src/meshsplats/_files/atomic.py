@@ -33,8 +33,8 @@ _waiting: list[_Finished] | None = None
 
 
 def replace_folder(finished: Path, target: Path, is_own: Callable[[str], bool]) -> None:
-    """Renames the folder ``finished`` to ``target``, in place of an older one, of which the files that are
-    not its own stay: ``is_own`` tells by the path in the folder, with slashes."""
+    """Renames the folder ``finished`` to ``target``, in place of an older one or a link to one, of which the
+    files that are not its own stay: ``is_own`` tells by the path in the folder, with slashes."""
     old = target.with_name(f".{target.name}.old")
     if target.exists():
         _hand_over(old, target, is_own)  # what a run left that was killed here
@@ -55,9 +55,9 @@ def _hand_over(old: Path, target: Path, is_own: Callable[[str], bool]) -> None:
                 path.unlink()
             elif not os.path.lexists(target / inside):
                 (target / inside).parent.mkdir(parents=True, exist_ok=True)
-                os.rename(path, target / inside)
+                shutil.move(path, target / inside)  # to another disk where the older folder was a link
         with suppress(OSError):
-            place.rmdir()
+            place.unlink() if place.is_symlink() else place.rmdir()
 
 
 @contextmanager
