@@ -59,7 +59,6 @@ def test_a_new_file_follows_the_umask(tmp_path, umask, mode):
     assert stat.S_IMODE((tmp_path / "a.npz").stat().st_mode) == mode
 
 
-@posix
 def test_a_folder_takes_the_place_of_one_that_a_killed_run_has_moved(tmp_path):
     for folder, name in ((".site.old", "mine"), (".site.old", "old"), ("site", "old"), ("new", "new")):
         (tmp_path / folder).mkdir(exist_ok=True)
@@ -85,6 +84,7 @@ def test_a_folder_takes_the_place_of_a_link_again_and_again(tmp_path):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "site"]
 
 
+@posix
 def test_a_replaced_file_keeps_its_permissions(tmp_path):
     target = tmp_path / "a.npz"
     target.write_bytes(b"")
