@@ -66,6 +66,17 @@ def test_a_texture_comes_back(tmp_path, suffix, origin):
     np.testing.assert_array_equal(again.origin, base.origin)
 
 
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.6, 0, 0.8)])
+def test_up_and_origin_of_a_texture_come_back(tmp_path, suffix, up):
+    base = replace(tetrahedron(origin=(500_000, 30, 4e6)), up=np.array(up))
+    save_base(base, tmp_path / f"a{suffix}")
+    again = load_base(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(again.up, base.up, atol=1e-6)
+    np.testing.assert_array_equal(again.origin, base.origin)
+    np.testing.assert_allclose(again.vertices[again.faces], base.vertices[base.faces], atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply", ".npz", pytest.param(".usdc", marks=needs_usd)])
 def test_colours_of_vertices_come_back(tmp_path, suffix):
     base = tetrahedron(textured=False)

@@ -15,6 +15,7 @@ from meshsplats.formats.obj.mesh import (
     write_obj,
     write_rows,
 )
+from meshsplats.formats.ply.header import origin_comments
 from meshsplats.formats.ply.mesh import write_mesh_ply
 from meshsplats.formats.surfaces.corners import (
     normal_file,
@@ -83,6 +84,8 @@ def write_surface_ply(base: BaseMesh, path: Path, target: Path, image: str | Non
     faces["n"], faces["index"], faces["m"], faces["uv"] = 3, base.faces, 6, uv.reshape(-1, 6)
     header = [
         *("ply", "format binary_little_endian 1.0", f"comment TextureFile {picture.name}"),
+        f"comment meshsplats up {' '.join(repr(float(u)) for u in base.up)}",
+        *origin_comments(base.origin),
         f"element vertex {len(rows)}",
         *(f"property {wide} {name}" for name in "xyz"),
         *(f"property float n{name}" for name in "xyz"),
