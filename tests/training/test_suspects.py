@@ -76,6 +76,21 @@ def test_the_same_photograph_twice_is_named(photographs, kind):
     assert find_suspects([*photographs, moved]) == Suspects(), "a neighbour is another photograph"
 
 
+def test_clear_pixels_do_not_make_neighbours_the_same(photographs):
+    """A tenth of the image shows the subject, as in lego, where two are a third of a degree apart."""
+    alpha = np.zeros((96, 96), np.uint8)
+    alpha[33:63, 33:63] = 255
+    views = [
+        replace(view, source=ViewImage(np.minimum(view.load().color, alpha[..., None]), alpha))
+        for view in photographs
+    ]
+    color = views[4].load().color
+    copy = replace(views[4], camera=replace(views[4].camera, name="copy"))
+    assert find_suspects([*views, copy]) == Suspects(doubles=(("004", "copy"),))
+    neighbour = with_color(copy, np.where(alpha[..., None] > 0, color + 7, color).astype(np.uint8))
+    assert find_suspects([*views, neighbour]) == Suspects()
+
+
 def test_few_photographs_do_not_tell_what_is_usual(photographs):
     blurred = with_color(photographs[0], smeared(photographs[0].load().color, 7, 0, 1))
     views = [blurred, *photographs[1:4]]
