@@ -54,6 +54,18 @@ def test_a_data_set_and_its_copy_have_the_same_images(copied):
     same_views(copied(dataset), dataset)
 
 
+def test_images_in_memory_are_not_sent_along():
+    dataset = splat_dataset(splats(0, 20), width=16, height=12, train=2, test=1)
+    size = len(pickle.dumps(dataset))
+    source = dataset.train[0].source
+    image = source.load()
+    assert len(pickle.dumps(dataset)) == size
+    again = by_pickle(source)
+    assert again.store.find(again) is None
+    again.store.keep(again, image)  # its room is the same
+    assert again.store.find(again) is image
+
+
 @pytest.mark.parametrize("copied", [by_pickle, copy.deepcopy])
 def test_an_interruption_keeps_its_step(copied):
     made = copied(Interrupted(7, 2))

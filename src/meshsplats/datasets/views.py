@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -267,11 +267,10 @@ class ImageCache:
         self._kept: dict[object, ViewImage] = {}
         self._lock = threading.Lock()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_lock"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _lock=threading.Lock())
+    def __reduce__(self) -> tuple[type[ImageCache], tuple[int]]:
+        # A copy, or that of another process, begins empty: images may be gigabytes, and are read again.
+        with self._lock:
+            return ImageCache, (self._left + sum(image.nbytes for image in self._kept.values()),)
 
     def find(self, key: object) -> ViewImage | None:
         return self._kept.get(key)
