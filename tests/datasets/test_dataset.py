@@ -126,6 +126,16 @@ def test_broken_exif_is_no_matter(tmp_path):
     assert [view.turn for view in load_dataset(folder).views] == [0, 0]
 
 
+def test_photographs_that_cannot_be_read_need_not_be_where_smaller_copies_are(tmp_path):
+    """Too large, or broken: such a one only does not tell which way it was held."""
+    folder = simple_colmap(tmp_path, 2)
+    for path in sorted((folder / "images").iterdir()):
+        save(folder / "images_2" / path.name, np.full((4, 6, 3), 255, np.uint8))
+        path.write_bytes(b"none")
+    views = load_dataset(folder, downscale=2, test_every=0).train
+    assert [(view.turn, view.image.shape) for view in views] == [(0, (4, 6, 3))] * 2
+
+
 def test_masks_of_a_subject_cut_it_out(tmp_path):
     folder = simple_colmap(tmp_path, 3)
     rng = np.random.default_rng(0)

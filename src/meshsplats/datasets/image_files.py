@@ -18,7 +18,7 @@ from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.lens import Lens, Pinhole, pinholes
 from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.views import ImageCache
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import Header, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
@@ -212,8 +212,7 @@ class Album:
             width, height = header.width, header.height
             if small is None:
                 width, height = (max(1, round(side / self.downscale)) for side in (width, height))
-            # Smaller copies may lack EXIF data.
-            turn = header.turn if full in (None, path) else read_header(full).turn
+            turn = header.turn if full in (None, path) else _turn(full)
             mask = self._mask(frame, full, label, masks)
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
@@ -371,6 +370,15 @@ def _camera(frame: Frame, pinhole: Pinhole, where: str) -> Camera:
         return Camera(matrix, **lens, near=frame.near, name=frame.name + pinhole.suffix)
     except ValueError as error:
         raise FileFormatError(f"{where}: {error}") from None
+
+
+def _turn(photograph: Path) -> int:
+    """``Header.turn`` of a photograph whose smaller copy is used, which may lack EXIF data; 0 for one that
+    cannot be read, as it need not be."""
+    try:
+        return read_header(photograph).turn
+    except (FileFormatError, MissingDependencyError):
+        return 0
 
 
 def _check_shape(lens: Lens, header: Header, path: Path) -> None:
