@@ -243,7 +243,7 @@ def write_jpeg(path, side, focal=None, focal_of_film=None):
     exif = Image.Exif()
     exif[0x0110] = "Phone"
     values = {0x920A: focal, 0xA405: focal_of_film}
-    exif.get_ifd(0x8769).update({tag: value for tag, value in values.items() if value is not None})
+    exif[0x8769] = {tag: value for tag, value in values.items() if value is not None}
     Image.new("RGB", (side, 40)).save(path, exif=exif)
 
 
@@ -267,7 +267,7 @@ def test_photographs_of_one_size_and_focal_length_share_a_lens(scene):
 def test_exif_data_that_are_none_do_not_matter(tmp_path):
     Image.new("RGB", (60, 40)).save(tmp_path / "a.jpg", exif=b"Exif\0\0" + bytes(range(200)))
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0x920A] = TiffImagePlugin.IFDRational(1, 0)
+    exif[0x8769] = {0x920A: TiffImagePlugin.IFDRational(1, 0)}
     Image.new("RGB", (60, 40)).save(tmp_path / "b.jpg", exif=exif)
     for name in ("a.jpg", "b.jpg"):
         assert read_shot(tmp_path / name) == Shot((60, 40), "JPEG")
