@@ -74,8 +74,12 @@ def test_masked_pixels_do_not_count():
     scores = evaluate(perfect, Dataset((), (target,))).method("mesh").views[0]
     assert scores.psnr > 100
     assert scores.ssim == pytest.approx(1, abs=1e-6)
-    with pytest.raises(ValueError, match=r"a/one\.png.*no pixel"):
-        evaluate(perfect, Dataset((), (View(CAMERA, ViewImage(wrong, None, ~mask & mask)),)))
+    nothing = View(CAMERA, ViewImage(wrong, None, ~mask & mask))
+    with pytest.warns(DataWarning, match="1 of 2 held-out photographs are not scored"):
+        both = evaluate(perfect, Dataset((), (nothing, target)))
+    assert both.method("mesh").views == (scores,)
+    with pytest.warns(DataWarning), pytest.raises(ValueError, match=r"a/one\.png.*no pixel"):
+        evaluate(perfect, Dataset((target,), (nothing,)))
 
 
 def test_masked_ssim_is_that_of_the_cropped_image():

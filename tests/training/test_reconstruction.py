@@ -412,7 +412,9 @@ def test_cameras_of_others_are_never_replaced(scene):
     content = '{"frames": [{"file_path": "p0.png"}]}'
     (folder / "transforms.json").write_text(content)
     options = PhotographOptions(estimate_cameras=True)
-    with pytest.raises(OptionsError, match=r"transforms\.json has cameras of another program; move it away"):
+    with pytest.raises(
+        OptionsError, match=r"transforms\.json has cameras that were not found here; move it away"
+    ):
         options.with_cameras(folder, print)
     assert not colmap.calls
     assert (folder / "transforms.json").read_text() == content

@@ -447,8 +447,9 @@ def test_what_the_gpu_cannot_hold_is_an_error_before_anything_is_written(scene, 
         for resume in (False, True):
             with monkeypatch.context() as patch:
                 patch.setattr(where, name, value)
+                again = replace(run, resume=resume, replace_old=not resume)
                 with pytest.raises(error, match=message):
-                    finetune(mesh, dataset, make_config(steps=1), run=replace(run, resume=resume))
+                    finetune(mesh, dataset, make_config(steps=1), run=again)
             assert {path: path.read_bytes() for path in sorted(run.folder.iterdir())} == before
 
 

@@ -173,9 +173,10 @@ def evaluate(
 ) -> Report:
     """Scores meshes, splats and images on the held-out views of ``dataset``, or on all views if it has none.
 
-    Images are clipped to [0, 1], and masked pixels do not count. Ground truth with alpha is composited over
-    ``View.background``, and everything is rendered over it. For photographs without alpha it has to be the
-    background that the splats were trained with (``find_background``, ``Dataset.over``).
+    Images are clipped to [0, 1], and masked pixels do not count; held-out views without others are left out
+    (``Dataset.scorable``). Ground truth with alpha is composited over ``View.background``, and everything is
+    rendered over it. For photographs without alpha it has to be the background that the splats were trained
+    with (``find_background``, ``Dataset.over``).
 
     Args:
         mesh: method ``'mesh'``, or several meshes by the names of their methods; None: only the others.
@@ -196,7 +197,7 @@ def evaluate(
         The scores of all methods on all views.
 
     Raises:
-        ValueError: nothing to score, no view, a view whose mask excludes all pixels, a mesh with the name of
+        ValueError: nothing to score, no view, views whose masks exclude all pixels, a mesh with the name of
             another method, records of different origins.
     """
     if not (isinstance(mesh, Mapping) and all(isinstance(one, SplatMesh) for one in mesh.values())):
@@ -206,7 +207,7 @@ def evaluate(
     need(GaussianCloud, splats=splats, optional=True)
     meshes = {} if mesh is None else {"mesh": mesh} if isinstance(mesh, SplatMesh) else dict(mesh)
     need_one_origin({"dataset": dataset, **meshes, "before": before, "splats": splats})
-    views = dataset.test or dataset.views
+    views = dataset.scorable().test or dataset.test or dataset.views
     if samples is None:
         cameras = [view.camera for view in views]
         every_mesh = [*meshes.values(), *([] if before is None else [before])]

@@ -73,8 +73,8 @@ class PhotographOptions:
         there = ensure_cameras(folder, replacing=replacing, say=say, threads=threads)
         if there is not None and self.estimate_cameras:
             raise OptionsError(
-                f"``estimate_cameras`` has no effect: {there} has cameras of another program; move it away to"
-                " have others found"
+                f"``estimate_cameras`` has no effect: {there} has cameras that were not found here; move it"
+                " away to have others found"
             )
         return folder
 
