@@ -176,6 +176,7 @@ def test_cameras_and_info_say_how_it_stands():
     assert unusual_up(upright(chair())) is None
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("up", range(1, len(UPS)))
 def test_what_shows_its_coarse_side_was_photographed_another_way_up(up):
     """A cube stands on any side; the one that lay on the ground is coarse."""
