@@ -64,19 +64,20 @@ def check_folder(folder: Path, *, resume: bool = False, replace_old: bool = Fals
         OSError: it cannot be written.
     """
     unfinished = partial_folder(folder)
-    _check_older(folder)
+    _older_levels(folder)
     check_resumption(folder, unfinished, CONFIGURATION, resume=resume, replace_old=replace_old)
     check_outputs([folder], replace_old or resume)
 
 
-def _check_older(folder: Path) -> None:
-    """FileExistsError if ``folder`` exists and is no chain."""
+def _older_levels(folder: Path) -> list[dict[str, Any]]:
+    """The rows of the chain in ``folder``, none if it does not exist. FileExistsError if it is no chain."""
     if not folder.exists():
-        return
+        return []
     if not (folder / TABLE).is_file():
         raise FileExistsError(f"{folder} is there and holds no {TABLE}: give another folder")
     try:
-        load_table(folder / TABLE)
+        rows: list[dict[str, Any]] = load_table(folder / TABLE)["levels"]
+        return rows
     except FileFormatError as error:
         raise FileExistsError(f"{error}: give another folder") from None
 
@@ -118,7 +119,7 @@ def make_chain(
     is no chain, and what ``plan_levels`` raises.
     """
     folder = as_path("folder", folder)
-    _check_older(folder)
+    _older_levels(folder)  # an error before the work
     chosen, unfinished = options or ChainOptions(), partial_folder(folder)
     chain = planned(chosen, len(cloud))
     unfinished.mkdir(exist_ok=True)
@@ -145,9 +146,7 @@ def make_chain(
     for record in records:
         record.unlink()
     write_json(unfinished / TABLE, table)
-    _check_older(folder)
-    older = load_table(folder / TABLE)["levels"] if folder.exists() else []
-    own = {TABLE, CONFIGURATION, *(row["file"] for row in older)}
+    own = {TABLE, CONFIGURATION, *(row["file"] for row in _older_levels(folder))}
     replace_folder(unfinished, folder, own.__contains__)
     return table
 

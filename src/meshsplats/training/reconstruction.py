@@ -28,8 +28,8 @@ from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyErr
 from meshsplats.formats.outputs import PREVIEW
 from meshsplats.images.reading import Shot
 from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
-from meshsplats.training.photo_files import by_lens, for_pycolmap, read_shots
 from meshsplats.training.poses import find_poses
+from meshsplats.training.pycolmap_input import by_lens, for_pycolmap, read_shots
 from meshsplats.training.suspects import shortened
 
 CAMERAS, POINTS = "transforms.json", "sparse_points.ply"

@@ -86,9 +86,8 @@ def train(
             ``interrupted.npz``.
 
     Warns with a DataWarning of points if no photograph shows most of them, and of photographs that do not fit
-    the others: before the first step of those that
-    have clear pixels though no subject is cut out, which do not count then, and of those that are blurred or
-    double; at the end of those that the mesh cannot show.
+    the others: before the first step of those that have clear pixels though no subject is cut out, which do
+    not count then, and of those that are blurred or double; at the end of those that the mesh cannot show.
     """
     need(Dataset, dataset=dataset)
     need(TrainConfig, config=config, optional=True)

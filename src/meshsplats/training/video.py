@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import tempfile
 import time
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._files.atomic import write_text
+from meshsplats._files.atomic import write_json
 from meshsplats._foreign import VIDEO_SUFFIXES
 from meshsplats._json import read_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
@@ -146,7 +145,7 @@ def save_frames(
                 save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", turned / np.float32(255))
             if index == chosen[-1]:
                 break
-        write_text(made / RECORD, json.dumps(record) + "\n")
+        write_json(made / RECORD, record)
         made.rename(folder)
     return len(chosen)
 

@@ -12,7 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, Bounds, scene_bounds
 from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.viewpoints.kind import FINE, fineness_outside, glance, subsample_of
+from meshsplats.viewpoints.kind import FINE, glance, subsample_of
 from meshsplats.viewpoints.sample import AllSplats, fibonacci
 from meshsplats.viewpoints.thinning import without_harmonics
 
@@ -134,14 +134,11 @@ def find_stance(cloud: GaussianCloud, threads: int | None = None) -> tuple[np.nd
 
 
 def finer_stance(cloud: GaussianCloud, threads: int | None = None) -> np.ndarray | None:
-    """(3,) that of ``UPS`` with which a scene is an object that is none the usual way up: upside down or
-    lying, it shows the coarse side that nobody photographed. None where there is none."""
+    """(3,) that of ``UPS`` with which a scene may be an object that is none the usual way up, by a glance:
+    upside down or lying, it shows the coarse side that nobody photographed. None where there is none."""
     usual, *others = (glance(cloud, np.array(up), threads) for up in UPS)
     best = int(np.argmax(others))
-    if others[best] < max(usual + CLEARLY, FINE - NEARLY):
-        return None
-    up = np.array(UPS[1 + best])
-    return up if fineness_outside(cloud, up, threads) >= FINE else None
+    return np.array(UPS[1 + best]) if others[best] >= max(usual + CLEARLY, FINE - NEARLY) else None
 
 
 def _told_by(bounds: Bounds) -> bool:
