@@ -130,6 +130,7 @@ def test_fidelity_is_that_of_the_look_that_was_chosen(splats, tmp_path, capsys, 
     assert f"{wanted:.2f} dB" in printed
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     ("name", "options"),
     [

@@ -80,6 +80,7 @@ def test_many_splats_are_merged_in_blocks(room, monkeypatch):
     np.testing.assert_array_equal(alone.means, merging.simplify(room, 800).means)
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "limits",

@@ -107,6 +107,7 @@ def some_views(far: float = 4.0):
     return [front, replace(side, fx=side.fx * 0.8)]
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize(
     ("suffix", "collision", "origin"),
     [

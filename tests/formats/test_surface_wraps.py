@@ -40,6 +40,7 @@ def test_the_factor_is_in_the_pixels(tmp_path, suffix):
     np.testing.assert_allclose(shown, base.colors_at(face, weights), atol=0.006)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("suffix", [".glb", ".usda"])
 @pytest.mark.parametrize("wrap", [("repeat", "mirror"), ("clamp", "repeat"), ("clamp", "clamp")])
 def test_the_wrap_comes_back(tmp_path, suffix, wrap):

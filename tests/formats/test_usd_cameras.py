@@ -105,6 +105,7 @@ def test_a_mesh_without_cameras_takes_no_second_process(tmp_path, monkeypatch):
         cameras_in_usd(tmp_path / "b.usdc")
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("changes", [{"high": 0}, {"focal": "nan"}])
 def test_a_broken_lens_is_refused(tmp_path, changes):
     path = write(tmp_path / "a.usda", **changes)

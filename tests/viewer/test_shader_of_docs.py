@@ -58,6 +58,7 @@ def test_images_are_those_of_render(drawing, mesh, degree):
     assert without < 40
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("degree", [0, 1])
 def test_the_model_before_has_a_shader_of_its_own(drawing, mesh, degree):
     camera = ms.orbit(mesh, 1, azimuth=30, elevation=20, width=80, height=60)[0]

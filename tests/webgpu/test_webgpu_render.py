@@ -95,6 +95,7 @@ def test_triangles_that_pierce_each_other_with_all_outputs(seed):
     assert_same_image(*both(soup(seed, view=view), view, **EXTRAS))
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("near", [0.5, 0.05, 1e-4])
 def test_triangles_across_and_behind_the_near_plane(near):
     mesh = soup(4, spread=(2, 2, 3), z=0.5)

@@ -28,6 +28,7 @@ def with_harmonics(mesh: SplatMesh, terms: int, strength: float = 0.4) -> SplatM
     return replace(mesh, harmonics=random.normal(0, strength, (len(mesh.splats), terms, 3)))
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("order", ["fragment", "splat"])
 @pytest.mark.parametrize("terms", [3, 8, 15])
 def test_equal_to_the_core(terms, order):
