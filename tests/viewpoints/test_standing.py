@@ -28,6 +28,7 @@ from meshsplats.viewpoints.standing import (
     thinned,
     tips_over,
 )
+from meshsplats.viewpoints.views import Chooser
 
 USUAL = [0, -1, 0]
 
@@ -191,6 +192,24 @@ def test_what_shows_its_coarse_side_was_photographed_another_way_up(up):
     assert told is not None
     assert (told.up.tolist(), told.reason) == (list(UPS[up]), BY_COARSENESS)
     assert find_cameras(box, 3, up=USUAL).kind == "ring"
+
+
+def test_a_ring_opens_with_its_whole_subject(monkeypatch):
+    """The box above in the usual way up: its middle is in that of the image, from further back."""
+    box = boxes(((0, 0, 0), (0.4, 0.4, 0.4)))
+    coarse = box.means[:, 0] > 0.36
+    box = replace(box, scales=box.scales * np.where(coarse, 5, 1)[:, None].astype(np.float32))
+    found = find_cameras(box, 3, up=USUAL)
+    monkeypatch.setattr(Chooser, "of_subject", lambda chooser, view, lens, limit: view)
+    as_photographed = find_cameras(replace(box), 3, up=USUAL)
+    assert found.kind == as_photographed.kind == "ring"
+    for camera, other in zip(found.cameras[1:], as_photographed.cameras[1:], strict=True):
+        np.testing.assert_array_equal(camera.world_to_camera, other.world_to_camera)
+    opening, near = found.cameras[0], as_photographed.cameras[0]
+    (middle,), _ = opening.project(np.zeros((1, 3)))
+    assert np.abs(middle - 200).max() < 20
+    assert np.linalg.norm(opening.center) > 1.1 * np.linalg.norm(near.center)
+    assert opening.fx == near.fx
 
 
 class Telling(SceneReading):

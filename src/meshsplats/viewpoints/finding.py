@@ -196,7 +196,7 @@ def find_cameras(
                 raise ValueError("the splats are so faint or small that nothing can be seen from within")
             return _around(cloud, outside._replace(confidence=0.0), count, width, height)
         scene = _within(sample, places, kind, confidence, given)
-        views = choose_views(sample, places, scene.up, wanted)
+        views = choose_views(sample, places, scene.up, wanted, around=scene.kind == "ring")
         found = _searched[cloud] = _Search(key, wanted, kind != "object", scene, views)
     shown = [view.with_lens(lens, width, height) for view, lens in found.views[:count]]
     extent = float(np.median([_depth(camera) for camera in shown]))

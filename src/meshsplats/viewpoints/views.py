@@ -53,6 +53,15 @@ PATIENCE = 40
 """So many views in a row that are no good pictures, and no more are looked for."""
 NEAR_SHARE = 0.02
 """Near plane as a share of the mean depth of the view."""
+STEPS_BACK = (1.3, 1.15, 1.0)
+"""Distances to a subject from which a scene may open, as multiples of that of the view that is turned to it:
+the whole subject is to be in the image, where photographs may show a part."""
+TURNED = 0.8
+"""Least cosine between that view and the direction to the subject."""
+POOR_BESIDE = 0.35
+"""Greatest share of poor pixels in an opening view of a subject, beside which they lie."""
+CROSSINGS = 8
+"""Rounds in which the point is found that most lines of sight pass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +145,7 @@ class Chooser:
         total = self.shown @ np.round(LEVELS * self.weight).astype(np.float32)
         self.rich = total >= RICH * np.quantile(total, 0.9)
         self._checked: dict[int, Checked] = {}
+        self.pool = self.in_order(None, POOL, np.inf)
 
     def _shown(self) -> np.ndarray:
         """(candidates, TARGETS) float32 whole numbers up to STEPS: how well each shows each splat."""
@@ -204,9 +214,8 @@ class Chooser:
 
     def fog_limit(self) -> float:
         """The most fog of a good picture: as much as usual for the scene's better views."""
-        pool = self.in_order(None, POOL, np.inf)
         fog = []
-        for k in pool:
+        for k in self.pool:
             found = self.checked(k)
             judged = np.tan(np.radians(WIDEST / 2)) / found.focal >= np.tan(np.radians(WIDE / 2)) * 0.98
             fog.append(found.fog[judged][-1])
@@ -225,9 +234,41 @@ class Chooser:
                 return int(k)
         return None
 
+    def subject(self) -> np.ndarray:
+        """(3,) the point that the views of ``pool`` look at: that of the least sum of distances to lines."""
+        views = [self.checked(k).camera for k in self.pool]
+        start = np.array([view.center for view in views])
+        gaze = np.array([view.world_to_camera[2, :3] for view in views])
+        across = np.eye(3) - gaze[:, :, None] * gaze[:, None, :]
+        weight = np.ones(len(views))
+        for _ in range(CROSSINGS):
+            total = np.einsum("n,nij->ij", weight, across) + 1e-9 * weight.sum() * np.eye(3)
+            point = np.linalg.solve(total, np.einsum("n,nij,nj->i", weight, across, start))
+            missed = np.linalg.norm(np.einsum("nij,nj->ni", across, point - start), axis=1)
+            weight = 1 / (missed + 0.05 * np.median(np.linalg.norm(point - start, axis=1)))
+        return point
 
-def choose_views(sample: Sample, places: Places, up: np.ndarray, count: int) -> list[tuple[Checked, int]]:
-    """Up to ``count`` views, the opening one first, each with the number of its lens."""
+    def of_subject(self, view: Checked, lens: int, limit: float) -> Checked:
+        """``view``, turned to the subject and from further back, if that is as good a picture with ``lens``:
+        but for its edges, where photographs show less."""
+        place, gaze = view.camera.center, view.camera.world_to_camera[2, :3]
+        away = self.subject() - place
+        distance = float(np.linalg.norm(away))
+        if away @ gaze < TURNED * distance:
+            return view
+        for back in STEPS_BACK:
+            stand = place + (1 - back) * away
+            seen = check(self.sample, stand, away / distance, back * distance, self.up, self.places.natural)
+            if seen.widest(limit) is not None and seen.poor[lens] <= POOR_BESIDE:
+                return seen
+        return view
+
+
+def choose_views(
+    sample: Sample, places: Places, up: np.ndarray, count: int, *, around: bool = False
+) -> list[tuple[Checked, int]]:
+    """Up to ``count`` views, the opening one first, each with the number of its lens. ``around``: they stand
+    around a subject, which the first of them shows as a whole."""
     chooser = Chooser(sample, places, up)
     limit = chooser.fog_limit()
     chosen = [chooser.checked(k) for k in chooser.in_order(chooser.opening(limit), count, limit)]
@@ -235,4 +276,7 @@ def choose_views(sample: Sample, places: Places, up: np.ndarray, count: int) -> 
         best = [chooser.checked(k) for k in chooser.in_order(None, min(count, POOL), np.inf)]
         return [(view, len(view.focal) - 1) for view in best]
     lenses = [view.widest(limit) for view in chosen]
-    return [(view, lens) for view, lens in zip(chosen, lenses, strict=True) if lens is not None]
+    views = [(view, lens) for view, lens in zip(chosen, lenses, strict=True) if lens is not None]
+    if around:
+        views[0] = chooser.of_subject(*views[0], limit), views[0][1]
+    return views
