@@ -127,7 +127,13 @@ class SetUpStage(Modal, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
     lights: EnumProperty(name="Light", items=LIGHTS, default="sun")
-    camera: BoolProperty(name="Camera", description="Add a camera that sees all of them", default=True)
+    camera: BoolProperty(
+        name="New Camera",
+        description="Make the active camera one that sees all of them. Where it is not chosen, a camera of"
+        " your own stays",
+        default=True,
+        options={"SKIP_SAVE"},
+    )
     make_lit: BoolProperty(
         name="Make Lit",
         description="Give unlit splat meshes the lit material, which light acts on",
@@ -169,7 +175,8 @@ class SetUpStage(Modal, bpy.types.Operator):
         setting.hide_start_scene(context.scene)
         with waiting(context):
             every = objects.subjects(context.scene)
-            setting.set_up(context.scene, every, self.lights, camera=self.camera, fast=self.fast)
+            camera = self.camera if self.properties.is_property_set("camera") else None
+            setting.set_up(context.scene, every, self.lights, camera=camera, fast=self.fast)
         if "EEVEE" in context.scene.render.engine:  # Material Preview shows no lamps of the scene
             setting.show_colors(context.window_manager.windows, "RENDERED")
 

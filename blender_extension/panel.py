@@ -87,11 +87,14 @@ class MeshSplatsPanel(bpy.types.Panel):
         layout.separator()
         layout.label(text="Light, ground and camera")
         layout.prop(context.scene, "meshsplats_fast")
+        layout.prop(context.scene, "meshsplats_new_camera")
         row = layout.row(align=True)
         fast = context.scene.meshsplats_fast
         for lights in ("sun", "noon", "overcast", "studio"):
             button = row.operator(SetUpStage.bl_idname, text=lights.capitalize())
             button.lights, button.fast = lights, fast
+            if context.scene.meshsplats_new_camera:
+                button.camera = True
         row = layout.row(align=True)
         button = row.operator(BakeLight.bl_idname, text="Bake Light")
         button.live, button.fast = False, fast

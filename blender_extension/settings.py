@@ -138,6 +138,11 @@ def register():
         description="Prepare light for a preview: rougher, in less time",
         default=False,
     )
+    bpy.types.Scene.meshsplats_new_camera = BoolProperty(
+        name="New Camera",
+        description="Sun to Studio make a camera that sees the splats, also where there is one of your own",
+        default=False,
+    )
     bpy.utils.register_class(MeshSplatsSource)
     bpy.types.Object.meshsplats = PointerProperty(type=MeshSplatsSource)
 
@@ -145,4 +150,5 @@ def register():
 def unregister():
     del bpy.types.Object.meshsplats
     bpy.utils.unregister_class(MeshSplatsSource)
+    del bpy.types.Scene.meshsplats_new_camera
     del bpy.types.Scene.meshsplats_fast

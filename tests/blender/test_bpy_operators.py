@@ -26,6 +26,7 @@ from meshsplats.blender.inside import (
     materials,
     meshes,
     objects,
+    setting,
     sorted_copies,
     stand_ins,
     views,
@@ -397,6 +398,14 @@ def test_each_light_has_a_tooltip_of_its_own(extension):
     ]
     assert len(set(texts)) == 4
     assert texts[3].startswith("A large lamp on the left, a weaker one on the right. Set up light")
+
+
+def test_a_new_camera_is_made_only_where_it_is_chosen(ball, monkeypatch):
+    asked = []
+    monkeypatch.setattr(setting, "set_up", lambda *_, camera, fast: asked.append(camera))
+    for chosen in ({}, {"camera": True}, {"camera": False}, {}):
+        bpy.ops.scene.meshsplats_stage(make_lit=False, **chosen)
+    assert asked == [None, True, False, None]
 
 
 def test_name_and_format_of_an_export_follow_each_other(extension):

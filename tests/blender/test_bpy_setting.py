@@ -17,7 +17,7 @@ from mathutils import Matrix, Vector
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import objects, rendering, setting, versions, views, written
+from meshsplats.blender.inside import notes, objects, rendering, setting, versions, views, written
 from meshsplats.blender.options import LIGHTS
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.images.reading import load_image
@@ -86,6 +86,46 @@ def test_one_click_sets_everything_up(empty, lights):
     assert np.ptp(seen[:, 1]) > 0.6, "it fills the image"
     assert empty.cycles.use_denoising
     assert empty.view_settings.exposure == pytest.approx(LIGHTS[lights].exposure)
+
+
+def test_the_camera_of_a_shot_stays_the_active_one(tmp_path):
+    """Unless another one is asked for, which sees the splats at the pixel aspect of the file."""
+    bpy.ops.wm.read_factory_settings()
+    scene, obj = bpy.context.scene, ball()
+    camera, render = scene.camera, scene.render
+    camera.keyframe_insert("location", frame=1)
+    render.pixel_aspect_x = 2
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    notes.take()
+    setting.set_up(scene, [obj], fast=True)
+    assert scene.camera == camera
+    assert [o.name for o in scene.objects if o.type == "CAMERA"] == ["Camera"]
+    assert "Camera stays the active camera: New Camera in the panel makes another" in notes.take()
+    setting.set_up(scene, [obj], camera=True, fast=True)
+    assert "the active camera is Camera.001, in place of Camera" in notes.take()
+    assert (render.resolution_x, render.resolution_y) == (1920, 1080)
+    assert (render.pixel_aspect_x, render.pixel_aspect_y) == (2, 1)
+    bpy.context.view_layer.update()
+    places = [obj.matrix_world @ vertex.co for vertex in list(obj.data.vertices)[::20]]
+    across, up, _ = np.array([world_to_camera_view(scene, scene.camera, place) for place in places]).T
+    assert 0 < up.min() < up.max() < 1
+    assert np.ptp(up) > 0.6
+    assert np.ptp(across) / np.ptp(up) == pytest.approx(9 / 32, rel=0.1), "as wide as high where it is shown"
+
+
+@pytest.mark.parametrize("change", ["nothing", "save", "save moved", "prop", "keys"])
+def test_whose_camera_it_is(tmp_path, change):
+    bpy.ops.wm.read_factory_settings()
+    scene = bpy.context.scene
+    if change == "prop":
+        bpy.ops.mesh.primitive_cone_add()
+    elif change == "keys":
+        scene.camera.keyframe_insert("location", frame=1)
+    elif change == "save moved":
+        scene.camera.location.x += 1
+    if change.startswith("save"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    assert setting.has_own_camera(scene) == (change in ("save moved", "prop", "keys"))
 
 
 def test_without_splats_it_says_so(empty):

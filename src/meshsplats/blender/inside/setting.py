@@ -39,11 +39,12 @@ _ROOM = 1.1
 
 
 def set_up(
-    view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True, fast: bool = False
+    view: Any, objs: list[Any], lights: str = "sun", *, camera: bool | None = None, fast: bool = False
 ) -> LightOptions:
     """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
-    camera that sees all of them at the scene's resolution, or a place from within. Replaces those of an
-    earlier call, but for a camera that was moved or animated since. ``fast``: light for a preview.
+    camera that sees all of them at the scene's resolution, or a place from within; None: unless
+    ``has_own_camera``. Replaces those of an earlier call, but for a camera that was moved or animated since.
+    Notes name the camera that is kept or replaced. ``fast``: light for a preview.
 
     Returns:
         The light.
@@ -61,21 +62,13 @@ def set_up(
         places, normals, size = baking.places_of(obj)
         low = ground_height(low, places[:, 2], normals[:, 2], size)
     stage.clear(view)
-    viewer = None
-    if camera and view.camera is not None and stage.MADE in view.camera:
-        viewer = np.array(view.camera.matrix_world.translation)
-    elif camera:
-        width, height = view.render.resolution_x, view.render.resolution_y
-        within = views.opening(objs)
-        if within is None:
-            seen = orbit(points, 1, elevation=15, azimuth=20, up=UP, width=width, height=height)[0]
-        else:
-            seen = within.camera(width, height)
-        home = stage.collection("Cameras")
-        away = float(np.linalg.norm(seen.center - bounds.center))
-        view.camera = stage.add_camera(seen, "Camera", np.eye(3), 2 * away + 1000 * bounds.radius, home)
-        view.render.pixel_aspect_x = view.render.pixel_aspect_y = 1
-        viewer = seen.center
+    if camera is None:
+        camera = not has_own_camera(view)
+        if not camera and stage.MADE not in view.camera:  # or it is named already
+            notes.add(f"{view.camera.name} stays the active camera: New Camera in the panel makes another")
+    if camera:
+        _add_camera(view, objs, points)
+    viewer = None if view.camera is None else np.array(view.camera.matrix_world.translation)
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
     objects.render_settings(view, objs, True, light)
@@ -83,6 +76,36 @@ def set_up(
         rendering.preview_settings(view)
     baking.bake(view, objs, samples=(FAST if fast else CAREFUL).samples)
     return light
+
+
+def _add_camera(view: Any, objs: list[Any], points: np.ndarray) -> None:
+    """Makes a camera that sees ``objs``, or a place from within, the active one of the scene ``view``."""
+    before, bounds = view.camera, scene_bounds(points)
+    # Of square pixels: what images show at the scene's pixel aspect.
+    width, height = (round(side) for side in _shown_size(view))
+    within = views.opening(objs)
+    if within is None:
+        seen = orbit(points, 1, elevation=15, azimuth=20, up=UP, width=width, height=height)[0]
+    else:
+        seen = within.camera(width, height)
+    reach = 2 * float(np.linalg.norm(seen.center - bounds.center)) + 1000 * bounds.radius
+    view.camera = stage.add_camera(seen, "Camera", np.eye(3), reach, stage.collection("Cameras"))
+    if before is not None:
+        notes.add(f"the active camera is {view.camera.name}, in place of {before.name}")
+
+
+def has_own_camera(scene: Any) -> bool:
+    """Whether the active camera is the artist's: it is animated, or one of ours that was changed; images show
+    other objects than splats, what was made for them and the cube that Blender starts with; or, in a saved
+    file, it is not where Blender starts with it."""
+    camera = scene.camera
+    if camera is None:
+        return False
+    if stage.MADE in camera:
+        return stage.is_artists(camera)
+    if stage.is_animated(camera) or any(_is_others(obj) and not _is_start(obj) for obj in scene.objects):
+        return True
+    return bool(bpy.data.filepath) and not _stands_at_start(camera)
 
 
 def set_up_render(scene: Any, objs: list[Any], lit: bool, *, chosen: bool = False) -> None:
@@ -99,14 +122,25 @@ def set_up_render(scene: Any, objs: list[Any], lit: bool, *, chosen: bool = Fals
 
 def _has_others(scene: Any) -> bool:
     """Whether the file was saved, and images show other objects than splats and what was made for them."""
-    return bool(bpy.data.filepath) and any(
+    return bool(bpy.data.filepath) and any(_is_others(obj) for obj in scene.objects)
+
+
+def _is_others(obj: Any) -> bool:
+    """Whether images show ``obj``, and it is neither splats nor made for them."""
+    return (
         obj.type in _RENDERED
         and not obj.hide_render
         and objects.is_lit(obj) is None
         and stage.MADE not in obj
         and not exporting.is_helper(obj)
-        for obj in scene.objects
     )
+
+
+def _is_start(obj: Any) -> bool:
+    """Whether ``obj`` is the cube or the lamp that Blender starts with."""
+    if obj.type == "MESH":
+        return obj.name == "Cube" and len(obj.data.vertices) == 8 and not obj.location.length
+    return obj.type == "LIGHT" and obj.name == "Light" and obj.data.energy == 1000
 
 
 def hide_start_scene(scene: Any) -> list[str]:
@@ -115,15 +149,11 @@ def hide_start_scene(scene: Any) -> list[str]:
     if bpy.data.filepath:
         return []
     hidden = []
-    for name, kind in (("Cube", "MESH"), ("Light", "LIGHT")):
-        obj = scene.objects.get(name)
-        if obj is None or obj.type != kind or obj.hide_render:
-            continue
-        cube = kind == "MESH" and len(obj.data.vertices) == 8 and not obj.location.length
-        if cube or (kind == "LIGHT" and obj.data.energy == 1000):
+    for obj in scene.objects:
+        if _is_start(obj) and not obj.hide_render:
             obj.hide_render = True
             obj.hide_set(True)
-            hidden.append(name)
+            hidden.append(obj.name)
     return hidden
 
 
@@ -185,15 +215,22 @@ def look_from(view: views.View, windows: Any, scene: Any) -> None:
 def _start_camera(scene: Any) -> Any:
     """The camera that Blender starts with, where it starts, in a file that was not saved yet; else None."""
     camera = scene.camera
-    if bpy.data.filepath or camera is None or camera.name != "Camera":
-        return None
-    return camera if np.allclose(camera.location, _START_CAMERA, atol=1e-3) else None
+    return None if bpy.data.filepath or camera is None or not _stands_at_start(camera) else camera
+
+
+def _stands_at_start(camera: Any) -> bool:
+    return camera.name == "Camera" and np.allclose(camera.location, _START_CAMERA, atol=1e-3)
+
+
+def _shown_size(scene: Any) -> tuple[float, float]:
+    """Width and height of images as they are shown, in pixels of the scene's but square."""
+    render = scene.render
+    return render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
 
 
 def _narrowest_angle(scene: Any, lens: Any) -> float:
     """The angle, in radians, that the camera ``lens`` sees along the shorter side of images."""
-    render = scene.render
-    sides = sorted((render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y))
+    sides = sorted(_shown_size(scene))
     return 2 * float(np.arctan(np.tan(lens.angle / 2) * sides[0] / sides[1]))
 
 

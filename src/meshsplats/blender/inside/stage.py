@@ -76,8 +76,13 @@ def is_artists(obj: Any) -> bool:
     return obj.type == "CAMERA" and MADE in obj and _was_moved(obj)
 
 
+def is_animated(camera: Any) -> bool:
+    """Whether the object ``camera`` or its lens has keys, drivers or constraints."""
+    return any(part.animation_data is not None for part in (camera, camera.data)) or bool(camera.constraints)
+
+
 def _was_moved(camera: Any) -> bool:
-    if any(part.animation_data is not None for part in (camera, camera.data)) or camera.constraints:
+    if is_animated(camera):
         return True
     pose = [value for row in camera.matrix_basis for value in row]
     return not np.allclose(pose, list(camera.get(POSE, pose)), rtol=1e-5, atol=1e-6)
