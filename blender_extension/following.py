@@ -15,13 +15,22 @@ POINTS = "meshsplats_light_points"
 """Property of lit splats: the points that their light is baked at."""
 
 
-def _has_followers(scene):
-    return any(BASE in obj for obj in scene.objects)
+def _has_followers():
+    """Whether the file has any, also in collections of which scenes show instances."""
+    return any(BASE in obj for obj in bpy.data.objects)
+
+
+@persistent
+def after_load(*_):
+    if _has_followers():
+        from meshsplats.blender.inside import priors
+
+        priors.tie_all()
 
 
 @persistent
 def after_update(scene, depsgraph):
-    if _has_followers(scene):
+    if _has_followers():
         from meshsplats.blender.inside import priors
 
         priors.after_update(scene, depsgraph)
@@ -66,7 +75,7 @@ def before_render(scene, *_):
 
 @persistent
 def after_frame(scene, depsgraph):
-    if _has_followers(scene):
+    if _has_followers():
         from meshsplats.blender.inside import priors
 
         priors.after_frame(scene, depsgraph)
@@ -74,6 +83,7 @@ def after_frame(scene, depsgraph):
 
 
 def register():
+    bpy.app.handlers.load_post.append(after_load)
     bpy.app.handlers.depsgraph_update_post.append(after_update)
     bpy.app.handlers.frame_change_post.append(after_frame)
     bpy.app.handlers.render_init.append(before_render)
@@ -85,3 +95,4 @@ def unregister():
     bpy.app.handlers.render_init.remove(before_render)
     bpy.app.handlers.frame_change_post.remove(after_frame)
     bpy.app.handlers.depsgraph_update_post.remove(after_update)
+    bpy.app.handlers.load_post.remove(after_load)

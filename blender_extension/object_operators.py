@@ -159,13 +159,22 @@ class FollowBase(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return context.object is not None and context.object.get("meshsplats_base") is not None
+        obj = context.object
+        if obj is None or obj.get("meshsplats_base") is None:
+            return False
+        if obj.library:
+            cls.poll_message_set("Linked splats stay as they are: Object > Library Override > Make")
+        return not obj.library
 
     def execute(self, context):
         from meshsplats.blender.inside import priors
 
-        if not priors.follow([context.object], context.evaluated_depsgraph_get()):
-            self.report({"ERROR"}, context.object[priors.PROBLEM])
+        obj = context.object
+        priors.tie(obj)
+        if not priors.follow([obj], context.evaluated_depsgraph_get()):
+            self.report(
+                {"ERROR"}, obj[priors.PROBLEM] or f"Blender does not evaluate {obj.name}, or its base"
+            )
             return {"CANCELLED"}
         return {"FINISHED"}
 

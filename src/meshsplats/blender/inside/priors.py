@@ -2,12 +2,12 @@
 
 The splats are a child of the base, so they move with it. When the base deforms (edit mode, shape keys, an
 armature, cloth, soft bodies), ``follow`` computes their vertices from its own, as ``MeshPrior.pose`` does.
-The extension calls it after every change and on every frame.
+The extension calls it after every change and on every frame, also of those that are rendered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,9 @@ BASE = "meshsplats_base"
 """Property of the splats' object: the object of its base."""
 PROBLEM = "meshsplats_problem"
 """Property of the splats' object: why it could not follow its base; empty if it could."""
+TIE = "Follows base"
+"""Name of a constraint of the splats, without influence: it has Blender evaluate the base wherever it
+evaluates the splats. Bases are hidden in images, and hidden objects are left as they are at rest."""
 LIFT = "meshsplats_lift"
 """Property of the mesh data: distance between layers."""
 ATTRIBUTES = {"vertex_face": "splat_base_face", "weights": "splat_base_weights", "layers": "splat_layer"}
@@ -56,7 +59,35 @@ def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
     obj.matrix_basis.identity()
     obj[BASE] = base
     obj[PROBLEM] = ""
+    tie(obj)
     return base
+
+
+def tie(obj: Any) -> None:
+    """Gives the splats ``obj`` what following their base needs, where it is missing: the constraint ``TIE``,
+    and, to a library override, a mesh of its own, as linked ones cannot be changed."""
+    base = base_of(obj)
+    if base is None or obj.library is not None:
+        return
+    if obj.data.library is not None:
+        obj.data = obj.data.copy()
+    if not is_tied(obj):
+        constraint = obj.constraints.new("SHRINKWRAP")
+        constraint.name, constraint.target, constraint.influence = TIE, base, 0
+        constraint.show_expanded = False
+
+
+def is_tied(obj: Any) -> bool:
+    """Whether Blender evaluates the base of ``obj`` wherever it evaluates ``obj``."""
+    found = obj.constraints.get(TIE)
+    return found is not None and not found.mute and found.target == base_of(obj)
+
+
+def tie_all() -> None:
+    """Ties the splats of files that an earlier release saved."""
+    for obj in bpy.data.objects:
+        if BASE in obj and not obj.override_library:
+            tie(obj)
 
 
 def base_of(obj: Any) -> Any:
@@ -64,6 +95,8 @@ def base_of(obj: Any) -> Any:
     base = obj.get(BASE) if obj is not None and obj.type == "MESH" else None
     if base is None or base.type != "MESH" or FACE not in obj.data.attributes:
         return None
+    if obj.override_library and obj.parent is not None and obj.parent.override_library:
+        return obj.parent if obj.parent.override_library.reference == base else base
     return base
 
 
@@ -89,13 +122,13 @@ def binding_of(obj: Any) -> Binding:
 
 def follow(objs: Iterable[Any], depsgraph: Any) -> int:
     """Moves the splats ``objs`` with their bases as evaluated in ``depsgraph``, with modifiers and
-    simulations. Returns how many moved; the property ``PROBLEM`` of the others says why not."""
+    simulations. Splats stay as they are where it does not evaluate the base. Returns how many moved; the
+    property ``PROBLEM`` of the others says why not."""
     moved = 0
     for obj in objs:
-        problem = ""
+        problem = "" if is_tied(obj) else "rendered images may miss how the base moves: Follow Base Now"
         try:
-            _move(obj, depsgraph)
-            moved += 1
+            moved += _move(obj, depsgraph)
         except ValueError as error:
             problem = str(error)
         if obj.get(PROBLEM) != problem:
@@ -104,13 +137,26 @@ def follow(objs: Iterable[Any], depsgraph: Any) -> int:
 
 
 def followers(scene: Any) -> list[Any]:
-    """The objects of ``scene`` that follow a base."""
-    return [obj for obj in scene.objects if base_of(obj) is not None]
+    """The objects of ``scene``, and of collections that it shows as instances, that follow a base. Linked
+    ones cannot."""
+    return [obj for obj in dict.fromkeys(_shown(scene.objects)) if not obj.library and base_of(obj)]
 
 
-def _move(obj: Any, depsgraph: Any) -> None:
+def _shown(objs: Iterable[Any]) -> Iterator[Any]:
+    for obj in objs:
+        yield obj
+        if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
+            yield from _shown(obj.instance_collection.all_objects)
+
+
+def _move(obj: Any, depsgraph: Any) -> bool:
+    """Whether ``depsgraph`` evaluates the base of ``obj``, whose splats were moved then."""
+    if obj.data.library is not None:
+        raise ValueError(f"its mesh is linked from {obj.data.library.name}: Follow Base Now makes it local")
     binding, base = binding_of(obj), base_of(obj)
     vertices = _evaluated(base, depsgraph)
+    if vertices is None:
+        return False
     if len(vertices) != len(binding.base_vertices):
         raise ValueError(
             f"the base has {len(binding.base_vertices):,} vertices, with its modifiers {len(vertices):,}:"
@@ -127,21 +173,31 @@ def _move(obj: Any, depsgraph: Any) -> None:
         versions.set_normals(data, normals)
     far_to_near.set_centers(data)
     data.update()
+    return True
 
 
-def _evaluated(base: Any, depsgraph: Any) -> np.ndarray:
-    """(n, 3) float32 vertices of the object ``base`` as displayed, in its own frame."""
+def _evaluated(base: Any, depsgraph: Any) -> np.ndarray | None:
+    """(n, 3) float32 vertices of the object ``base`` as displayed, in its own frame; None where ``depsgraph``
+    has not evaluated them."""
     if base.mode == "EDIT":  # no evaluated mesh while it is edited
         import bmesh
 
         edited = bmesh.from_edit_mesh(base.data)
         return np.array([vertex.co[:] for vertex in edited.verts], np.float32).reshape(-1, 3)
     evaluated = base.evaluated_get(depsgraph)
+    if not evaluated.is_evaluated or (evaluated.data.is_evaluated and _deforms(base, depsgraph)):
+        return None  # the mesh is a mere copy of the one at rest
     mesh = evaluated.to_mesh()
     try:
         return versions.positions(mesh)
     finally:
         evaluated.to_mesh_clear()
+
+
+def _deforms(base: Any, depsgraph: Any) -> bool:
+    """Whether modifiers or shape keys of ``base`` act where ``depsgraph`` is for."""
+    shown = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
+    return base.data.shape_keys is not None or any(getattr(m, shown) for m in base.modifiers)
 
 
 def after_update(scene: Any, depsgraph: Any) -> None:
