@@ -4,6 +4,7 @@
 import importlib.util
 
 from . import (
+    bounces,
     cut_operator,
     export_operator,
     following,
@@ -34,6 +35,7 @@ def register():
     object_operators.register()
     light_operators.register()
     cut_operator.register()
+    bounces.register()
     panel.register()
     following.register()
     sorting.register()
@@ -43,6 +45,7 @@ def unregister():
     sorting.unregister()
     following.unregister()
     panel.unregister()
+    bounces.unregister()
     cut_operator.unregister()
     light_operators.unregister()
     object_operators.unregister()

@@ -95,15 +95,14 @@ class SetUpRender(bpy.types.Operator):
     shading: EnumProperty(items=SHADINGS)
 
     def execute(self, context):
-        from meshsplats.blender.inside import objects
+        from meshsplats.blender.inside import bounces, objects
 
-        every = objects.splat_objects(context.scene)
-        lit = self.shading == "lit"
+        every, lit = objects.splat_objects(context.scene), self.shading == "lit"
         limit = objects.render_settings(context.scene, every, lit)
-        clash = objects.clash(every, lit)
+        clash = objects.clash([*every, *bounces.instanced(context.scene.objects)], lit)
         if clash:
             self.report({"WARNING"}, f"MeshSplats: {clash}")
-        layers = objects.count_layers(every)
+        layers = bounces.layers_of(context.scene.objects)
         if layers > limit:
             self.report(
                 {"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black"

@@ -5,6 +5,7 @@ import textwrap
 
 import bpy
 
+from .bounces import SetBounces, described, missing
 from .cut_operator import AdjustSplats, CleanSplats, CutSplats
 from .import_operator import ImportMeshSplats
 from .light_operators import BakeLight, SetShading, SetUpRender, SetUpStage
@@ -100,6 +101,10 @@ class MeshSplatsPanel(bpy.types.Panel):
         button.live, button.fast = False, fast
         row.operator(BakeLight.bl_idname, text="Live Light").live = True
         layout.label(text="Render settings")
+        limit = missing(context.scene)
+        if limit:
+            draw_warning(layout, described(context.scene, limit))
+            layout.operator(SetBounces.bl_idname, text=f"Set Bounces to {limit}")
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
         row.operator(SetUpRender.bl_idname, text="Lit").shading = "lit"

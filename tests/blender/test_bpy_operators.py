@@ -345,7 +345,8 @@ def test_a_modifier_that_tears_splats_is_named(ball, extension):
     assert warning(ball) == "Hole tears splats to strips: Cut Splats cuts whole ones"
 
 
-def test_the_panel_has_a_button_for_each(ball, extension):
+def recording_layout():
+    """A layout, and the operators whose buttons are drawn in it, each with its context."""
     drawn = []
 
     class Layout(SimpleNamespace):
@@ -361,6 +362,11 @@ def test_the_panel_has_a_button_for_each(ball, extension):
             return draw
 
     top = Layout(operator_context="INVOKE_REGION_WIN")  # all layouts of a panel share it
+    return top, drawn
+
+
+def test_the_panel_has_a_button_for_each(ball, extension):
+    top, drawn = recording_layout()
     panel = sys.modules["blender_extension.panel"].MeshSplatsPanel
     panel._object(None, top, ball)
     names = [name for name, _ in drawn]
@@ -406,6 +412,55 @@ def test_a_new_camera_is_made_only_where_it_is_chosen(ball, monkeypatch):
     for chosen in ({}, {"camera": True}, {"camera": False}, {}):
         bpy.ops.scene.meshsplats_stage(make_lit=False, **chosen)
     assert asked == [None, True, False, None]
+
+
+@pytest.fixture
+def instances(ball):
+    """Two instances of a collection, one of them within another instance; it is in the scene only so."""
+    scene, ball.data[objects.LAYERS] = bpy.context.scene, 100
+    asset, group = bpy.data.collections.new("asset"), bpy.data.collections.new("group")
+    asset.objects.link(ball)
+    scene.collection.objects.unlink(ball)
+    found = []
+    for shown, home in ((asset, scene.collection), (asset, group), (group, scene.collection)):
+        obj = bpy.data.objects.new("instance", None)
+        obj.instance_type, obj.instance_collection = "COLLECTION", shown
+        home.objects.link(obj)
+        found.append(obj)
+    bpy.context.view_layer.update()
+    return found
+
+
+def test_linked_splats_say_that_rays_pass_too_few_layers(instances, extension, capsys):
+    """In the panel, and in the console where images are rendered in the background; nothing changes until it
+    is asked for."""
+    scene, ours = bpy.context.scene, sys.modules["blender_extension.bounces"]
+    panel = sys.modules["blender_extension.panel"].MeshSplatsPanel
+
+    def buttons():
+        layout, drawn = recording_layout()
+        panel.draw(SimpleNamespace(layout=layout), SimpleNamespace(scene=scene, object=None))
+        return [name for name, _ in drawn]
+
+    scene.render.engine, scene.cycles.transparent_max_bounces = "CYCLES", 8
+    ours.before_render(scene)
+    said = capsys.readouterr().out
+    assert "Rays pass 8 transparent layers and splats need 250: deeper ones are black" in said
+    assert "bpy.ops.scene.meshsplats_bounces()" in said
+    assert ours.SetBounces.bl_idname in buttons()
+    assert scene.cycles.transparent_max_bounces == 8
+    bpy.ops.scene.meshsplats_set_up(shading="lit")
+    assert scene.cycles.transparent_max_bounces == 250
+    scene.cycles.transparent_max_bounces = 99
+    instances[0].hide_render = True
+    bpy.ops.scene.meshsplats_bounces()
+    assert scene.cycles.transparent_max_bounces == 125, "of what images show"
+    assert ours.SetBounces.bl_idname not in buttons()
+    ours.before_render(scene)
+    assert capsys.readouterr().out.count("Rays pass") == 0
+    scene.cycles.transparent_max_bounces = 8
+    scene.render.engine = "BLENDER_WORKBENCH"
+    assert ours.missing(scene) == 0, "Cycles alone has such a limit"
 
 
 def test_name_and_format_of_an_export_follow_each_other(extension):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.blender.inside import (
+    bounces,
     far_to_near,
     foreign,
     frame,
@@ -24,6 +25,9 @@ from meshsplats.blender.inside import (
     versions,
     views,
 )
+from meshsplats.blender.inside.bounces import LAYERS as LAYERS
+from meshsplats.blender.inside.bounces import count_layers as count_layers
+from meshsplats.blender.inside.bounces import splat_objects as splat_objects
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIT as LIT
 from meshsplats.blender.inside.stand_ins import ROUGH as ROUGH
@@ -47,8 +51,6 @@ ORIGIN = "meshsplats_origin"
 WORLD = "meshsplats_world"
 """Property of the mesh data, where it is not zero: ``SplatMesh.origin``, the point of the world that its
 frame is relative to. Blender's places are float32, so objects stand near (0, 0, 0)."""
-LAYERS = "meshsplats_layers"
-"""Property of the mesh data: most layers behind each other."""
 
 
 def prepare(
@@ -129,11 +131,6 @@ def add_chain(
     return objs
 
 
-def splat_objects(scene: Any) -> list[Any]:
-    """The splat meshes of ``scene``, hidden ones too."""
-    return [obj for obj in scene.objects if obj.type == "MESH" and LAYERS in obj.data]
-
-
 def subjects(scene: Any) -> list[Any]:
     """What light can act on: the splat meshes of ``scene``, and the splats that Blender draws itself, without
     those that images do not show, as meshes may have taken their place."""
@@ -146,16 +143,6 @@ def is_lit(obj: Any) -> bool | None:
     if lit_points.can_be_lit(obj):
         return bool(obj.data.get(LIT))
     return bool(obj.data[LIT]) if obj.type == "MESH" and LIT in obj.data else None
-
-
-def count_layers(objs: Iterable[Any]) -> int:
-    """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
-    most: dict[tuple[bool, str], int] = {}
-    for obj in objs:
-        chain = levels.chain_of(obj)
-        key = (True, chain.name) if chain is not None else (False, obj.name)
-        most[key] = max(most.get(key, 0), int(obj.data.get(LAYERS, 256)))
-    return sum(most.values())
 
 
 def replace_mesh(obj: Any, prepared: dict[str, Any], onto: Any = None) -> list[str]:
@@ -397,7 +384,8 @@ def _unlit_colors(data: Any, facts: Any) -> np.ndarray:
 
 
 def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions | None = None) -> int:
-    """Sets up engine, colour management and bounce limits of the scene for ``objs``.
+    """Sets up engine, colour management and bounce limits of the scene for ``objs`` and the splats that
+    instances of collections show.
 
     Keeps the engine, or chooses Cycles where it is neither Cycles nor EEVEE. A scene cannot be right for
     unlit meshes of both display and linear blending: display wins. Lit images are denoised, with the exposure
@@ -410,9 +398,10 @@ def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions 
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
     objs = [obj for obj in objs if obj.type == "MESH"]  # splats that Blender draws have no triangles
-    layers = count_layers(objs)
-    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
-    limit = bounce_limit(layers)
+    others = [obj for obj in scene.objects if obj.type == "EMPTY"]
+    limit = bounce_limit(bounces.layers_of([*objs, *others]))
+    shown = [*objs, *bounces.instanced(others)]
+    linear = bool(shown) and all(obj.data.get(LINEAR) for obj in shown)
     if lit:
         rendering.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)
     else:

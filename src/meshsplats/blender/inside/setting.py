@@ -10,6 +10,7 @@ import numpy as np
 
 from meshsplats.blender.inside import (
     baking,
+    bounces,
     exporting,
     meshes,
     notes,
@@ -115,7 +116,7 @@ def set_up_render(scene: Any, objs: list[Any], lit: bool, *, chosen: bool = Fals
         objects.render_settings(scene, objs, lit)
         return
     versions.enable_cycles()
-    rendering.layers_alone(scene, bounce_limit(objects.count_layers(objs)) if lit else 1024)
+    rendering.layers_alone(scene, bounce_limit(bounces.layers_of(scene.objects)) if lit else 1024)
     button = "Lit" if lit else "Exact"
     notes.add(f"this file has other objects, so its render settings stay: {button} in the panel sets them")
 

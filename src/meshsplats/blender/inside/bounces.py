@@ -1,0 +1,63 @@
+"""How many transparent layers of splats rays pass in a scene, those of collections' instances too, and the
+limit of Cycles that they need: beyond it, pixels turn black."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from meshsplats.blender.inside import levels, light_state
+from meshsplats.blender.layers import bounce_limit
+
+LAYERS = "meshsplats_layers"
+"""Property of the mesh data: most layers behind each other."""
+
+
+def splat_objects(scene: Any) -> list[Any]:
+    """The splat meshes of ``scene``, hidden ones too."""
+    return [obj for obj in scene.objects if _is_splats(obj)]
+
+
+def instanced(objs: Iterable[Any]) -> list[Any]:
+    """The splat meshes that those of ``objs`` show that are instances of collections, some of them
+    more than once."""
+    within = [obj for home in map(_instances, objs) if home for obj in home.all_objects]
+    return [*filter(_is_splats, within), *(instanced(within) if within else [])]
+
+
+def count_layers(objs: Iterable[Any]) -> int:
+    """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
+    most: dict[tuple[bool, str], int] = {}
+    for obj in objs:
+        chain = levels.chain_of(obj)
+        key = (True, chain.name) if chain is not None else (False, obj.name)
+        most[key] = max(most.get(key, 0), int(obj.data.get(LAYERS, 256)))
+    return sum(most.values())
+
+
+def layers_of(objs: Iterable[Any]) -> int:
+    """Most layers behind each other of the splat meshes among ``objs`` and of what their instances of
+    collections show, each of them."""
+    unique = set(objs)
+    layers = count_layers(filter(_is_splats, unique))
+    return layers + sum(layers_of(light_state.rendered(home)) for home in map(_instances, unique) if home)
+
+
+def missing(scene: Any) -> int:
+    """The limit on transparent bounces that the splats in images of ``scene`` need, where images are made by
+    Cycles and it has less than there are layers; else 0."""
+    if scene.render.engine != "CYCLES":
+        return 0
+    shown = (light_state.rendered(layer.layer_collection) for layer in scene.view_layers if layer.use)
+    layers = max(map(layers_of, shown), default=0)
+    limit = bounce_limit(layers)
+    return limit if scene.cycles.transparent_max_bounces < min(layers, limit) else 0
+
+
+def _is_splats(obj: Any) -> bool:
+    return obj.type == "MESH" and LAYERS in obj.data
+
+
+def _instances(obj: Any) -> Any:
+    """The collection that ``obj`` is an instance of, or None."""
+    return obj.instance_collection if obj.instance_type == "COLLECTION" else None
