@@ -38,8 +38,8 @@ def other_suffix(path):
 
 
 class Export(ExportHelper):
-    """Mix-in for operators that export splat meshes: ``save`` writes some objects, and says what it wrote.
-    The name's suffix and ``format``, chosen in the dialog, follow each other."""
+    """Mix-in for operators that export splat meshes: ``save`` writes some objects and instances of others,
+    and says what it wrote. The name's suffix and ``format``, chosen in the dialog, follow each other."""
 
     _shown = None
     """The format that the dialog showed last."""
@@ -83,7 +83,10 @@ class Export(ExportHelper):
             bpy.ops.object.mode_set(mode="OBJECT")
         try:
             with waiting(context), own_warnings() as caught:
-                written = self.save(exporting.chosen(context.view_layer, selected=self.use_selection), path)
+                objs = exporting.chosen(context.view_layer, selected=self.use_selection)
+                depsgraph = context.evaluated_depsgraph_get()
+                instances = exporting.instances(depsgraph, selected=self.use_selection)
+                written = self.save(objs, instances, path)
         except (ValueError, OSError, ImportError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -105,13 +108,13 @@ class ExportMeshSplats(Export, bpy.types.Operator):
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix, *_ in FORMATS), options={"HIDDEN"})
     format: EnumProperty(name="Format", description="Of a name without suffix", items=FORMATS)
 
-    def save(self, objs, path):
+    def save(self, objs, instances, path):
         from meshsplats.blender.inside import exporting
         from meshsplats.formats.meshes import save_mesh
 
-        mesh = exporting.exported(objs)
+        mesh = exporting.exported(objs, instances)
         save_mesh(mesh, path)
-        return f"{len(objs)} objects, {len(mesh.faces):,} triangles"
+        return f"{len(objs)} objects, {len(instances)} instances, {len(mesh.faces):,} triangles"
 
 
 class ExportSplats(Export, bpy.types.Operator):
@@ -129,12 +132,12 @@ class ExportSplats(Export, bpy.types.Operator):
     )
     format: EnumProperty(name="Format", description="Of a name without suffix", items=SPLAT_FORMATS)
 
-    def save(self, objs, path):
+    def save(self, objs, instances, path):
         from meshsplats.blender.inside import exporting
         from meshsplats.errors import DataWarning
         from meshsplats.formats.gaussians import save_gaussians
 
-        cloud, cut = exporting.exported_splats(objs)
+        cloud, cut = exporting.exported_splats(objs, instances)
         save_gaussians(cloud, path)
         if cut:
             left_out = f"MeshSplats: left out {cut:,} splats that lack some of their triangles"

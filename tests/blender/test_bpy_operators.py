@@ -16,7 +16,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats
 from mathutils import Matrix
 
-from meshsplats import bind, convert, load_gaussians, look_at, save_gaussians, save_mesh
+from meshsplats import bind, convert, load_gaussians, load_mesh, look_at, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender import subject
 from meshsplats.blender.inside import (
@@ -461,6 +461,23 @@ def test_linked_splats_say_that_rays_pass_too_few_layers(instances, extension, c
     scene.cycles.transparent_max_bounces = 8
     scene.render.engine = "BLENDER_WORKBENCH"
     assert ours.missing(scene) == 0, "Cycles alone has such a limit"
+
+
+def test_instances_are_exported_where_they_are(instances, ball, tmp_path):
+    instances[0].location, instances[0].rotation_euler = (5, 0, 0), (0, 0, 1)
+    count = splat_count(ball)
+    bpy.ops.export_scene.meshsplats(filepath=str(tmp_path / "all.npz"))
+    both = load_mesh(tmp_path / "all.npz")
+    assert len(both.splats) == 2 * count
+    half = len(both.vertices) // 2
+    here, away = both.vertices[:half], both.vertices[half:]
+    if here[:, 0].mean() > away[:, 0].mean():
+        here, away = away, here
+    turned = here @ np.array(instances[0].matrix_world)[:3, :3].T + [5, 0, 0]
+    np.testing.assert_allclose(away, turned, atol=1e-4)
+    instances[0].select_set(True)
+    bpy.ops.export_scene.meshsplats_splats(filepath=str(tmp_path / "one.ply"), use_selection=True)
+    assert len(load_gaussians(tmp_path / "one.ply")) == count
 
 
 def test_name_and_format_of_an_export_follow_each_other(extension):

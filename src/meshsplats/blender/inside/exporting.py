@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,29 +24,38 @@ LINEAR = "Color linear"
 """Colour attribute, during an export by Blender, with linear light: what file formats hold."""
 
 
-def exported(objs: Sequence[Any]) -> SplatMesh:
+class Instance(NamedTuple):
+    """A splat mesh that another object shows: of a collection, or scattered by its nodes."""
+
+    obj: Any
+    world: np.ndarray
+    """(4, 4) float64, from the object's own frame to Blender's world."""
+
+
+def exported(objs: Sequence[Any], instances: Sequence[Instance] = ()) -> SplatMesh:
     """One unlit mesh of the splat meshes ``objs``: where they are in Blender's world, z up, with what their
-    modifiers make of them. Each keeps its splats.
+    modifiers make of them, and of ``instances`` of others. Each keeps its splats.
 
     Raises:
         ValueError: no splat mesh, one without triangles, or meshes for different blending.
     """
-    if not objs:
+    if not objs and not instances:
         raise ValueError("there is no splat mesh to export: import one, or select one")
-    parts = [_in_world(obj) for obj in objs]
+    placed = [*(Instance(obj, np.array(obj.matrix_world)) for obj in objs), *instances]
+    parts = [_in_world(obj, world) for obj, world in placed]
     if any(part.face_splat is None for part in parts):
         parts = [replace(part, face_splat=None) for part in parts]
     return SplatMesh.joined(parts)
 
 
-def exported_splats(objs: Sequence[Any]) -> tuple[GaussianCloud, int]:
-    """The splats of the meshes ``objs``, as ``exported``, with y down as files of splats have it, and how
-    many were left out: those that edits or modifiers have cut.
+def exported_splats(objs: Sequence[Any], instances: Sequence[Instance] = ()) -> tuple[GaussianCloud, int]:
+    """The splats of the meshes ``objs`` and of ``instances``, as ``exported``, with y down as files of splats
+    have it, and how many were left out: those that edits or modifiers have cut.
 
     Raises:
         ValueError: as ``exported`` and ``recover_splats``.
     """
-    cloud, whole = recover_splats(exported(objs))
+    cloud, whole = recover_splats(exported(objs, instances))
     return cloud.transformed(frame.to_blender(np.array(DEFAULT_UP)).T), int((~whole).sum())
 
 
@@ -63,8 +72,21 @@ def chosen(view_layer: Any, *, selected: bool) -> list[Any]:
     ]
 
 
-def _in_world(obj: Any) -> SplatMesh:
-    world = np.array(obj.matrix_world)
+def instances(depsgraph: Any, *, selected: bool) -> list[Instance]:
+    """The instances of splat meshes that are visible in ``depsgraph``; with ``selected``, those that selected
+    objects show."""
+    return [
+        Instance(one.object.original, np.array(one.matrix_world))
+        for one in depsgraph.object_instances
+        if one.is_instance
+        and one.show_self
+        and one.object.type == "MESH"
+        and objects.LIT in one.object.original.data
+        and (not selected or one.parent.original.select_get())
+    ]
+
+
+def _in_world(obj: Any, world: np.ndarray) -> SplatMesh:
     with _without_sorting(obj):
         found = objects.splat_mesh_of(obj, obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)
     if not len(found.faces):
