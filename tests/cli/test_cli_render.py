@@ -254,7 +254,7 @@ def test_a_part_is_drawn(splats, tmp_path):
 def test_aim_and_lens(splats, tmp_path):
     cloud = load_gaussians(splats)
     size = ["--width", 60, "--height", 40]
-    aimed = ["--look-at", -1, 0.5, 2, "--focal-length", 50]
+    aimed = ["--look-at", -1, 0.5, 2, "--focal-length", 50, "--azimuth", 0]
     assert run(splats, "-o", tmp_path / "a.png", "--as-splats", *size, *aimed) == 0
     (camera,) = load_cameras(tmp_path / "a.png.cameras.json")
     x, y, z = camera.world_to_camera[:3] @ [-1, 0.5, 2, 1]

@@ -159,10 +159,12 @@ def draw_preview(
 ) -> None:
     """Saves a preview (``save_preview``), or says why there is none."""
     from meshsplats.rendering.layers import layers
-    from meshsplats.rendering.previews import preview_camera, save_preview
+    from meshsplats.rendering.previews import save_preview
+    from meshsplats.viewpoints.opening import opening_camera
 
+    camera = camera or opening_camera(scene, how.get("threads"))
     if not save_preview(scene, path, camera, **how):
-        count = layers(scene, camera or preview_camera(scene))
+        count = layers(scene, camera)
         say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
 
 

@@ -216,11 +216,13 @@ def save_strip(
     """Saves a strip of three images of ``scene`` to ``path``: as it is; with what was ``found`` in red; and
     what is ``left``."""
     from meshsplats.images.writing import save_image, strip
+    from meshsplats.viewpoints.opening import opening_azimuth
 
     if found.camera is not None:
         whole = rest = found.camera
     else:
-        lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
+        azimuth = opening_azimuth(scene, threads=threads)
+        lens: dict[str, Any] = {"azimuth": azimuth, "width": _SIDE, "height": _SIDE}
         whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
     shown = ((scene, whole), (_marked(scene, found), whole), (left, rest))
     images = [_image(part, camera, threads) for part, camera in shown]

@@ -83,8 +83,9 @@ class SceneViews:
     missing: MissingOfData = "few"
     elevation: float | None = None
     """Degrees above the horizon. Default: 15; 0 with ``look_around``."""
-    azimuth: float = 0.0
-    """Degrees of the first view: 0 from the front, 90 from the subject's right-hand side in that view."""
+    azimuth: float | None = None
+    """Degrees of the first view: 0 from the front, 90 from the subject's right-hand side in that view.
+    Default: 0; of a single image, the side of an object that shows most."""
     distance: float = 1.0
     """Multiple of the distance from which the subject just fits the image."""
     look_at: tuple[float, float, float] | None = None
@@ -171,6 +172,7 @@ class SceneViews:
         from meshsplats.cameras.files import cameras_beside, load_cameras
         from meshsplats.cameras.framing import guess_up
         from meshsplats.cameras.trajectories import dome, look_around, orbit
+        from meshsplats.viewpoints.opening import opening_azimuth
         from meshsplats.viewpoints.showing import default_views
 
         check_options(self)
@@ -194,7 +196,7 @@ class SceneViews:
         if self.look_around is not None:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
             lens["fov"] = 75.0 if fov is None else fov
-            return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
+            return look_around(scene, self.look_around, azimuth=self.azimuth or 0.0, **lens)
         if not self._placed:
             size, told = (width, lens["height"]), None if self.up is None else lens["up"]
             number = count if self.orbit is None else self.orbit
@@ -208,4 +210,7 @@ class SceneViews:
         if self.dome is not None:
             return dome(scene, self.dome, **lens)
         lens["elevation"] = 15.0 if self.elevation is None else self.elevation
-        return orbit(scene, count if self.orbit is None else self.orbit, azimuth=self.azimuth, **lens)
+        number, azimuth = count if self.orbit is None else self.orbit, self.azimuth
+        if azimuth is None:
+            azimuth = opening_azimuth(scene, up=lens["up"]) if number == 1 and not film else 0.0
+        return orbit(scene, number, azimuth=azimuth, **lens)

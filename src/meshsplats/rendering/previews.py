@@ -22,13 +22,15 @@ triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."
 FRAGMENTS = 1e9
 """Fragments above which a preview is made smaller, or not at all: some 10 s of one processor. Of real scenes,
 previews have 1e7 to 4e8."""
+USUAL = 30.0
+"""Degrees of azimuth: in front and a little to the side, which shows more of the shape."""
 SIDE = 800
 """Longer side of previews in pixels, at least."""
 
 
-def preview_camera(scene: SplatMesh | GaussianCloud) -> Camera:
-    """In front of ``scene`` and a little to the side, which shows more of its shape."""
-    return orbit(scene, 1, azimuth=30, width=SIDE, height=SIDE)[0]
+def preview_camera(scene: SplatMesh | GaussianCloud, azimuth: float = USUAL) -> Camera:
+    """A view of the whole of ``scene`` from ``azimuth``, degrees."""
+    return orbit(scene, 1, azimuth=azimuth, width=SIDE, height=SIDE)[0]
 
 
 def save_preview(

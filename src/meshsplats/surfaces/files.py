@@ -21,16 +21,20 @@ from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, check_ph
 from meshsplats.errors import OptionsError
 from meshsplats.formats import base_meshes
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
+from meshsplats.formats.surfaces.solids import upright
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_image
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.previews import preview_camera
 from meshsplats.surfaces import draw_surface
+from meshsplats.surfaces.fusion import parts_of
 from meshsplats.surfaces.making import surfaces_from
 from meshsplats.surfaces.options import SurfaceOptions, level_options
 from meshsplats.surfaces.views import Sources, place_of, sources_of
 from meshsplats.viewpoints.finding import FoundCameras
+from meshsplats.viewpoints.opening import opening_camera
 
+_PRINT = 100.0
+"""Millimetres of the longest side of a print that ``scale`` is named for."""
 _VIEWS = 8
 """Cameras in the file of a place."""
 
@@ -73,11 +77,16 @@ class SurfaceFileOptions:
         base_meshes.check_writing(output, unlit=self.unlit, image=self.image, collision=self.collision)
         if suffix in base_meshes.PRINTED and self.surface.shape in ("open", "floor"):
             raise OptionsError(f"{suffix} is for printing, which wants a solid: ``shape`` closed")
+        plain = suffix in base_meshes.UNTEXTURED
+        if plain and self.surface.texture:
+            raise OptionsError(f"``texture`` is for formats that hold one, not for {suffix}")
+        if self.image is not None and (plain or self.surface.texture == 0):
+            raise OptionsError("``image`` is the file of a texture, and there is none")
         check_photographs(self.data, self.missing, self.cameras, self.masks)
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise OptionsError(f"``scale`` must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}
-        options = SurfaceOptions(**given).checked()
+        options = SurfaceOptions(**given | ({"texture": 0} if plain else {})).checked()
         level_options(options.sized(closed=True), self.levels)  # open surfaces have more of everything
         return options
 
@@ -158,10 +167,35 @@ class SurfaceRun:
             for base, path in zip(bases, files, strict=True):
                 own = views if path == files[0] and path.suffix.lower() in base_meshes.SHADED else ()
                 save(self.place(scaled(base, chosen.scale)), path, cameras=own)
+            self._say_size(bases[0])
             self.record(beside(self.output, CONFIGURATION))
             if not chosen.no_preview:
                 self._draw_preview(scene, bases[0], place)
         return scene, list(zip(files, bases, strict=True))
+
+    def printed(self, base: BaseMesh) -> dict[str, Any]:
+        """Of a surface that is printed: its sides in millimetres, z last, and the number of its solids, which
+        do not touch; of others nothing."""
+        if self.output.suffix.lower() not in base_meshes.PRINTED:
+            return {}
+        sides = np.ptp(upright(scaled(base, self.options.scale)), axis=0)
+        return {
+            "millimetres": [float(f"{side:.4g}") for side in sides],
+            "solids": int(parts_of(base.faces, len(base.vertices)).max()) + 1,
+        }
+
+    def _say_size(self, base: BaseMesh) -> None:
+        """A line about the size and the solids of a surface that is printed."""
+        if not (found := self.printed(base)):
+            return
+        sides, solids = found["millimetres"], found["solids"]
+        factor = _PRINT / max(sides) * (self.options.scale or 1.0)
+        text = " x ".join(f"{side:g}" for side in sides) + " mm"
+        if self.options.scale is None:
+            text += f"; ``scale`` {factor:.3g} makes it {_PRINT:g} mm"
+        if solids > 1:
+            text += f"; {solids} solids that do not touch"
+        self.say(text)
 
     def _views(self, place: FoundCameras, sources: Sources) -> list[Camera]:
         """Views of the place in the frame of the surface that is written, the first one to open with."""
@@ -178,7 +212,7 @@ class SurfaceRun:
     def _draw_preview(
         self, scene: GaussianCloud | SplatMesh, base: BaseMesh, place: FoundCameras | None
     ) -> None:
-        camera = preview_camera(scene)
+        camera = opening_camera(scene, self.threads)
         if place is not None:
             self.say(place.seen_in_words())
             camera = place.cameras[0].within(camera.width)

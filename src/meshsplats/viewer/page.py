@@ -25,12 +25,14 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.order import Order, checked_order
 from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_mesh
 from meshsplats.viewer.surface import PackedSurface, pack_surface
+from meshsplats.viewpoints.opening import opening_azimuth
 from meshsplats.webgpu import device, frames, kernels
 
 MODULES = (
@@ -39,6 +41,8 @@ MODULES = (
 )
 """The scripts of the page, in the order in which they are joined."""
 
+OPENING_TRIANGLES = 200_000
+"""Triangles, at most, by which the side of a surface is found that shows most."""
 MOST_CAMERAS = 2000
 """Cameras in the list of the page; of more, some are left out evenly."""
 
@@ -113,11 +117,11 @@ def make_page(
     if np.shape(options.background) != (3,):
         raise ValueError(f"background must have shape (3,), got {np.shape(options.background)}")
     blocks: dict[str, tuple[str, str]] = {}
-    textured = None
+    alone = textured = None
     if isinstance(mesh, BaseMesh):
         if surface is not None or coarse is not None:
             raise ValueError("a page of a surface alone has no other surface and no coarse level")
-        textured = pack_surface(mesh)
+        alone, textured = mesh, pack_surface(mesh)
         mesh, packed = textured.shape, textured.mesh
     else:
         packed = quantise_mesh(mesh)
@@ -131,7 +135,9 @@ def make_page(
     views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
     if not views:
-        views = [orbit(mesh, 1, azimuth=30, elevation=15, width=1000, height=1000, up=up)[0]]
+        colored = mesh if alone is None else texture_to_vertex_colors(alone, OPENING_TRIANGLES)
+        azimuth = opening_azimuth(splats or colored, up=up, threads=1)
+        views = orbit(mesh, 1, azimuth=azimuth, elevation=15, width=1000, height=1000, up=up)
     bounds = scene_bounds(mesh)
     settings = {
         "title": legible(options.title[:LONGEST_NAME]),
