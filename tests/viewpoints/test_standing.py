@@ -18,7 +18,14 @@ from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints import standing
-from meshsplats.viewpoints.finding import BY_COARSENESS, find_cameras, first_impression, unusual_up
+from meshsplats.viewpoints.finding import (
+    BY_COARSENESS,
+    BY_STANCE,
+    BY_SURVEY,
+    find_cameras,
+    first_impression,
+    unusual_up,
+)
 from meshsplats.viewpoints.standing import (
     STOOD,
     UPS,
@@ -190,7 +197,7 @@ def test_what_shows_its_coarse_side_was_photographed_another_way_up(up):
     assert (found.kind, found.up.tolist(), found.up_confidence) == ("object", list(UPS[up]), standing.SEEN)
     told = unusual_up(box)
     assert told is not None
-    assert (told.up.tolist(), told.reason) == (list(UPS[up]), BY_COARSENESS)
+    assert (told.up.tolist(), told.reason) == (list(UPS[up]), BY_COARSENESS.format("-y"))
     assert find_cameras(box, 3, up=USUAL).kind == "ring"
 
 
@@ -210,6 +217,18 @@ def test_a_ring_opens_with_its_whole_subject(monkeypatch):
     assert np.abs(middle - 200).max() < 20
     assert np.linalg.norm(opening.center) > 1.1 * np.linalg.norm(near.center)
     assert opening.fx == near.fx
+
+
+def test_a_survey_stands_as_its_coordinates_say_unless_it_would_tip_over():
+    at = np.array([500_000.0, 4_500_000.0, 100.0])
+    y_up = turned(chair(), (1, 0, 0), (0, 0, 1), (0, -1, 0))
+    for cloud, up, reason in (
+        (chair(), [0, 0, 1], BY_SURVEY),
+        (y_up, [0, 1, 0], BY_STANCE.format("z")),
+    ):
+        found = unusual_up(replace(cloud, origin=at))
+        assert found is not None
+        assert (found.up.tolist(), found.reason) == (up, reason)
 
 
 class Telling(SceneReading):

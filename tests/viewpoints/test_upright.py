@@ -11,17 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_finding_cameras import moved, room
 
+from meshsplats.cameras.framing import guess_up
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.room import make_room
 from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.formats.streaming import stream_gaussians
+from meshsplats.inspection import describe
+from meshsplats.tiles.building import build_tiles
+from meshsplats.tiles.options import TileOptions
+from meshsplats.tiles.tileset import Tileset
 from meshsplats.viewpoints import finding, kind, standing
-from meshsplats.viewpoints.finding import BY_FLOORS, find_cameras, first_impression, unusual_up
+from meshsplats.viewpoints.finding import BY_FLOORS, BY_SURVEY, find_cameras, first_impression, unusual_up
 from meshsplats.viewpoints.kind import surely_object
 from meshsplats.viewpoints.search import FEW, find_places
 from meshsplats.viewpoints.standing import thinned
-from meshsplats.viewpoints.upright import LEVEL_GROUND, aligned, levelled
+from meshsplats.viewpoints.upright import LEVEL_GROUND, MEASURED, aligned, levelled
 
 USUAL = np.array([0.0, -1, 0])
 
@@ -168,3 +175,67 @@ def test_what_stands_for_others_is_wider(monkeypatch):
     few = thinned([cloud])
     assert len(few) == -(-len(cloud) // 4)
     assert few.scales == pytest.approx(2 * cloud.scales[::4])
+
+
+UTM = np.array([500_000.0, 4_500_000.0, 100.0])
+
+
+@pytest.mark.parametrize(
+    ("at", "up"),
+    [
+        (UTM, [0, 0, 1]),
+        (UTM[[0, 2, 1]] * [1, -1, 1], USUAL),  # turned to y up, and read as such
+        ([3000, 2000, 100], USUAL),
+        ([6_378_000, 0, 400_000], USUAL),  # on the globe
+    ],
+)
+def test_a_survey_has_z_up(at, up):
+    far = replace(make_scene(500), up=None, origin=np.array(at, float))
+    assert guess_up(far).tolist() == list(up)
+    assert guess_up(far.relative_to(np.zeros(3))).tolist() == list(up)
+    assert guess_up(replace(far, up=np.array(USUAL))).tolist() == list(USUAL)
+
+
+def test_cameras_of_a_survey_lean_and_others_win():
+    far = replace(make_scene(500), up=None, origin=UTM)
+    leaning = orbit(far, 1, elevation=30, up=(0, 0, 1))
+    assert guess_up(far, leaning).tolist() == [0, 0, 1]
+    assert guess_up(far, orbit(far, 4, up=USUAL)) == pytest.approx(USUAL)
+
+
+@pytest.mark.slow
+def test_what_a_survey_shows_wins(furnished):
+    z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    leaning = replace(moved(furnished, 1, turn(0, 9) @ z_up, np.zeros(3)), origin=UTM)
+    found = unusual_up(leaning)
+    assert found is not None
+    assert (found.up.tolist(), found.reason) == ([0, 0, 1], BY_SURVEY)
+    found = unusual_up(replace(furnished, origin=UTM))
+    assert found is not None
+    assert (found.up.tolist(), found.reason) == (USUAL.tolist(), BY_FLOORS)
+
+
+def test_all_that_is_made_of_a_survey_stands_alike(tmp_path):
+    still = moved(make_scene(3000), 1, turn(0, -90), np.zeros(3))
+    save_gaussians(replace(still, up=None, origin=UTM), tmp_path / "still.ply")
+
+    class Telling(SceneReading):
+        def tell(self, text: str) -> None:
+            said.append(text)
+
+    said: list[str] = []
+    cloud = Telling().load(tmp_path / "still.ply")
+    streams = [Telling().stream(tmp_path / "still.ply", origin) for origin in (None, (0.0, 0, 0))]
+    assert [scene.up.tolist() for scene in (cloud, *streams)] == [[0, 0, 1]] * 3
+    assert len(set(said)) == 1
+    assert said[0].startswith("up: z, as in coordinates of surveys, which these look like; if that is wrong")
+    blocks = stream_gaussians(tmp_path / "still.ply", block=1000)
+    assert unusual_up(thinned(blocks)).up.tolist() == [0, 0, 1]
+    options = TileOptions(alpha="blend", max_triangles=100_000)
+    build_tiles(blocks, tmp_path / "tiles", options)
+    assert Tileset(tmp_path / "tiles").up.tolist() == [0, 0, 1]
+    assert [part.up.tolist() for part in convert_blocks(blocks)] == [[0, 0, 1]]
+    seen = find_cameras(cloud.take(slice(None)), 1)
+    assert seen.up.tolist() == [0, 0, 1]
+    assert describe(tmp_path / "still.ply")["up_found"] == [0, 0, 1]
+    assert describe(tmp_path / "still.ply")["up_confidence"] == MEASURED

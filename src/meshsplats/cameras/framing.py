@@ -12,6 +12,7 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
 from meshsplats._kinds import need_array
+from meshsplats._origin import choose_origin, sampled
 from meshsplats.camera import Camera
 from meshsplats.errors import DataWarning, StraysWarning
 from meshsplats.gaussians import GaussianCloud
@@ -19,6 +20,11 @@ from meshsplats.mesh import SplatMesh
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Splats trained from COLMAP cameras have the y axis pointing down."""
+SURVEY_UP = (0.0, 0.0, 1.0)
+"""Surveys have eastings, northings and heights."""
+FAR = 10_000.0
+"""Least distance across, and greatest height, of the coordinates of a survey, in metres or feet. Those that
+were turned to y up have a northing for a height."""
 SAMPLE = 20_000
 """Largest number of points to measure: more do not change the quantiles visibly."""
 SURROUNDINGS = 4.0
@@ -276,12 +282,15 @@ def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = N
     """(3,) float64 unit direction that points up in the world frame.
 
     That of ``cameras`` if there are any and they agree (people hold cameras upright); else the ``up`` of a
-    mesh, or of splats whose file names it; else ``DEFAULT_UP``, as in scenes trained from COLMAP cameras. A
-    file's ``up`` that is within 45 degrees of that of the cameras is the better one: those lean. The points
-    themselves do not count: they cannot distinguish an upright vase from a hanging lamp.
+    mesh, or of splats whose file names it; of splats of a survey, z; else ``DEFAULT_UP``, as in scenes
+    trained from COLMAP cameras. The ``up`` of a file or a survey that is within 45 degrees of that of the
+    cameras is the better one: those lean. The points themselves do not count: they cannot distinguish an
+    upright vase from a hanging lamp.
     """
     held = _up_of_cameras(cameras) if cameras else None
-    told = scene.up.astype(np.float64) if isinstance(scene, GaussianCloud) and scene.up is not None else None
+    told = None
+    if isinstance(scene, GaussianCloud):
+        told = up_of_survey(scene) if scene.up is None else scene.up.astype(np.float64)
     if told is not None and (held is None or told @ held > np.sqrt(0.5)):
         return told
     if held is not None:
@@ -289,6 +298,19 @@ def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = N
     if isinstance(scene, SplatMesh):
         return scene.up.astype(np.float64)
     return np.array(DEFAULT_UP)
+
+
+def up_of_survey(cloud: GaussianCloud) -> np.ndarray | None:
+    """(3,) unit direction that points up in the coordinates of a survey, such as UTM; None for other ones."""
+    up = default_up(choose_origin(sampled(cloud.means) + cloud.origin))
+    return None if np.array_equal(up, DEFAULT_UP) else up
+
+
+def default_up(origin: np.ndarray) -> np.ndarray:
+    """(3,) unit direction that points up in a scene of which no more is known than its ``origin`` (3,) in the
+    world: (0, 0, 0), or a point in its midst if it is far from there."""
+    surveyed = np.hypot(*origin[:2]) >= FAR > abs(origin[2])
+    return np.array(SURVEY_UP if surveyed else DEFAULT_UP)
 
 
 def _up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:

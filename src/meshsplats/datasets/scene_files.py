@@ -57,9 +57,9 @@ class SceneReading:
     ) -> GaussianCloud:
         """The splats of a file, relative to ``origin`` (3,). Tells what its header names; ``up``: the option
         that counts in its place. An object that would tip over the usual way up gets the one in which it
-        stands, and a place that in which its floors are level, unless ``find_up`` is False, or the folder has
-        cameras, which know. ``threads``: at most this many. FileFormatError for a mesh, and what
-        ``load_gaussians`` raises."""
+        stands, a place that in which its floors are level, and a survey z, unless ``find_up`` is False, or
+        the folder has cameras, which know. ``threads``: at most this many. FileFormatError for a mesh, and
+        what ``load_gaussians`` raises."""
         from meshsplats.cameras.files import model_folder
         from meshsplats.cameras.framing import warn_of_strays_in, warn_of_unseen
         from meshsplats.formats.gaussians import load_gaussians

@@ -26,7 +26,7 @@ from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
 from meshsplats._words import plural
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import DEFAULT_UP, unit_up
+from meshsplats.cameras.framing import DEFAULT_UP, default_up, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion.driver import worth_drawing
@@ -133,7 +133,7 @@ def build_tiles(
     check_threads(threads)
     chosen = options or TileOptions()
     if chosen.up is None:
-        up = DEFAULT_UP if source.up is None else source.up.astype(float).tolist()
+        up = (default_up(source.origin) if source.up is None else source.up).astype(float).tolist()
         chosen = replace(chosen, up=(up[0], up[1], up[2]))
     conversion = chosen.resolved()
     target = Path(folder)

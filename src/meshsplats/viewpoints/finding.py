@@ -11,8 +11,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from meshsplats._kinds import need
+from meshsplats._words import direction_in_words
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
+from meshsplats.cameras.framing import DEFAULT_UP, SURVEY_UP, guess_up, scene_bounds, unit_up, up_of_survey
 from meshsplats.cameras.placing import (
     OBJECT_ELEVATIONS,
     STEPS,
@@ -36,7 +37,7 @@ from meshsplats.viewpoints.relief import Relief, find_relief
 from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
 from meshsplats.viewpoints.standing import SEEN, find_stance, finer_stance, tips_over
-from meshsplats.viewpoints.upright import find_upright
+from meshsplats.viewpoints.upright import MEASURED, find_upright
 from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, Checked, choose_views
 
 MOST = 96
@@ -56,8 +57,9 @@ WIDE = 85.0
 WIDER = 1.5
 """...and how much more it shows, at most, than the view that it is a variation of: a narrow view is one
 because there is noise around it."""
-BY_STANCE = "as the object stands (likely): with the usual -y it would tip over"
-BY_COARSENESS = "as the object was photographed (likely): with the usual -y its coarse side is above"
+BY_STANCE = "as the object stands (likely): with the usual {} it would tip over"
+BY_COARSENESS = "as the object was photographed (likely): with the usual {} its coarse side is above"
+BY_SURVEY = "as in coordinates of surveys, which these look like"
 BY_FLOORS = "as floors or ground are level (likely)"
 """What shows another way up than the usual one."""
 
@@ -76,7 +78,7 @@ class FoundCameras:
     """(3,) unit direction."""
     up_confidence: float
     """How sure ``up`` is: 1 where it was given, by the caller or the file, or a large floor shows it; 0 where
-    it is the default of the format."""
+    it is the default of the format; more for coordinates of surveys."""
     ground: float
     """Height of the ground along ``up``: ``point @ up`` of points on it."""
     extent: float
@@ -244,25 +246,33 @@ class UnusualUp(NamedTuple):
 
 def unusual_up(cloud: GaussianCloud, threads: int | None = None) -> UnusualUp | None:
     """Another way up than the usual one of a scene whose file names none: that in which an object stands well
-    that would tip over, or along which the floors or the ground of a place are level; else None."""
-    if cloud.up is not None or len(cloud) < FEWEST or not worth_a_look(cloud):
+    that would tip over, or along which the floors or the ground of a place are level; else z for the
+    coordinates of a survey; else None."""
+    if cloud.up is not None:
         return None
-    given, usual = _told_up(cloud, None)
+    usual = guess_up(cloud)
+    if len(cloud) >= FEWEST and worth_a_look(cloud) and (seen := _seen_up(cloud, usual, threads)) is not None:
+        return seen
+    return None if np.array_equal(usual, DEFAULT_UP) else UnusualUp(usual, BY_SURVEY)
+
+
+def _seen_up(cloud: GaussianCloud, usual: np.ndarray, threads: int | None) -> UnusualUp | None:
+    """Another way up than the ``usual`` one (3,), if splats show it."""
     few = len(cloud) < FEWEST_OF_PLACE
     if not tips_over(cloud) and surely_object(cloud, usual, threads):
         return None
-    outside = _from_outside(cloud, _key(cloud, given), usual, threads)
+    outside = _from_outside(cloud, _key(cloud, None), usual, threads)
     if outside.kind == "object":
         stands = outside.up_confidence > 0 and not np.array_equal(outside.up, usual)
         reason = BY_STANCE if tips_over(cloud) else BY_COARSENESS
-        return UnusualUp(outside.up, reason) if stands else None
+        return UnusualUp(outside.up, reason.format(direction_in_words(usual))) if stands else None
     # A landscape is flat the usual way up, and its ground may slope.
     if outside.kind in ("relief", "aerial") or few or not cloud.opacities.any():
         return None
     seen = _glimpse(cloud, usual, threads)
     if seen is None:
         return None
-    upright = find_upright(*seen, usual)
+    upright = find_upright(*seen, usual, exact=up_of_survey(cloud) is not None)
     leans = upright.level and not np.array_equal(upright.up, usual)
     return UnusualUp(upright.up, BY_FLOORS) if leans else None
 
@@ -305,6 +315,8 @@ def _from_outside(cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int 
             as_it_stands, surer = kind_from_outside(cloud, stance, threads)
             if as_it_stands == "object":
                 kind, confidence, up, sure = as_it_stands, surer, stance, SEEN
+        if key[1] is None and np.array_equal(up, SURVEY_UP) and up_of_survey(cloud) is not None:
+            sure = MEASURED
         seen = _Outside(relief, kind, confidence, up, sure)
         known = _outsides[cloud] = key, seen
     return known[1]
@@ -338,7 +350,9 @@ def _within(
     sample: Sample, places: Places, kind: Kind | None, confidence: float, given: np.ndarray | None
 ) -> FoundCameras:
     """A scene that is seen from ``places``, without cameras; ``kind``: as it looks from outside."""
-    upright = find_upright(sample, places, guess_up(sample.cloud) if given is None else given)
+    first_up = guess_up(sample.cloud) if given is None else given
+    of_survey = given is None and up_of_survey(sample.cloud) is not None
+    upright = find_upright(sample, places, first_up, exact=of_survey)
     up, sure = (upright.up, upright.confidence) if given is None else (given, 1.0)
     if kind is None:
         kind, confidence = kind_from_inside(sample, places, up)

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshsplats._geometry import level_axes
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import DEFAULT_UP, Bounds, scene_bounds
+from meshsplats.cameras.framing import DEFAULT_UP, Bounds, scene_bounds, up_of_survey
 from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.viewpoints.kind import FINE, glance, subsample_of
@@ -17,7 +17,7 @@ from meshsplats.viewpoints.sample import AllSplats, fibonacci
 from meshsplats.viewpoints.thinning import without_harmonics
 
 UPS = (DEFAULT_UP, (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
-"""Directions that programs which write splats have as up, the usual one first."""
+"""Directions that programs which write splats have as up, that of most first."""
 OPAQUE = 0.3
 """Opacity of splats, at least, that something stands on."""
 FEWEST = 100
@@ -101,19 +101,26 @@ def _every_other(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
 def tips_over(cloud: GaussianCloud) -> bool:
     """Whether a scene would not stand the usual way up."""
     bounds = scene_bounds(cloud)
-    return _told_by(bounds) and base_of(bounds, np.array(DEFAULT_UP)).margin < 0
+    return _told_by(bounds) and base_of(bounds, _ups(cloud)[0]).margin < 0
+
+
+def _ups(cloud: GaussianCloud) -> list[np.ndarray]:
+    """``UPS``, the usual one of such a scene first."""
+    usual = up_of_survey(cloud)
+    first = [] if usual is None else [usual]
+    return first + [np.array(up) for up in UPS if usual is None or not np.array_equal(up, usual)]
 
 
 def find_stance(cloud: GaussianCloud, threads: int | None = None) -> tuple[np.ndarray, float]:
     """(3,) unit direction that is up for an object, and how sure, 0 to 1.
 
-    The usual one of the format, unless the object would tip over, and another one of ``UPS`` is better: it
-    alone stands firmly, or is coarse from below, where nobody photographed it. It looks at every so many of
-    many splats."""
-    usual, bounds = np.array(DEFAULT_UP), scene_bounds(cloud)
+    The usual one of the format, or of surveys, unless the object would tip over, and another one of ``UPS``
+    is better: it alone stands firmly, or is coarse from below, where nobody photographed it. It looks at
+    every so many of many splats."""
+    (usual, *unusual), bounds = _ups(cloud), scene_bounds(cloud)
     if not _told_by(bounds):
         return usual, 0.0
-    first, *others = (base_of(bounds, np.array(up)) for up in UPS)
+    first, *others = (base_of(bounds, up) for up in (usual, *unusual))
     if first.margin >= 0:
         return usual, AS_USUAL if first.share >= WIDE else 0.0
     cloud, directions = subsample_of(cloud), fibonacci(VIEWS)
@@ -123,22 +130,21 @@ def find_stance(cloud: GaussianCloud, threads: int | None = None) -> tuple[np.nd
         log_angle, alpha, _ = splats.look(camera, SHARP_SIDE)
         sizes.append((alpha * log_angle).sum() / max(float(alpha.sum()), 1e-6))
     coarse = np.array(sizes)
-    for up, base in zip(UPS, (first, *others), strict=True):
-        beside = up[2] != 0  # where cameras that photographed its front alone would have looked from
-        if coarse_beneath(directions, coarse, np.array(up), alone=beside) and (base.firm or not beside):
-            return np.array(up), SEEN
-    firm = [
-        np.array(up) for up, base in zip(UPS[1:], others, strict=True) if base.firm and base.height >= TALL
-    ]
+    for up, base in zip((usual, *unusual), (first, *others), strict=True):
+        beside = up @ usual == 0  # where cameras that photographed its front alone would have looked from
+        if coarse_beneath(directions, coarse, up, alone=beside) and (base.firm or not beside):
+            return up, SEEN
+    firm = [up for up, base in zip(unusual, others, strict=True) if base.firm and base.height >= TALL]
     return (firm[0], STOOD) if len(firm) == 1 else (usual, 0.0)
 
 
 def finer_stance(cloud: GaussianCloud, threads: int | None = None) -> np.ndarray | None:
     """(3,) that of ``UPS`` with which a scene may be an object that is none the usual way up, by a glance:
     upside down or lying, it shows the coarse side that nobody photographed. None where there is none."""
-    usual, *others = (glance(cloud, np.array(up), threads) for up in UPS)
+    ups = _ups(cloud)
+    usual, *others = (glance(cloud, up, threads) for up in ups)
     best = int(np.argmax(others))
-    return np.array(UPS[1 + best]) if others[best] >= max(usual + CLEARLY, FINE - NEARLY) else None
+    return ups[1 + best] if others[best] >= max(usual + CLEARLY, FINE - NEARLY) else None
 
 
 def _told_by(bounds: Bounds) -> bool:

@@ -30,7 +30,8 @@ def sizes_of(scales: np.ndarray) -> np.ndarray:
 
 
 def without_harmonics(cloud: GaussianCloud, rows: slice | np.ndarray) -> GaussianCloud:
-    """Some splats of a cloud, without the harmonics that only colours need: most of its memory."""
+    """Some splats of a cloud, without the harmonics that only colours need: most of its memory. Without
+    ``up``."""
     return GaussianCloud(
         cloud.means[rows],
         cloud.quaternions[rows],
@@ -38,6 +39,7 @@ def without_harmonics(cloud: GaussianCloud, rows: slice | np.ndarray) -> Gaussia
         cloud.opacities[rows],
         cloud.sh[rows, :1],
         cloud.kernel,
+        origin=cloud.origin,
     )
 
 

@@ -52,13 +52,16 @@ class Upright:
     ground: float
     """Height of the ground along ``up``."""
     confidence: float
-    """0: the format's default, as the splats do not tell; 1: a large floor was found."""
+    """0: the format's default, as the splats do not tell; 1: a large floor was found. ``MEASURED`` at least
+    for the coordinates of a survey."""
     level: bool
     """Whether floors or ground are level, by which up is exact."""
 
 
-def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright:
-    """Up from the largest plane in the best views, or from their being level; else ``default`` (3,)."""
+def find_upright(sample: Sample, places: Places, default: np.ndarray, *, exact: bool = False) -> Upright:
+    """Up from the largest plane in the best views, or from their being level; else ``default`` (3,). If that
+    is ``exact``, floors and ground count only where they are level by another direction altogether: if they
+    lean from it, it is they that are not level."""
     best = places.best()
     area = _area_in_pictures(sample, best)
     scales = np.sort(sample.thin.scales, axis=1)
@@ -89,12 +92,14 @@ def find_upright(sample: Sample, places: Places, default: np.ndarray) -> Upright
         agrees = float(up @ default)
         if agrees < -0.2 or (agrees < 0.3 and confidence < KNOWN):  # a wall, likely
             up, confidence = default, 0.0
-    exact, level = _measured(sample, flat_area, up)
+    measured, level = _measured(sample, flat_area, up)
     if not level and confidence < KNOWN and up @ default < LIKELY:
         up, confidence = default, 0.0
-        exact, level = _measured(sample, flat_area, up)
+        measured, level = _measured(sample, flat_area, up)
     if level:
-        up, confidence = aligned(exact), max(confidence, MEASURED)
+        up, confidence = aligned(measured), max(confidence, MEASURED)
+    if exact and (not level or up @ default > np.sqrt(0.5)):
+        up, confidence = default, MEASURED
     height = sample.means @ up
     facing = area * (np.abs(sample.normals @ up) > 0.9)
     return Upright(up, _ground(height, facing if facing.any() else area), confidence, level)
