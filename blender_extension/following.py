@@ -5,6 +5,8 @@ by which what was made for the light of splats goes when they are deleted."""
 import bpy
 from bpy.app.handlers import persistent
 
+from .settings import is_splat_mesh
+
 BASE = "meshsplats_base"
 """Property of splats that follow a base; ``meshsplats.blender.inside.priors`` sets it."""
 
@@ -22,10 +24,15 @@ def _has_followers():
 
 @persistent
 def after_load(*_):
+    """Brings files of earlier releases up to date."""
     if _has_followers():
         from meshsplats.blender.inside import priors
 
         priors.tie_all()
+    if any(map(is_splat_mesh, bpy.data.objects)):
+        from meshsplats.blender.inside import far_to_near
+
+        far_to_near.renew()
 
 
 @persistent

@@ -16,7 +16,16 @@ from _eevee import draw_animation, draw_by_eevee
 
 from meshsplats import convert, orbit, psnr, render
 from meshsplats.blender import SceneOptions
-from meshsplats.blender.inside import far_to_near, frame, meshes, objects, rendering, sorted_copies, stage
+from meshsplats.blender.inside import (
+    far_to_near,
+    frame,
+    meshes,
+    objects,
+    rendering,
+    sorted_copies,
+    stage,
+    versions,
+)
 
 
 @pytest.fixture
@@ -176,6 +185,60 @@ def test_centres_follow_edits(scene):
         far_to_near.look(modifier, (0, 1, 0))
     after = evaluated_centers(obj)
     assert after[:, 0].mean() == pytest.approx(before[:, 0].mean() + 5, abs=1e-3)
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_splats_that_modifiers_or_shape_keys_have_moved_are_sorted_where_they_are(scene, numbered):
+    """A rig that was added last, and turns them by half a turn. Numbers of splats may occur twice, as in
+    joined meshes."""
+    obj = objects.add(objects.prepare(convert(ball_splats(100)[0]), False), "ball", scene.collection)
+    owner = meshes.owners(obj.data)
+    if not numbered:
+        obj.data.attributes[meshes.SPLAT].data.foreach_set("value", owner % 7)
+    modifier = far_to_near.modifier_of(obj)
+    rig = bpy.data.objects.new("rig", None)
+    scene.collection.objects.link(rig)
+    hook = obj.modifiers.new("rig", "HOOK")
+    assert obj.modifiers[-1] == modifier
+    hook.object = rig
+    hook.vertex_indices_set(range(len(obj.data.vertices)))
+    obj.data.attributes.new("own", "INT", "FACE").data.foreach_set("value", owner)
+    rig.rotation_euler = (0, 0, np.pi)
+    far_to_near.look(modifier, (0, 1, 0))
+    for keyed in (False, True):
+        if keyed:
+            hook.show_viewport = False
+            obj.shape_key_add(name="rest")
+            moved = versions.positions(obj.data) * np.float32([-1, -1, 1])
+            obj.shape_key_add(name="turned").data.foreach_set("co", moved.ravel())
+            obj.data.shape_keys.key_blocks["turned"].value = 1
+        bpy.context.view_layer.update()
+        data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        number = np.empty(len(data.polygons), np.int32)
+        data.attributes["own"].data.foreach_get("value", number)
+        starts = np.flatnonzero(np.diff(number, prepend=-1))
+        assert len(starts) == len(np.unique(owner)), "splats stay together"
+        middles = np.add.reduceat(meshes.face_middles(data), starts)
+        middles /= np.diff(starts, append=len(number))[:, None]
+        drawn = middles @ np.array(obj.matrix_world)[:3, :3].T
+        assert (np.diff(drawn[:, 1]) >= -1e-5).all()
+
+
+def test_files_of_earlier_releases_are_sorted_so_too(scene):
+    obj = objects.add(objects.prepare(convert(ball_splats(20)[0]), False), "ball", scene.collection)
+    modifier = far_to_near.modifier_of(obj)
+    modifier.use_pin_to_last = False
+    for node in [n for n in modifier.node_group.nodes if n.bl_idname == "GeometryNodeAccumulateField"]:
+        modifier.node_group.nodes.remove(node)
+    obj.modifiers.new("later", "WEIGHTED_NORMAL")
+    old = modifier.node_group
+    far_to_near.renew()
+    assert obj.modifiers[-1] == far_to_near.modifier_of(obj)
+    assert far_to_near.modifier_of(obj).node_group != old
+    far_to_near.look(far_to_near.modifier_of(obj), (1, 0, 0))
+    assert_far_to_near(obj, (1, 0, 0))
+    again = objects.add(objects.prepare(convert(ball_splats(20)[0]), False), "again", scene.collection)
+    assert far_to_near.modifier_of(again).node_group == far_to_near.modifier_of(obj).node_group
 
 
 def test_meshes_without_splats_are_sorted_by_the_triangle(scene):

@@ -1,9 +1,10 @@
 """Splats from far to near for EEVEE, which blends the triangles of an object in the order of its mesh.
 
-A Geometry Nodes modifier sorts them, by the splat as ``render(order="splat")`` does. The mesh keeps its own
-order, and files need no add-on: images follow the active camera, also an animated one. A viewport follows the
-active camera, too, or else the direction that it was given last (``look``), by a sorted copy of the mesh
-where that will do (``sorted_copies``).
+A Geometry Nodes modifier sorts them, by the splat as ``render(order="splat")`` does, and by where shape keys
+and the modifiers before it have put them. The mesh keeps its own order, and files need no add-on: images
+follow the active camera, also an animated one. A viewport follows the active camera, too, or else the
+direction that it was given last (``look``), by a sorted copy of the mesh where that will do
+(``sorted_copies``).
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ MODIFIER = "Far to near"
 """Name of the modifier, and of its node group."""
 _STEPS = 2.0**20
 """Steps of depth in the distance within which half of the splats lie from the middle."""
+_TOTAL = "GeometryNodeAccumulateField"
+"""The node of sums over splats."""
 _SOME = 10_000
 """Splats whose median that distance is."""
 _FARTHEST = 2.0**29
@@ -29,16 +32,39 @@ _FARTHEST = 2.0**29
 
 
 def add(obj: Any, *, viewport: bool = True) -> Any:
-    """Gives ``obj``, a splat mesh, the modifier, behind those that it has; with ``viewport``, viewports sort,
-    too. Returns the modifier, also one that was there."""
+    """Gives ``obj``, a splat mesh, the modifier, behind those that it has or will have; with ``viewport``,
+    viewports sort, too. Returns the modifier, also one that was there."""
     set_centers(obj.data)
     found = modifier_of(obj)
     if found is None:
         found = obj.modifiers.new(MODIFIER, "NODES")
-        found.node_group = bpy.data.node_groups.get(MODIFIER) or _group()
+        found.node_group = _latest_group()
         found.show_expanded = False
         found.show_viewport = viewport
+        found.use_pin_to_last = True
     return found
+
+
+def renew() -> None:
+    """Has the modifiers of files that an earlier release saved sort by where splats are, not by where they
+    are at rest."""
+    for obj in bpy.data.objects:
+        found = modifier_of(obj) if obj.type == "MESH" and not obj.library else None
+        if found is None or obj.override_library or _is_latest(found.node_group):
+            continue
+        found.node_group = _latest_group()
+        found.use_pin_to_last = True
+        obj.modifiers.move(list(obj.modifiers).index(found), len(obj.modifiers) - 1)
+
+
+def _latest_group() -> Any:
+    return next((group for group in bpy.data.node_groups if _is_latest(group)), None) or _group()
+
+
+def _is_latest(group: Any) -> bool:
+    """Whether ``group`` is the node group of this release, in this file."""
+    ours = group is not None and group.name.startswith(MODIFIER) and group.library is None
+    return ours and any(node.bl_idname == _TOTAL for node in group.nodes)
 
 
 def modifier_of(obj: Any) -> Any:
@@ -183,25 +209,44 @@ def _group() -> Any:
     link(transposed.outputs[0], local.inputs["Transform"])
     unit = node("ShaderNodeVectorMath", 4, 1, operation="NORMALIZE")
     link(local.outputs["Direction"], unit.inputs[0])
-    stored = node("GeometryNodeInputNamedAttribute", 4, 0, data_type="FLOAT_VECTOR")
-    stored.inputs["Name"].default_value = CENTER
+    # The mean depth of a splat, of faces that lie side by side and have one number; else of each face.
+    number = node("GeometryNodeInputNamedAttribute", 4, 6, data_type="INT")
+    number.inputs["Name"].default_value = meshes.SPLAT
+    index = node("GeometryNodeInputIndex", 3, 5)
+    last = node(versions.integer_math(), 4, 5, operation="SUBTRACT")
+    link(index.outputs[0], last.inputs[0])
+    last.inputs[1].default_value = 1
+    before = node("GeometryNodeFieldAtIndex", 5, 5, data_type="INT", domain="FACE")
+    link(last.outputs[0], before.inputs["Index"])
+    link(number.outputs["Attribute"], before.inputs["Value"])
+    begins = node("FunctionNodeCompare", 6, 5, data_type="INT", operation="NOT_EQUAL")
+    one, other = (socket for socket in begins.inputs if socket.enabled)
+    link(number.outputs["Attribute"], one)
+    link(before.outputs[0], other)
+    splat = node(_TOTAL, 7, 5, data_type="INT", domain="FACE")
+    link(begins.outputs[0], splat.inputs["Value"])
+    owner = node("GeometryNodeSwitch", 8, 5, input_type="INT")
+    link(number.outputs["Exists"], owner.inputs["Switch"])
+    link(index.outputs[0], owner.inputs["False"])
+    link(splat.outputs["Leading"], owner.inputs["True"])
     near = node("ShaderNodeVectorMath", 5, 1, operation="DOT_PRODUCT")
-    link(stored.outputs["Attribute"], near.inputs[0])
+    link(node("GeometryNodeInputPosition", 4, 0).outputs[0], near.inputs[0])
     link(unit.outputs[0], near.inputs[1])
-    step = node("FunctionNodeFloatToInt", 6, 1, rounding_mode="ROUND")
-    link(near.outputs["Value"], step.inputs[0])
-    # Groups are counted and laid side by side, which takes half as long as sorting faces by a weight.
-    depth = node("GeometryNodeCaptureAttribute", 7, 0, domain="FACE")
-    depth.capture_items.new("INT", "Depth")
-    link(given.outputs["Geometry"], depth.inputs[0])
-    link(step.outputs[0], depth.inputs["Depth"])  # by name: Blender 5.2 has a selection before it
+    total = node(_TOTAL, 9, 4, data_type="FLOAT", domain="FACE")
+    link(near.outputs["Value"], total.inputs["Value"])
+    faces = node(_TOTAL, 9, 5, data_type="INT", domain="FACE")
+    faces.inputs["Value"].default_value = 1
+    mean = node("ShaderNodeMath", 10, 4, operation="DIVIDE")
+    for i, part in enumerate((total, faces)):
+        link(owner.outputs[0], versions.socket(part.inputs, "Group ID", "Group Index"))
+        link(part.outputs["Total"], mean.inputs[i])
     # What is not carried along needs no time.
     less = node("GeometryNodeRemoveAttribute", 8, 0)
     less.inputs["Name"].default_value = CENTER
-    link(depth.outputs[0], less.inputs["Geometry"])
+    link(given.outputs["Geometry"], less.inputs["Geometry"])
     sort = node("GeometryNodeSortElements", 9, 0, domain="FACE")
     link(less.outputs[0], sort.inputs["Geometry"])
-    link(depth.outputs["Depth"], sort.inputs["Group ID"])
+    link(mean.outputs[0], sort.inputs["Sort Weight"])
     copy = node("GeometryNodeObjectInfo", 7, 2, transform_space="ORIGINAL")
     link(given.outputs[SORTED], copy.inputs["Object"])
     count = node("GeometryNodeAttributeDomainSize", 8, 2, component="MESH")

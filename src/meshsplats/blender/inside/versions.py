@@ -109,6 +109,12 @@ def set_if_there(owner: Any, **values: Any) -> None:
             setattr(owner, name, value)
 
 
+def integer_math() -> str:
+    """The node that calculates with whole numbers; before 4.3, those beyond 2^24 are rounded."""
+    exact = "FunctionNodeIntegerMath"
+    return exact if hasattr(bpy.types, exact) else "ShaderNodeMath"
+
+
 def enable_cycles() -> None:
     """Enables the add-on Cycles, which may be off in a bare user configuration."""
     import addon_utils
