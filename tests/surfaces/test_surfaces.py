@@ -38,7 +38,6 @@ from meshsplats.surfaces import make_surface, making
 from meshsplats.surfaces.files import SurfaceFileOptions, SurfaceRun
 from meshsplats.surfaces.fusion import TRUNCATION, grid_of, isosurface
 from meshsplats.surfaces.holes import close_holes
-from meshsplats.surfaces.manifold import split_pinches
 from meshsplats.surfaces.options import CLOSED, OPEN, SurfaceOptions, level_options
 
 _TAGS = {"vertex": "xyz", "triangle": ("v1", "v2", "v3")}
@@ -509,75 +508,3 @@ def test_photographs_from_one_side_are_where_depth_is_taken_from():
         assert found.closed
         assert len(found.depth) == (len(cameras) if one_side else 12)
     assert len(sources_of(mesh, None, front, options, 1).depth) == len(front)
-
-
-def box(low) -> tuple[np.ndarray, np.ndarray]:
-    """A unit cube, facing out."""
-    points = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return points + low, np.array(faces, np.int32)
-
-
-def uses_of_edges(faces) -> list[int]:
-    """How many triangles the edges have, each number once."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return sorted(set(np.unique(edges, axis=0, return_counts=True)[1].tolist()))
-
-
-def joined(parts) -> tuple[np.ndarray, np.ndarray]:
-    """Meshes as one, with vertices at one place as one."""
-    points = np.concatenate([p for p, _ in parts])
-    counts = np.cumsum([0, *(len(p) for p, _ in parts)])
-    faces = np.concatenate([f + n for (_, f), n in zip(parts, counts, strict=False)])
-    places, index = np.unique(points, axis=0, return_inverse=True)
-    return places, index.reshape(-1)[faces].astype(np.int32)
-
-
-@needs_extra
-def test_solids_that_touch_at_an_edge_are_two():
-    points, faces = joined([box((0, 0, 0)), box((1, 1, 0))])
-    assert uses_of_edges(faces) == [2, 4]
-    split, apart, _ = split_pinches(points, faces)
-    assert uses_of_edges(apart) == [2]
-    assert len(split) == 16, "the inside of each cube stays together"
-    np.testing.assert_array_equal(split[apart], points[faces])
-    # A ring of cubes that closes at an edge: its sheets meet at both ends of that edge, too.
-    ring = [(0, 0, 0), (1, 1, 0), (0, 0, 1), (1, 1, 1), (0, 1, 2)]
-    points, faces = joined([box(low) for low in ring])
-    split, apart, _ = split_pinches(points, faces)
-    assert uses_of_edges(apart) == [2]
-    assert open_edges(apart) == 0
-    assert volume(split, apart) == pytest.approx(5)
-
-
-@needs_extra
-def test_a_sheet_without_thickness_stays():
-    # Two triangles and their backs: a square without thickness, between two cubes that it touches.
-    square = np.array([(0, 0, 5), (1, 0, 5), (1, 1, 5), (0, 1, 5)], float)
-    both = np.array([(0, 1, 2), (0, 2, 3), (0, 2, 1), (0, 3, 2)], np.int32)
-    points, faces = joined([(square, both), box((0, 0, 4)), box((3, 0, 0))])
-    uv = np.random.default_rng(0).random((len(faces), 3, 2))
-    split, apart, corners = split_pinches(points, faces, uv)
-    assert uses_of_edges(apart) == [2]
-    assert open_edges(apart) == 0
-    assert len(apart) == len(faces)
-    before = np.concatenate([points[faces], uv], axis=2).reshape(len(faces), -1)
-    after = np.concatenate([split[apart], corners], axis=2).reshape(len(faces), -1)
-    assert sorted(map(tuple, before.tolist())) == sorted(map(tuple, after.tolist()))
-
-
-@needs_extra
-@pytest.mark.parametrize("seed", range(6))
-def test_collapsed_surfaces_become_manifold(seed):
-    rng = np.random.default_rng(seed)
-    field = rng.normal(size=(14, 14, 14))
-    for axis in range(3):
-        field = (np.roll(field, 1, axis) + field + np.roll(field, -1, axis)) / 3
-        sides = np.moveaxis(field, axis, 0)
-        sides[0] = sides[-1] = 0.5
-    vertices, faces = isosurface(field.astype(np.float32), 300)
-    split, apart, _ = split_pinches(vertices, faces)
-    assert uses_of_edges(apart) == [2]
-    assert open_edges(apart) == 0
-    assert volume(split, apart) == pytest.approx(volume(vertices, faces), abs=1e-6)

@@ -74,10 +74,7 @@ class Surface(Command):
                 force=self.force, progress=lambda name, done, total: show.phase(name, done / total)
             )
         seconds, lines = time.perf_counter() - start, []
-        rows = [
-            {"mesh": str(path), "triangles": len(base.faces), "bytes": path.stat().st_size}
-            for path, base in made
-        ]
+        rows = run.rows(made)
         for path, base in made:
             look = f"{len(base.textures[0].pixels)} texels, " if base.textures else "colours of vertices, "
             look = "" if path.suffix.lower() in PRINTED else look

@@ -42,6 +42,8 @@ SHADED = (".glb", ".usdc", ".usda", ".usd", ".usdz")
 """Formats that say whether lights shade a surface, and hold cameras."""
 PRINTED = (".stl", ".3mf")
 """Formats of shapes without colour."""
+UNTEXTURED = (*PRINTED, ".npz")
+"""Formats without a texture."""
 BASE_SUFFIXES = (".glb", ".obj", ".ply", ".usdc", ".usda", ".usd", ".usdz", ".npz", *PRINTED)
 """Suffixes that ``save_base`` knows."""
 
@@ -173,7 +175,7 @@ def save_base(
         raise ValueError(f"cameras are for {', '.join(SHADED)}, not for {suffix}")
     if collision == "only":
         base = BaseMesh(base.vertices, base.faces, up=base.up, origin=base.origin)
-    if image is not None and (suffix == ".npz" or suffix in PRINTED or not base.textured):
+    if image is not None and (suffix in UNTEXTURED or not base.textured):
         raise ValueError(f"image is for surfaces with a texture, and formats that keep it, not for {suffix}")
     if not len(base.faces):
         raise ValueError("the surface has no faces")

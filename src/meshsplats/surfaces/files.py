@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -167,32 +167,36 @@ class SurfaceRun:
             for base, path in zip(bases, files, strict=True):
                 own = views if path == files[0] and path.suffix.lower() in base_meshes.SHADED else ()
                 save(self.place(scaled(base, chosen.scale)), path, cameras=own)
-            self._say_size(bases[0])
+            if self.output.suffix.lower() in base_meshes.PRINTED:
+                self._say_size(bases[0])
             self.record(beside(self.output, CONFIGURATION))
             if not chosen.no_preview:
                 self._draw_preview(scene, bases[0], place)
         return scene, list(zip(files, bases, strict=True))
 
-    def printed(self, base: BaseMesh) -> dict[str, Any]:
-        """Of a surface that is printed: its sides in millimetres, z last, and the number of its solids, which
-        do not touch; of others nothing."""
-        if self.output.suffix.lower() not in base_meshes.PRINTED:
-            return {}
+    def rows(self, made: Sequence[tuple[Path, BaseMesh]]) -> list[dict[str, Any]]:
+        """What there is to say of each file, for JSON; of prints with their sides in millimetres, z last, and
+        how many solids there are that do not touch."""
+        found: list[dict[str, Any]] = [
+            {"mesh": str(path), "triangles": len(base.faces), "bytes": path.stat().st_size}
+            for path, base in made
+        ]
+        if self.output.suffix.lower() in base_meshes.PRINTED:
+            for row, (_, base) in zip(found, made, strict=True):
+                row |= {"millimetres": self._sides(base), "solids": _solids(base)}
+        return found
+
+    def _sides(self, base: BaseMesh) -> list[float]:
+        """Sides of a print, z last."""
         sides = np.ptp(upright(scaled(base, self.options.scale)), axis=0)
-        return {
-            "millimetres": [float(f"{side:.4g}") for side in sides],
-            "solids": int(parts_of(base.faces, len(base.vertices)).max()) + 1,
-        }
+        return [float(f"{side:.4g}") for side in sides]
 
     def _say_size(self, base: BaseMesh) -> None:
-        """A line about the size and the solids of a surface that is printed."""
-        if not (found := self.printed(base)):
-            return
-        sides, solids = found["millimetres"], found["solids"]
-        factor = _PRINT / max(sides) * (self.options.scale or 1.0)
+        """A line about the size and the solids of a print: splats have no unit, so it may be tiny."""
+        sides, solids = self._sides(base), _solids(base)
         text = " x ".join(f"{side:g}" for side in sides) + " mm"
         if self.options.scale is None:
-            text += f"; ``scale`` {factor:.3g} makes it {_PRINT:g} mm"
+            text += f"; ``scale`` {_PRINT / max(sides):.3g} makes it {_PRINT:g} mm"
         if solids > 1:
             text += f"; {solids} solids that do not touch"
         self.say(text)
@@ -217,3 +221,7 @@ class SurfaceRun:
             self.say(place.seen_in_words())
             camera = place.cameras[0].within(camera.width)
         save_image(self.preview, draw_surface(base, camera, threads=self.threads))
+
+
+def _solids(base: BaseMesh) -> int:
+    return int(parts_of(base.faces, len(base.vertices)).max()) + 1

@@ -15,7 +15,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.core_arguments import camera_struct
-from meshsplats.surfaces.options import LEVEL_FACTOR, MAX_RESOLUTION, USUAL_RESOLUTION
+from meshsplats.surfaces.options import MAX_RESOLUTION, USUAL_RESOLUTION
 
 TRUNCATION = 3.0
 """Truncation of signed distances, in voxels."""
@@ -42,6 +42,8 @@ _CLOSE = 0.9
 """Distance before a surface, in units of the truncation, from which there must be something behind."""
 _GAP = 3
 """Points across which gaps in a surface are closed."""
+_FILLED = 0.1
+"""Least distance below a surface of points in pockets that are filled, in units of the truncation."""
 MIN_PART = 0.01
 """Connected parts with a smaller volume, relative to the largest part, are removed."""
 
@@ -127,13 +129,15 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
         (n, 3) float64 vertices in grid steps, (m, 3) int32 triangles.
     """
     label, marching_cubes, _ = libraries()
+    known = np.isfinite(field)
+    if known.all():
+        field = _without_pockets(field, label)
     part = label(field < 0, connectivity=1)
     sizes = np.bincount(part.ravel())
     if len(sizes) == 1 or sizes[0] == 0:  # all exterior, or all interior
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
     small = sizes < MIN_PART * sizes[1:].max()
     small[0] = False
-    known = np.isfinite(field)
     vertices, triangles, _, _ = marching_cubes(
         np.where(known, np.where(small[part], -field, field), 1),
         0.0,
@@ -148,9 +152,15 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     return vertices.astype(np.float64), triangles.astype(np.int32)
 
 
-def coarser(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh, (n, 3) vertices and (m, 3) triangles, with about a quarter of its triangles."""
-    return collapsed(vertices, faces, max(4, len(faces) // LEVEL_FACTOR**2))
+def _without_pockets(field: np.ndarray, label: Callable[..., Any]) -> np.ndarray:
+    """``field`` with an interior where exterior does not reach the border of the grid: nobody sees it, and a
+    print would be hollow there."""
+    outside = label(field >= 0, connectivity=1)
+    reached = np.zeros(int(outside.max()) + 1, bool)
+    for axis in range(3):
+        reached[np.take(outside, [0, -1], axis=axis)] = True
+    reached[0] = True
+    return np.where(reached[outside], field, -np.maximum(np.abs(field), _FILLED))
 
 
 def collapsed(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,18 +173,25 @@ def collapsed(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[
 def large_parts(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The connected parts of a mesh, (n, 3) vertices and (m, 3) triangles, with at least ``MIN_PART`` of the
     triangles of the largest."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     if not len(triangles):
         return vertices, triangles
-    tails, heads = triangles.ravel(), np.roll(triangles, 1, axis=1).ravel()
-    links = coo_matrix((np.ones(len(tails), bool), (tails, heads)), (len(vertices), len(vertices)))
-    part = connected_components(links, directed=False)[1][triangles[:, 0]]
+    part = parts_of(triangles, len(vertices))
     counts = np.bincount(part)
     kept = triangles[counts[part] >= MIN_PART * counts.max()]
     used, index = np.unique(kept, return_inverse=True)
     return vertices[used], index.reshape(-1, 3).astype(triangles.dtype)
+
+
+def parts_of(triangles: np.ndarray, count: int) -> np.ndarray:
+    """(m,) number of the connected part that each of the triangles (m, 3) of ``count`` vertices belongs to,
+    from 0."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    tails, heads = triangles.ravel(), np.roll(triangles, 1, axis=1).ravel()
+    links = coo_matrix((np.ones(len(tails), bool), (tails, heads)), (count, count))
+    part = connected_components(links, directed=False)[1][triangles[:, 0]]
+    return np.unique(part, return_inverse=True)[1].reshape(-1)
 
 
 def libraries() -> tuple[Callable[..., Any], ...]:

@@ -19,6 +19,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import convert
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.formats.surfaces.solids import warn_of_gaps
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
@@ -27,7 +28,6 @@ from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors
 from meshsplats.surfaces.floor import missing_ground
 from meshsplats.surfaces.fusion import (
-    coarser,
     collapsed,
     grid_around,
     grid_of,
@@ -36,10 +36,11 @@ from meshsplats.surfaces.fusion import (
 )
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.images import Surface
-from meshsplats.surfaces.manifold import split_pinches
+from meshsplats.surfaces.manifold import apart, simplified
 from meshsplats.surfaces.normal_maps import Relief, normal_map, relief_of
 from meshsplats.surfaces.options import (
     CLOSED,
+    LEVEL_FACTOR,
     USUAL_RESOLUTION,
     SizedOptions,
     SurfaceOptions,
@@ -142,13 +143,14 @@ def surfaces_from(
     result = []
     for number, level in enumerate(levels):
         if number:
-            vertices, faces = coarser(grid.contracted(vertices), faces)
+            fewer = max(4, len(faces) // LEVEL_FACTOR**2)
+            vertices, faces = simplified(grid.contracted(vertices), faces, fewer, closed=sources.closed)
             vertices = grid.in_scene(vertices)
         views = tuple(reduced(view, level.size) for view in sources.views)
         seen = replace(sources, views=views)
         least = 0 if chosen.faces is None else len(faces)
         said("texture coordinates", 0, 1)
-        blank = _blank(vertices, faces, grid, level.texture, least=least)
+        blank = _blank(vertices, faces, grid, level.texture, least=least, closed=sources.closed)
         base, fitted = _surface_of(scene, blank, seen, level, threads, said)
         vertices, faces, uv = blank.vertices, blank.faces, blank.uv
         if level.texture and relief is not None:
@@ -159,7 +161,15 @@ def surfaces_from(
     return result
 
 
-def _blank(vertices: np.ndarray, faces: np.ndarray, grid: Grid, side: int, *, least: int = 0) -> Surface:
+def _blank(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    grid: Grid,
+    side: int,
+    *,
+    least: int = 0,
+    closed: bool = False,
+) -> Surface:
     """The surface of these triangles with a texture without colours. Its charts are as large as on the
     ``grid``: what is far from all cameras of a place needs few texels. Where they do not fit, or the library
     fails, it has fewer triangles, but not fewer than ``least``."""
@@ -171,7 +181,7 @@ def _blank(vertices: np.ndarray, faces: np.ndarray, grid: Grid, side: int, *, le
             fewer = int(_FEWER * len(faces))
             if fewer < max(least, CLOSED[0]):
                 raise
-            points, faces = collapsed(grid.contracted(vertices), faces, fewer)
+            points, faces = simplified(grid.contracted(vertices), faces, fewer, closed=closed)
             vertices = grid.in_scene(points)
 
 
@@ -189,9 +199,8 @@ def _surface_of(
         surface = _fitted(surface, sources, chosen, threads, progress)
     fitted = surface.vertices
     if sources.closed:
-        sheets = split_pinches(surface.vertices, faces, surface.uv)
-        faces = sheets.faces
-        surface = surface._replace(vertices=sheets.vertices, uv=sheets.corners.astype(np.float32))
+        surface = surface._replace(vertices=apart(fitted, faces))
+        warn_of_gaps(surface.vertices, faces)
     base = BaseMesh(surface.vertices.astype(np.float32), faces, up=guess_up(scene), origin=scene.origin)
     if not chosen.texture:
         return replace(base, colors=_vertex_colors(base, sources.views, threads)), fitted
@@ -252,10 +261,9 @@ def _fused(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
         )
     relief = None
-    if 0 < options.faces < len(faces):
-        if options.normal_map and options.texture:
-            relief = relief_of(grid.in_scene(grid.low + grid.voxel * vertices), faces)
-        vertices, faces = collapsed(vertices, faces, options.faces)
+    if 0 < options.faces < len(faces) and options.normal_map and options.texture:
+        relief = relief_of(grid.in_scene(grid.low + grid.voxel * vertices), faces)
+    vertices, faces = simplified(vertices, faces, options.faces, closed=sources.closed)
     if not sources.closed:
         vertices, faces = close_holes(vertices, faces)
     vertices = grid.in_scene(grid.low + grid.voxel * vertices)

@@ -1,46 +1,131 @@
-"""Closed surfaces whose edges belong to two triangles each, as slicers and solid modellers want them."""
+"""Closed surfaces as slicers and solid modellers want them: edges of two triangles, wherever they look."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from meshsplats._geometry import edge_groups
+from meshsplats._geometry import edge_groups, vertex_normals
+from meshsplats.surfaces.fusion import collapsed, parts_of
 
 _ROUNDS = 20
-"""Most passes over edges that are cut; one is enough where none share a triangle."""
+"""Most passes over edges that are cut, over vertices that are moved apart, and of collapses."""
+_APART = 0.005
+"""How far vertices at one place move apart, relative to the edges there: much less than a voxel..."""
+_STEPS = 8
+"""...but at least so many steps of float32, which files have, so that no turn or scale joins them again."""
+_FLAT = 1e-6
+"""Mean of the directions of the edges around a vertex below which they point nowhere."""
+_CRUMB = 1e-3
+"""Parts with a smaller volume, relative to the largest, were pinched off, and are removed."""
+_KEPT = 0.7
+"""Share of the volume that is left of a surface that is collapsed again for having too many triangles: below
+that it would lose whole parts."""
 
 
-class Sheets(NamedTuple):
-    """A mesh whose edges belong to two triangles each."""
+def simplified(
+    vertices: np.ndarray, faces: np.ndarray, count: int, *, closed: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh, (n, 3) vertices and (m, 3) triangles, with about ``count`` triangles; 0: with all of them. A
+    closed one is ``solid``, which may take a few more triangles, so fewer are aimed at."""
+    fewer = 0 < count < len(faces)
+    if not closed:
+        return collapsed(vertices, faces, count) if fewer else (vertices, faces)
+    if not fewer:
+        return solid(vertices, faces)
+    aim, least = count, 0.0
+    for _ in range(_ROUNDS):
+        made = solid(*collapsed(vertices, faces, aim))
+        if not 0 < len(made[1]) < len(faces) or _volume(*made) < least:  # no fewer, or not this shape
+            break
+        vertices, faces = made
+        least = least or _KEPT * _volume(vertices, faces)
+        if len(faces) <= count:
+            break
+        aim = max(4, count - min(len(faces) - count, count // 20))
+    return vertices, faces
 
-    vertices: np.ndarray
-    """(n, 3)."""
-    faces: np.ndarray
-    """(m, 3)."""
-    corners: np.ndarray
-    """(m, 3, k) values of the corners of the triangles, such as texture coordinates."""
 
-
-def split_pinches(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | None = None) -> Sheets:
-    """A closed mesh, (n, 3) vertices and (m, 3) triangles with values ``corners`` (m, 3, k), as one whose
-    edges belong to two triangles each.
+def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A closed mesh, (n, 3) vertices and (m, 3) triangles, as one whose edges belong to two triangles each,
+    once in each direction, and whose vertices are at different places.
 
     Edge collapses pinch a surface: four triangles or more meet at an edge. They are paired around it so that
     the inside lies between the triangles of a pair, and every sheet gets vertices of its own. Sheets that
-    also meet at both ends of the edge are cut there in its middle. Triangles that lie back to back, of a
-    sheet without thickness, become a pair of their own. No point of the surface moves.
+    also meet at both ends of the edge are cut there in its middle. Triangles back to back enclose nothing and
+    are left out; so are parts that face inwards, and crumbs that were pinched off.
+    """
+    for _ in range(_ROUNDS):
+        vertices, faces = _fans(vertices, _without_flakes(faces))
+        crowded = _edges(faces)[1]
+        if not crowded:
+            break
+        vertices, faces = _cut(vertices, faces, crowded)
+    vertices, faces = _large_solids(vertices, faces)
+    return apart(vertices, faces), faces
+
+
+def apart(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(n, 3) float64 vertices of a solid, of which none are at one place as float32.
+
+    Those that were have moved a little towards their neighbours, into the solid, or, where hollows touch, into
+    these: away from each other. The one whose triangles reach around most stays.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
-    values = np.empty((len(faces), 3, 0)) if corners is None else corners
-    back_to_back = _back_to_back(faces)
-    thin = _apart(vertices, faces, values, back_to_back)
-    solid = np.ones(len(faces), bool)
-    solid[back_to_back.ravel()] = False
-    faces, values = faces[solid], values[solid]
+    places, count = vertices.astype(np.float64), len(vertices)
+    least = _STEPS * 2.0**-24 * float(np.abs(places).max(initial=0))
+    tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    for attempt in range(_ROUNDS):
+        near = cKDTree(places).query_pairs(least, output_type="ndarray")
+        if not len(near):
+            break
+        links = coo_matrix((np.ones(len(near), bool), (near[:, 0], near[:, 1])), (count, count))
+        found = np.unique(near)
+        place = connected_components(links, directed=False)[1][found]
+        leaving = np.isin(tails, found)
+        at, edges = tails[leaving], places[heads[leaving]] - places[tails[leaving]]
+        lengths = np.linalg.norm(edges, axis=1)
+        shortest = np.full(count, np.inf)
+        np.minimum.at(shortest, at, lengths)
+        edges /= np.maximum(lengths, least)[:, None]
+        mean = np.stack([np.bincount(at, edges[:, k], count)[found] for k in range(3)], axis=1)
+        mean /= np.bincount(at, minlength=count)[found][:, None]
+        size = np.linalg.norm(mean, axis=1)
+        flat = size < _FLAT
+        mean[flat] = -vertex_normals(places, faces)[found[flat]]
+        order = np.lexsort((size, place))
+        rank = np.empty(len(found))
+        rank[order] = np.arange(len(found)) - np.searchsorted(place[order], place[order])
+        step = rank * np.maximum(_APART * shortest[found], 2 * least * (attempt + 1))
+        places[found] += mean * (step / np.where(flat, 1, size))[:, None]
+    return places
+
+
+def _without_flakes(faces: np.ndarray) -> np.ndarray:
+    """The triangles without those that have a vertex twice, and without pairs back to back."""
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    if not len(faces):
+        return faces
+    _, index, counts = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    index = index.reshape(-1)
+    first, row = np.argmin(faces, axis=1), np.arange(len(faces))  # the turn from there tells the winding
+    ahead = faces[row, (first + 1) % 3] < faces[row, (first + 2) % 3]
+    order, kept = np.lexsort((ahead, index)), np.ones(len(faces), bool)
+    starts = np.cumsum(counts) - counts
+    for k in np.flatnonzero(counts > 1).tolist():
+        group = order[starts[k] : starts[k] + counts[k]]
+        pairs = min(int(ahead[group].sum()), int((~ahead[group]).sum()))
+        kept[group[:pairs]] = kept[group[len(group) - pairs :]] = False
+    return faces[kept]
+
+
+def _fans(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with a vertex for each fan of triangles that go on at their edges."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     one, other = _pairs(vertices, faces).T  # half edges: 3 * face + corner of the tail
     tails = faces.ravel()
     after = np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, axis=1).ravel()
@@ -48,90 +133,51 @@ def split_pinches(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray |
     first = np.concatenate([one, after[one]])
     second = np.concatenate([np.where(same, other, after[other]), np.where(same, after[other], other)])
     links = coo_matrix((np.ones(len(first), bool), (first, second)), (3 * len(faces), 3 * len(faces)))
-    sheets = connected_components(links, directed=False)[1]
-    _, place, index = np.unique(sheets, return_index=True, return_inverse=True)
-    parts = _cut(vertices[faces.ravel()[place]], index.reshape(-1, 3).astype(faces.dtype), values)
-    return _joined([*parts, thin])
+    fans = connected_components(links, directed=False)[1]
+    _, place, index = np.unique(fans, return_index=True, return_inverse=True)
+    return vertices[tails[place]], index.reshape(-1, 3).astype(faces.dtype)
 
 
-def _joined(parts: list[Sheets]) -> Sheets:
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    return Sheets(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]).astype(
-            parts[0].faces.dtype
-        ),
-        np.concatenate([part.corners for part in parts]),
-    )
+def _cut(vertices: np.ndarray, faces: np.ndarray, crowded: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with a vertex of its own for each sheet in the middle of the edges where several meet, given
+    by their half edges; of those that share a triangle, of one."""
+    whole, points = faces.tolist(), [*vertices]
+    touched: set[int] = set()
+    for halves in crowded:
+        pairs = _paired(vertices, faces, halves) // 3
+        if touched & set(pairs.ravel().tolist()):
+            continue  # in the next round
+        touched |= set(pairs.ravel().tolist())
+        face, at = divmod(int(halves[0]), 3)
+        ends = {whole[face][at], whole[face][(at + 1) % 3]}
+        for pair in pairs.tolist():
+            points.append(np.mean([points[end] for end in ends], axis=0))
+            for index in pair:
+                tail = next(k for k in range(3) if whole[index][k] in ends and whole[index][k - 2] in ends)
+                a, b, c = (whole[index][(tail + k) % 3] for k in range(3))
+                whole[index] = [a, len(points) - 1, c]
+                whole.append([len(points) - 1, b, c])
+    return np.array(points), np.array(whole, faces.dtype).reshape(-1, 3)
 
 
-def _back_to_back(faces: np.ndarray) -> np.ndarray:
-    """(k, 2) pairs of triangles that have the same corners and face opposite ways."""
+def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    return float(_cones(vertices, faces).sum())
+
+
+def _cones(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m,) signed volumes between triangles and the middle of their vertices."""
+    return np.linalg.det(vertices[faces] - vertices.mean(axis=0)) / 6
+
+
+def _large_solids(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The parts of a closed mesh that enclose something, and not much less than the largest."""
     if not len(faces):
-        return np.empty((0, 2), np.int64)
-    _, index, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(index.reshape(-1), kind="stable")
-    starts = np.cumsum(count) - count
-    pairs = np.stack([order[starts[count == 2]], order[starts[count == 2] + 1]], axis=1)
-    first = np.argmin(faces[pairs], axis=2)[..., None]  # the turn from the least corner tells the winding
-    ahead = np.take_along_axis(faces[pairs], (first + 1) % 3, axis=2)[..., 0]
-    return pairs[ahead[:, 0] != ahead[:, 1]]
-
-
-def _apart(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, pairs: np.ndarray) -> Sheets:
-    """The triangles of ``pairs``, each pair with three vertices of its own."""
-    chosen = faces[pairs]
-    rank = np.argsort(np.argsort(chosen, axis=2), axis=2)
-    return Sheets(
-        vertices[np.sort(chosen[:, 0], axis=1).ravel()],
-        (rank + 3 * np.arange(len(pairs))[:, None, None]).reshape(-1, 3).astype(faces.dtype),
-        values[pairs].reshape(2 * len(pairs), *values.shape[1:]),
-    )
-
-
-def _cut(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> list[Sheets]:
-    """The mesh with a vertex of its own for each sheet in the middle of every edge where several meet, and
-    the triangles that then lie back to back."""
-    whole, points, corners = faces.tolist(), [*vertices], [*values]
-    thin, most = [], len(faces)
-    for _ in range(_ROUNDS):
-        now, places, held = np.array(whole, faces.dtype).reshape(-1, 3), np.array(points), np.array(corners)
-        back_to_back = _back_to_back(now)
-        if len(back_to_back):
-            thin.append(_apart(places, now, held, back_to_back))
-            kept = np.ones(len(now), bool)
-            kept[back_to_back.ravel()] = False
-            now, held = now[kept], held[kept]
-            whole, corners = now.tolist(), [*held]
-        _, groups = _edges(now)
-        if not 0 < len(groups) < most:  # done, or no longer getting better
-            break
-        most = len(groups)
-        touched: set[int] = set()
-        for halves in groups:
-            pairs = _paired(places, now, halves) // 3
-            if touched & set(pairs.ravel().tolist()):
-                continue  # in the next round
-            touched |= set(pairs.ravel().tolist())
-            face, at = divmod(int(halves[0]), 3)
-            ends = {whole[face][at], whole[face][(at + 1) % 3]}
-            for pair in pairs.tolist():
-                points.append(np.mean([points[end] for end in ends], axis=0))
-                for index in pair:
-                    tail = next(
-                        k for k in range(3) if whole[index][k] in ends and whole[index][k - 2] in ends
-                    )
-                    a, b, c = (whole[index][(tail + k) % 3] for k in range(3))
-                    at_a, at_b, at_c = (corners[index][(tail + k) % 3] for k in range(3))
-                    middle = (at_a + at_b) / 2
-                    whole[index], corners[index] = [a, len(points) - 1, c], np.stack([at_a, middle, at_c])
-                    whole.append([len(points) - 1, b, c])
-                    corners.append(np.stack([middle, at_b, at_c]))
-    now = np.array(whole, faces.dtype).reshape(-1, 3)
-    used, index = np.unique(now, return_inverse=True)
-    rest = np.array(corners).reshape(len(now), *values.shape[1:])
-    cut = Sheets(np.array(points)[used], index.reshape(-1, 3).astype(faces.dtype), rest)
-    return [cut, *thin]
+        return vertices, faces
+    part = parts_of(faces, len(vertices))
+    volumes = np.bincount(part, _cones(vertices, faces))
+    kept = faces[volumes[part] > _CRUMB * max(volumes.max(), 0)]
+    used, index = np.unique(kept, return_inverse=True)
+    return vertices[used], index.reshape(-1, 3).astype(faces.dtype)
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from meshsplats._geometry import edge_groups
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.errors import DataWarning
 from meshsplats.formats._orientation import up_rotation
 
 _Y_TO_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -38,9 +41,29 @@ def upright(base: BaseMesh) -> np.ndarray:
     return turned - turned.min(axis=0)
 
 
+def warn_of_gaps(vertices: np.ndarray, faces: np.ndarray) -> None:
+    """DataWarning for a mesh, (n, 3) vertices and (m, 3) triangles, that is no solid: where vertices
+    at one place (float32) are one, as for slicers, an edge does not have two triangles, in opposite
+    directions."""
+    _, index = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True)
+    joined = index.reshape(-1)[faces]
+    order, starts = edge_groups(joined)
+    ahead = np.where(joined < np.roll(joined, -1, axis=1), 1, -1).ravel()[order]
+    bad = (np.diff(starts) != 2) | (np.add.reduceat(ahead, starts[:-1]) != 0)
+    if bad.any():
+        warnings.warn(
+            f"the surface is no solid: {int(bad.sum()):,} of {len(bad):,} edges do not have two triangles,"
+            " which slicers repair or refuse",
+            DataWarning,
+            stacklevel=3,
+        )
+
+
 def write_stl(base: BaseMesh, path: Path) -> None:
-    """Writes the triangles of ``base`` as binary STL."""
-    corners = upright(base)[base.faces]
+    """Writes the triangles of ``base`` as binary STL. DataWarning where they are no solid."""
+    vertices = upright(base)
+    warn_of_gaps(vertices, base.faces)
+    corners = vertices[base.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     rows = np.zeros(len(corners), np.dtype([("n", "<f4", 3), ("p", "<f4", (3, 3)), ("unused", "<u2")]))
@@ -59,8 +82,10 @@ def _entry(name: str) -> zipfile.ZipInfo:
 
 
 def write_3mf(base: BaseMesh, path: Path) -> None:
-    """Writes the triangles of ``base`` as a 3D Manufacturing Format package (core specification 1.3)."""
+    """Writes the triangles of ``base`` as a 3D Manufacturing Format package (core specification 1.3).
+    DataWarning where they are no solid."""
     vertices = upright(base)
+    warn_of_gaps(vertices, base.faces)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as package:
         package.writestr(_entry("[Content_Types].xml"), _TYPES)
         package.writestr(_entry("_rels/.rels"), _RELATIONS)
