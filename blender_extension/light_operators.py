@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators for light: shading of objects, render settings, a stage with lamps and camera, baked light."""
 
+from contextlib import contextmanager
+
 import bpy
 from bpy.props import BoolProperty, EnumProperty
 
 from .checks import can_change, can_change_all
 from .settings import is_blenders
-from .work import LightWork, Modal, follow_shading, take_over, waiting
+from .work import LightWork, Modal, follow_shading, own_warnings, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -18,9 +20,10 @@ DARK = 0.1
 def is_dark(scene):
     """Whether images of ``scene`` have neither a lamp nor a sky that lights anything; what glows does not
     count."""
-    from meshsplats.blender.inside.light_state import is_rendered
+    from meshsplats.blender.inside.light_state import rendered
 
-    if any(obj.type == "LIGHT" and is_rendered(obj) and obj.data.energy > 0 for obj in scene.objects):
+    shown = rendered(bpy.context.view_layer.layer_collection)
+    if any(obj.type == "LIGHT" and obj.data.energy > 0 for obj in shown):
         return False
     world = scene.world
     if world is None:
@@ -80,7 +83,7 @@ class SetShading(Modal, bpy.types.Operator):
         if self._changed:
             follow_shading(self, context.scene, self.shading == "lit")
         if self._own:  # lamps alone do not light them
-            bake(context, done, work.choices["fast"])
+            bake(self, context, done, work.choices["fast"])
         if self.shading == "lit" and is_dark(context.scene):
             self.report({"WARNING"}, "MeshSplats: no lamp lights it: choose Sun to Studio")
 
@@ -172,7 +175,7 @@ class SetUpStage(Modal, bpy.types.Operator):
 
         take_over(self, work)
         setting.hide_start_scene(context.scene)
-        with waiting(context):
+        with waiting(context), telling(self):
             every = objects.subjects(context.scene)
             camera = self.camera if self.properties.is_property_set("camera") else None
             setting.set_up(context.scene, every, self.lights, camera=camera, fast=self.fast)
@@ -180,14 +183,25 @@ class SetUpStage(Modal, bpy.types.Operator):
             setting.show_colors(context.window_manager.windows, "RENDERED")
 
 
-def bake(context, names, fast):
-    """Gathers the light of the scene on the lit splats with these ``names``. Returns how many took it."""
+@contextmanager
+def telling(operator):
+    """``operator`` reports what MeshSplats warns of meanwhile."""
+    with own_warnings() as caught:
+        yield
+    for warning in caught:
+        operator.report({"WARNING"}, f"MeshSplats: {warning.message}")
+
+
+def bake(operator, context, names, fast):
+    """Gathers the light of the scene on the lit splats with these ``names``. Returns how many of them can
+    take it."""
     from meshsplats.blender.inside import baking
     from meshsplats.blender.options import CAREFUL, FAST
 
     objs = [obj for name in names if (obj := bpy.data.objects.get(name)) is not None]
-    with waiting(context):
-        return baking.bake(context.scene, objs, samples=(FAST if fast else CAREFUL).samples)
+    with waiting(context), telling(operator):
+        baking.bake(context.scene, objs, samples=(FAST if fast else CAREFUL).samples)
+    return sum(baking.points_of(obj) is not None for obj in objs)
 
 
 class BakeLight(Modal, bpy.types.Operator):
@@ -243,7 +257,7 @@ class BakeLight(Modal, bpy.types.Operator):
 
     def done(self, context, work):
         renewed = take_over(self, work)
-        count = bake(context, self._names, self.fast)
+        count = bake(self, context, self._names, self.fast)
         if renewed:
             self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")
         if not count:

@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 from _blender_scenes import ball_splats
 
-from meshsplats import convert, orbit, render
+from meshsplats import DataWarning, convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import (
     baking,
@@ -233,3 +233,72 @@ def test_hidden_splats_are_baked_as_if_they_were_visible(ball):
         light.append(light_of(obj))
     np.testing.assert_array_equal(*light)
     assert light[0].min() < 0.02 < light[0].max(), "its stand-in shades it"
+
+
+def sunny_ball(ball):
+    """The lit ball in a collection of its own, under a sun and on a ground."""
+    obj = lit_ball(ball)
+    versions.enable_cycles()
+    scene = bpy.context.scene
+    stage.add_sun(np.array([0.0, 0, 1]), 3.0, 1.0, 0.01, scene.collection)
+    stage.add_ground(np.array([0.0, 0, -1.2]), 1.0, False, scene.collection)
+    home = bpy.data.collections.new("home")
+    scene.collection.children.link(home)
+    for part in (obj, *obj.children):
+        scene.collection.objects.unlink(part)
+        home.objects.link(part)
+    return obj, home
+
+
+def test_light_is_the_same_wherever_splats_are_hidden(ball):
+    obj, home = sunny_ball(ball)
+    view, layer = bpy.context.scene, bpy.context.view_layer
+    place = layer.layer_collection.children["home"]
+    ground = view.objects["Ground"]
+    ground.select_set(True)
+    layer.objects.active = ground
+    baking.bake(view, [obj], samples=4)
+    expected = light_of(obj)
+    assert expected.min() < 0.5 < expected.max()
+    for owner, switch in [
+        *((home, name) for name in ("hide_viewport", "hide_render", "hide_select")),
+        *((place, name) for name in ("hide_viewport", "holdout", "indirect_only", "exclude")),
+        (obj, "hide_viewport"),
+    ]:
+        setattr(owner, switch, True)
+        light = obj.data.attributes[materials.LIGHT]
+        light.data.foreach_set("color", np.zeros(4 * len(light.data), np.float32))
+        assert baking.bake(view, [obj], samples=4) == 1
+        np.testing.assert_allclose(light_of(obj), expected, atol=1e-4, err_msg=switch)
+        assert getattr(owner, switch)
+        setattr(owner, switch, False)
+    assert list(view.view_layers) == [layer]
+    assert [child.users_collection for child in obj.children] == [(home,)] * len(obj.children)
+    assert bpy.context.selected_objects == [ground] == [layer.objects.active]
+
+
+def test_what_cannot_be_baked_is_left_out_and_the_others_are_lit(ball):
+    obj, _ = sunny_ball(ball)
+    view = bpy.context.scene
+    broken = objects.add(ball.prepared, "broken", view.collection)
+    points = baking.points_of(broken).data
+    points.color_attributes.remove(points.color_attributes[materials.LIGHT])
+    with pytest.warns(DataWarning, match="broken was left out, it cannot be baked: "):
+        assert baking.bake(view, [broken, obj], samples=4) == 1
+    assert np.ptp(light_of(obj)) > 0.3
+    assert not baking.is_older(view, obj)
+    assert len(view.view_layers) == 1
+    assert broken.visible_camera
+    assert baking.points_of(broken).hide_render
+
+
+def test_light_does_not_depend_on_settings_of_images(ball):
+    """Which apply the film's exposure to it once more, and after *Exact* have no bounces."""
+    obj, _ = sunny_ball(ball)
+    view = bpy.context.scene
+    baking.bake(view, [obj], samples=4)
+    expected = light_of(obj)
+    view.cycles.film_exposure, view.cycles.max_bounces = 4.0, 0
+    baking.bake(view, [obj], samples=4)
+    np.testing.assert_allclose(light_of(obj), expected, atol=1e-4)
+    assert (view.cycles.film_exposure, view.cycles.max_bounces) == (4.0, 0)

@@ -6,6 +6,7 @@ long as an unlit one; the light stays as it was when it was gathered.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,6 +17,7 @@ from meshsplats.blender.inside import levels, light_state, materials, meshes, ve
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIGHT
 from meshsplats.blender.options import CAREFUL
+from meshsplats.errors import DataWarning
 
 POINT = "light_point"
 """Attribute of the splats: index of the point whose light each vertex takes."""
@@ -24,9 +26,12 @@ POINTS = "meshsplats_light_points"
 SIZE = "meshsplats_spacing"
 """Property of the points' mesh: distance of neighbouring points, scene units."""
 STATE = "meshsplats_light_state"
-"""Property of the splats: the ``light_state`` of the scene when their light was baked."""
+"""Property of the splats: the ``light_state`` of the scene when their light was baked, and the name of the
+view layer."""
 _RAYS = ("camera", "diffuse", "glossy", "transmission", "volume_scatter", "shadow")
 """Cycles leaves out what none of these rays can see."""
+_BOUNCES = 4
+"""Least bounces: images of unlit splats have none."""
 _AGREE = 4
 """Power of the cosine between the normals of two points that share their light."""
 _WIDTH = 1.0
@@ -77,11 +82,12 @@ def places_of(obj: Any) -> tuple[np.ndarray, np.ndarray, float]:
 def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
     """Gathers the light of ``scene`` on the splat objects ``objs`` and shows them in it.
 
-    Everything in the scene lights them and casts shadows on them, their own stand-ins, too. The render
-    settings stay as they are. Needs Cycles.
+    Everything that images of the active view layer show lights them and casts shadows on them, their own
+    stand-ins, too, also where they themselves are hidden, held out or left out there. The render settings
+    stay as they are. Needs Cycles.
 
-    Objects without points (``stand_ins.add``) are left out. Of a chain of levels of detail, each is lit as if
-    it were the visible one.
+    Objects without points (``stand_ins.add``) are left out, and with a DataWarning those that Cycles cannot
+    bake. Of a chain of levels of detail, each is lit as if it were the visible one.
 
     Returns:
         The number of objects that were lit.
@@ -96,10 +102,13 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
         (scene.cycles, "samples", samples),
         (scene.cycles, "use_denoising", False),
         (scene.cycles, "use_adaptive_sampling", False),
+        (scene.cycles, "film_exposure", 1.0),  # images have it once more
+        (scene.cycles, "max_bounces", max(scene.cycles.max_bounces, _BOUNCES)),
     ]
     # Not by ``hide_render``, which hides their stand-ins, too.
     unseen = [(obj, f"visible_{way}", False) for obj in chosen for way in _RAYS]
-    with _held(settings + unseen):
+    lit = []
+    with _held(settings + unseen), _layer(scene) as layer:
         for obj in chosen:
             target = targets[obj.name]
             chain = levels.chain_of(obj)
@@ -109,22 +118,34 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
             if shown:
                 levels.show(chain, obj[levels.LEVEL])
             shows = [(target, "hide_render", False), (target, "hide_viewport", False)]
-            with _held([*shows, (obj, "hide_render", False)]):  # lit as if it were visible
-                _bake(target)
-            for where, level in shown.items():
-                if level is not None:
-                    levels.show(chain, level, where)
-            show(obj.data, smoothed(target.data))
-    for obj in chosen:
-        obj[STATE] = light_state.renewed(scene, obj)
-    return len(chosen)
+            stand_in = [child for child in obj.children if child.get(light_state.STAND_IN)]
+            try:
+                # Lit as if it were visible.
+                with _held([*shows, (obj, "hide_render", False)]), _at_hand(scene, stand_in):
+                    _bake(target, layer)
+            except RuntimeError as error:
+                what = str(error).strip().removeprefix("Error: ")
+                warnings.warn(f"{obj.name} was left out, it cannot be baked: {what}", DataWarning, 2)
+            else:
+                show(obj.data, smoothed(target.data))
+                lit.append(obj)
+            finally:
+                for where, level in shown.items():
+                    if level is not None:
+                        levels.show(chain, level, where)
+    layer = bpy.context.view_layer
+    for obj in lit:
+        obj[STATE] = f"{light_state.renewed(scene, obj, layer)} {layer.name}"
+    return len(lit)
 
 
 def is_older(scene: Any, obj: Any) -> bool:
     """Whether the splats ``obj`` show baked light, and lamps, sky, other objects or they themselves have
     moved or changed since."""
-    shows = any(materials.shows_baked(material) for material in obj.data.materials)
-    return shows and obj.get(STATE) != light_state.latest(scene, obj)
+    if not any(materials.shows_baked(material) for material in obj.data.materials):
+        return False
+    baked, _, layer = obj.get(STATE, "").partition(" ")
+    return bool(baked != light_state.latest(scene, obj, scene.view_layers.get(layer)))
 
 
 def forget(objs: list[Any]) -> None:
@@ -188,16 +209,11 @@ def mean_light(centers: np.ndarray, normals: np.ndarray, light: np.ndarray, size
     return total / weights[:, None]
 
 
-def _bake(target: Any) -> None:
-    layer = bpy.context.view_layer
-    active, selected = layer.objects.active, list(bpy.context.selected_objects)
-    hidden = target.hide_get()  # with all else that the user has hidden
-    for obj in selected:
-        obj.select_set(False)
-    try:
-        target.hide_set(False)
-        target.select_set(True)
-        layer.objects.active = target
+def _bake(target: Any, layer: Any) -> None:
+    layer.update()
+    # Whatever is selected, and shown by a window's local view.
+    chosen = {"object": target, "active_object": target, "selected_objects": [target]}
+    with bpy.context.temp_override(view_layer=layer, **chosen):
         bpy.ops.object.bake(
             type="DIFFUSE",
             pass_filter={"DIRECT", "INDIRECT"},
@@ -205,12 +221,43 @@ def _bake(target: Any) -> None:
             use_clear=True,
             use_selected_to_active=False,
         )
+
+
+@contextmanager
+def _layer(scene: Any) -> Iterator[Any]:
+    """A view layer of ``scene`` that has the light of the active one, but holds nothing out, and shows only
+    indirectly, hides and selects nothing."""
+    active = bpy.context.view_layer
+    layer = scene.view_layers.new("Baked light")
+    try:
+        layer.world_override = active.world_override
+        _exclude_as(active.layer_collection, layer.layer_collection)
+        yield layer
     finally:
-        target.select_set(False)
-        target.hide_set(hidden)
-        for obj in selected:
-            obj.select_set(True)
-        layer.objects.active = active
+        scene.view_layers.remove(layer)
+        active.update()
+
+
+def _exclude_as(these: Any, those: Any) -> None:
+    """Excludes children of the layer collection ``those`` where their twins in ``these`` are."""
+    for this, that in zip(these.children, those.children, strict=True):
+        if that.exclude != this.exclude:
+            that.exclude = this.exclude
+        _exclude_as(this, that)
+
+
+@contextmanager
+def _at_hand(scene: Any, objs: list[Any]) -> Iterator[None]:
+    """The objects ``objs`` are in the collection of ``scene``, too, which no view layer leaves out."""
+    home = scene.collection.objects
+    added = [obj for obj in objs if scene.collection not in obj.users_collection]
+    for obj in added:
+        home.link(obj)
+    try:
+        yield
+    finally:
+        for obj in added:
+            home.unlink(obj)
 
 
 @contextmanager

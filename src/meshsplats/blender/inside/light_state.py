@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import time
 import zlib
+from collections.abc import Iterator
 from typing import Any
 
 from meshsplats.blender.inside import meshes, versions
+from meshsplats.blender.inside.host import bpy
+
+STAND_IN = "meshsplats_stand_in"
+"""Property of the objects that take light in place of splats: True."""
 
 _SHAPES = ("MESH", "POINTCLOUD", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME")
 _VALUES = ("BOOLEAN", "INT", "FLOAT", "ENUM", "STRING")
@@ -19,6 +24,8 @@ _LOOKS = {
     "use_nodes",  # always, from Blender 5 on, where asking for it warns
 }
 """RNA properties that do not change images."""
+_RAYS = ("diffuse", "glossy", "transmission", "volume_scatter", "shadow")
+"""Those that bring light, or take it."""
 _WHOLE = 300_000
 """Vertices of a mesh up to which all of them count; of larger ones, some."""
 _SOME = 500
@@ -27,67 +34,109 @@ _LONG = 0.02
 """Processor seconds: what takes as long delays the window."""
 _REST = 30
 """After which multiple of its time a state that takes long is looked for again."""
-_STAND_IN = "meshsplats_stand_in"
-"""``stand_ins.STAND_IN``."""
-_known: dict[tuple[str, str], tuple[float, float, str]] = {}
+_known: dict[tuple[str, ...], tuple[float, float, str]] = {}
 """When they began, how long they took, and what was found."""
 
 
-def state(scene: Any, obj: Any) -> str:
-    """A checksum of what lights the splats ``obj``: lamps, sky, and what is rendered, with its modifiers and
-    materials. Of other splats, only their places and sizes: their light does not come from their nodes."""
+def state(scene: Any, obj: Any, layer: Any = None) -> str:
+    """A checksum of what lights the splats ``obj`` in the view layer ``layer``, the active one by default:
+    lamps, sky, and what is rendered, with its modifiers and materials. Of other splats, only their places and
+    sizes: their light does not come from their nodes."""
+    layer = layer or bpy.context.view_layer
     parts: list[Any] = [_numbers(obj.matrix_world)]
     used: dict[str, Any] = {}
-    for other in sorted(scene.objects, key=lambda other: other.name):
-        if is_rendered(other) and other != obj and not (other.parent == obj and other.get(_STAND_IN)):
+    for other in sorted(set(rendered(layer.layer_collection)), key=lambda other: other.name):
+        if other != obj and not (other.parent == obj and other.get(STAND_IN)):
             parts += _object(other, used)
     parts += [part for material in used.values() for part in _block(material)]
-    if scene.world is not None:
-        parts += _block(scene.world)
+    world = layer.world_override or scene.world
+    if world is not None:
+        parts += _block(world)
     return f"{zlib.crc32(repr(parts).encode()):08x}"
 
 
-def latest(scene: Any, obj: Any) -> str:
+def latest(scene: Any, obj: Any, layer: Any = None) -> str:
     """``state``, for the panel, which asks whenever it is drawn: of a large scene, now and then."""
-    key, now, begun = (scene.name, obj.name), time.monotonic(), time.thread_time()
+    layer = layer or bpy.context.view_layer
+    key, now, begun = (scene.name, obj.name, layer.name), time.monotonic(), time.thread_time()
     when, took, found = _known.get(key, (0.0, 0.0, ""))
     if took > _LONG and now - when < _REST * took:
         return found
-    found = state(scene, obj)
+    found = state(scene, obj, layer)
     took = time.thread_time() - begun
     _known[key] = (now, took, found)
     return found
 
 
-def renewed(scene: Any, obj: Any) -> str:
+def renewed(scene: Any, obj: Any, layer: Any = None) -> str:
     """``state``, which ``latest`` then knows."""
-    _known.pop((scene.name, obj.name), None)
-    return latest(scene, obj)
+    _known.pop((scene.name, obj.name, (layer or bpy.context.view_layer).name), None)
+    return latest(scene, obj, layer)
 
 
-def is_rendered(obj: Any) -> bool:
-    """Whether ``obj`` is in images: neither it nor all of its collections are hidden there."""
-    return not obj.hide_render and not all(home.hide_render for home in obj.users_collection)
+def rendered(place: Any) -> Iterator[Any]:
+    """The objects that images show of ``place``, a collection or that of a view layer: those that neither
+    are hidden nor are in hidden or excluded collections. Some of them more than once."""
+    collection = getattr(place, "collection", place)
+    if collection.hide_render:
+        return
+    if not getattr(place, "exclude", False):
+        yield from (obj for obj in collection.objects if not obj.hide_render)
+    for child in place.children:
+        yield from rendered(child)
 
 
 def _object(obj: Any, used: dict[str, Any]) -> list[Any]:
     """What it is and where; its materials join those that are ``used``."""
-    if obj.type == "LIGHT":
-        return [_numbers(obj.matrix_world), *_block(obj.data)]
+    parts = [obj.name, _numbers(obj.matrix_world)]
     if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
-        parts: list[Any] = [obj.name, _numbers(obj.matrix_world)]
-        for inner in obj.instance_collection.all_objects:
-            parts += _object(inner, used) if is_rendered(inner) else []
+        for inner in sorted(set(rendered(obj.instance_collection)), key=lambda inner: inner.name):
+            parts += _object(inner, used)
         return parts
+    parts += [getattr(obj, f"visible_{way}") for way in _RAYS]
+    for linked in (obj.light_linking.receiver_collection, obj.light_linking.blocker_collection):
+        parts += [] if linked is None else _members(linked)
+    if obj.type == "LIGHT":
+        return parts + _block(obj.data)
     if obj.type not in _SHAPES:
         return []
-    parts = [obj.name, _numbers(obj.matrix_world)]
     if _LIT in obj.data:
         return [*parts, meshes.size(obj.data)]
     used |= {slot.material.name: slot.material for slot in obj.material_slots if slot.material is not None}
     for modifier in obj.modifiers:
-        parts += _values(modifier) if modifier.show_render else []
+        parts += [*_values(modifier), *_targets(modifier)] if modifier.show_render else []
+    keys = getattr(obj.data, "shape_keys", None)
+    parts += [] if keys is None else [[key.name, _plain(key.value), key.mute] for key in keys.key_blocks]
     return parts + _shape(obj.data)
+
+
+def _members(linked: Any) -> list[Any]:
+    """What a collection of light linking includes and excludes, whose stand-ins follow their splats."""
+    own = zip(linked.objects, linked.collection_objects, strict=True)
+    states = [(obj.name, kept.light_linking.link_state) for obj, kept in own if not obj.get(STAND_IN)]
+    children = zip(linked.children, linked.collection_children, strict=True)
+    parts: list[Any] = sorted(states)
+    for child, kept in children:
+        parts += [kept.light_linking.link_state, *_members(child)]
+    return parts
+
+
+def _targets(modifier: Any) -> list[Any]:
+    """Places, poses and shapes of the objects that ``modifier`` refers to."""
+    parts = []
+    for prop in modifier.bl_rna.properties:
+        found = prop.type == "POINTER" and prop.fixed_type.identifier == "Object"
+        target = getattr(modifier, prop.identifier) if found else None
+        if target is None:
+            continue
+        parts += [target.name, _numbers(target.matrix_world)]
+        if target.pose is not None:
+            parts += [_numbers(bone.matrix) for bone in target.pose.bones]
+        if target.type == "LATTICE":
+            parts.append(_numbers(point.co_deform for point in target.data.points))
+        elif target.type in _SHAPES:
+            parts += _shape(target.data)
+    return parts
 
 
 def _shape(data: Any) -> list[Any]:
