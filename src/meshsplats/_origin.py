@@ -54,7 +54,7 @@ def lost_detail(positions: np.ndarray) -> str:
     if found is None:
         return ""
     center, extent, farthest = found
-    step = 2.0 ** (math.floor(math.log2(farthest)) - 23) if farthest else 0.0
+    step = _step(farthest)
     if extent == 0 or extent >= FEWEST_STEPS * step:
         return ""
     return (
@@ -62,6 +62,27 @@ def lost_detail(positions: np.ndarray) -> str:
         f" extent of {extent:.3g}: detail is lost; double coordinates, or a point nearby that they are"
         " relative to, keep it"
     )
+
+
+def need_detail(samples: Mapping[Any, np.ndarray], origin: np.ndarray) -> None:
+    """Raises ValueError for one of several files, ``samples`` (n, 3) float64 of their positions by name, that
+    has fewer than ``FEWEST_STEPS`` float32 steps across it relative to their one ``origin``."""
+    found = {name: spread for name, sample in samples.items() if (spread := _spread(sample - origin))}
+    for name, (center, extent, farthest) in found.items():
+        if not 0 < extent < FEWEST_STEPS * _step(farthest):
+            continue
+        other = max(found, key=lambda place: float(np.linalg.norm(found[place][0] - center)))
+        at, beside = (in_words(choose_origin(samples[place])) for place in (name, other))
+        raise ValueError(
+            f"{name}, around {at}, and {other}, around {beside}, are too far apart for one result: relative"
+            f" to {in_words(origin)}, places in {name} would be in steps of {_step(farthest):g} across an"
+            f" extent of {extent:.3g}; take each file by itself, or give both coordinates of one world"
+        )
+
+
+def _step(farthest: float) -> float:
+    """The step of float32 at that coordinate."""
+    return 2.0 ** (math.floor(math.log2(farthest)) - 23) if farthest else 0.0
 
 
 def _spread(positions: np.ndarray) -> tuple[np.ndarray, float, float] | None:

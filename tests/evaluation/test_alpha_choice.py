@@ -10,6 +10,7 @@ from _local import shared_data
 
 from meshsplats import GaussianCloud, SplatMesh, convert, load_gaussians, load_mesh, orbit, render, save_mesh
 from meshsplats._arrays import subsample
+from meshsplats.errors import DataWarning
 from meshsplats.evaluation import viewers
 from meshsplats.evaluation.viewers import AlphaChoice, area_means, choose_alpha
 from meshsplats.rendering.viewers import viewer_images
@@ -55,6 +56,25 @@ def test_cutoff_below_the_opacities():
     mesh = joined(*layers)
     choice = choose_alpha(mesh, orbit(mesh, 4, width=160, height=160))
     assert (choice.alpha, choice.cutoff) == ("mask", 0.1)
+
+
+def test_nothing_seen_is_no_measurement():
+    mesh = joined(shell(1, 0.95, BLUE))
+    away = [camera.relative_to(np.full(3, 1e4)) for camera in orbit(mesh, 2, width=50, height=50)]
+    with pytest.warns(DataWarning, match="not measured but 'blend': nothing is seen"):
+        choice = choose_alpha(mesh, away)
+    assert choice == AlphaChoice("blend")
+    assert choice.in_words() is None
+
+
+def test_equal_images_have_no_number():
+    line = AlphaChoice("blend", 0.2, 200.0, 31.52).in_words()
+    assert line is not None
+    assert line.startswith("alpha: blend, equal to the sorted image in viewers that do not sort")
+    assert line.endswith("mask with cutoff 0.2: 31.5 dB")
+    both = AlphaChoice("blend", 0.2, 200.0, 200.0).in_words()
+    assert both is not None
+    assert both.endswith("mask with cutoff 0.2: equal")
 
 
 def test_figures_are_those_of_the_images():

@@ -42,6 +42,8 @@ from meshsplats.formats.gaussians import save_gaussian_blocks
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.meshes import save_mesh_blocks
 from meshsplats.formats.tensors import gaussians_from_tensors
+from meshsplats.tiles.building import build_tiles
+from meshsplats.tiles.options import TileOptions
 
 FAR = np.array([500_000.0, 4_500_000.0, 100.0])
 """A place in a UTM zone."""
@@ -208,7 +210,8 @@ def test_a_real_scene_in_a_zone(tmp_path):
     assert not one.origin.any()
     np.testing.assert_allclose(places(other) - FAR, one.means, atol=1e-6)
     np.testing.assert_array_equal(other.sh, one.sh)
-    images = [render(convert(cloud), orbit(cloud, 1, width=80, height=80)[0]).color for cloud in (one, other)]
+    views = [orbit(cloud, 1, up=(0, -1, 0), width=80, height=80)[0] for cloud in (one, other)]
+    images = [render(convert(cloud), view).color for cloud, view in zip((one, other), views, strict=True)]
     assert psnr(*images) > 50
 
 
@@ -294,6 +297,23 @@ def test_several_files_share_an_origin(tmp_path):
     np.testing.assert_allclose(
         found, np.concatenate([near + FAR, there + FAR + np.array([10, 0, 0])]), atol=1e-6
     )
+
+
+@pytest.mark.parametrize("given", [None, FAR])
+def test_a_file_that_would_lose_its_detail_beside_others_is_refused(tmp_path, given):
+    paths = [
+        write_ply(tmp_path / f"{name}.ply", [splat_table(splats(at=at)[0], DOUBLES)])
+        for name, at in (("local", np.zeros(3)), ("utm", FAR))
+    ]
+    lost = "utm" if given is None else "local"
+    message = f"{lost}.ply, around .* would be in steps of 0.5 across an extent of .*; take each file by"
+    with pytest.raises(ValueError, match=message) as refused:
+        next(iter(stream_gaussians(paths, origin=given)))
+    assert "utm.ply, around 500000 4500000 100" in str(refused.value)
+    assert "local.ply, around 0 0 0" in str(refused.value)
+    with pytest.raises(ValueError, match=message):
+        build_tiles(stream_gaussians(paths, origin=given), tmp_path / "tiles", TileOptions(up=(0, 0, 1)))
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
 def test_our_splats_come_back_exactly(tmp_path):

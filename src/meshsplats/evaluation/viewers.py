@@ -77,12 +77,16 @@ class AlphaChoice:
             return None
         modes = {"blend": "blend", "mask": f"mask with cutoff {self.cutoff:g}"}
         other = "mask" if self.alpha == "blend" else "blend"
+        chosen, second = (
+            "equal to" if value >= _MOST else f"{value:.1f} dB from"
+            for value in (getattr(self, self.alpha), getattr(self, other))
+        )
         sorting = (
             "" if self.alpha == "blend" else " (``alpha`` blend for ray tracers and Blender's own importer)"
         )
         return (
-            f"alpha: {modes[self.alpha]}, {getattr(self, self.alpha):.1f} dB from the sorted image in viewers"
-            f" that do not sort, seen from afar; {modes[other]}: {getattr(self, other):.1f} dB{sorting}"
+            f"alpha: {modes[self.alpha]}, {chosen} the sorted image in viewers that do not sort, seen from"
+            f" afar; {modes[other]}: {second.removesuffix(' from').removesuffix(' to')}{sorting}"
         )
 
 
@@ -152,10 +156,16 @@ def area_means(image: np.ndarray) -> np.ndarray:
 
 
 def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int | None = None) -> AlphaChoice:
-    """``choose_alpha`` by these views, at least one, each with what a viewer draws of the scene there."""
+    """``choose_alpha`` by these views, each with what a viewer draws of the scene there. A DataWarning says
+    that nothing is seen from any of them; 'blend' is then no result of measurement."""
     near, far = np.zeros((2, 1 + len(CUTOFFS)))
-    for number, (mesh, view) in enumerate(views, 1):
-        truth = render(mesh, view, samples=2, threads=threads).color.clip(0, 1)
+    number = 0
+    for mesh, view in views:
+        drawn = render(mesh, view, samples=2, threads=threads)
+        if not drawn.alpha.any():
+            continue
+        number += 1
+        truth = drawn.color.clip(0, 1)
         differences = [
             image - truth for image in viewer_images(mesh, view, (None, *CUTOFFS), threads=threads)
         ]
@@ -164,6 +174,10 @@ def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int |
         blend, *masks = _decibels(far / number)
         if number > 1 and abs(max(masks) - blend) > CLEAR:
             break
+    if not number:
+        text = "the alpha mode is not measured but 'blend': nothing is seen in the images"
+        warnings.warn(text, DataWarning, stacklevel=2)
+        return AlphaChoice("blend")
     sharp = _decibels(near[1:])
     best = int(np.argmax(sharp))
     if sharp[best] <= sharp[CUTOFFS.index(CUTOFF)] + CUTOFF_GAIN:

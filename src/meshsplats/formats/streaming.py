@@ -15,7 +15,7 @@ import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._kinds import described, need_path, require_path
-from meshsplats._origin import choose_origin
+from meshsplats._origin import choose_origin, need_detail
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.opening import open_splats, to_y_down
@@ -62,21 +62,23 @@ class SplatStream:
         self.paths = tuple(Path(path) for path in paths)
         """The files, in their order."""
         self.block, self.strict, self.axes = int(block), strict, axes
-        self._origin = None if origin is None else checked_array("origin", origin, np.float64, (3,))
+        self._given_origin = None if origin is None else checked_array("origin", origin, np.float64, (3,))
         self.count = 0
         """Splats that the last iteration has given so far."""
         self._found_up: np.ndarray | None = None
 
-    @property
+    @cached_property
     def origin(self) -> np.ndarray:
-        """(3,) float64 origin of all blocks. The files are looked at when it is first needed."""
-        if self._origin is None:
-            if len(self.paths) == 1:
-                self._origin = self._looked_at(self.paths[0], alone=True)
-            else:
-                samples = [self._looked_at(path, alone=False) for path in self.paths]
-                self._origin = choose_origin(np.concatenate([np.empty((0, 3)), *samples]))
-        return self._origin
+        """(3,) float64 origin of all blocks. The files are looked at when it is first needed. Raises
+        ValueError where one of several would lose its detail relative to it."""
+        origin = self._given_origin
+        if len(self.paths) == 1:
+            return self._looked_at(self.paths[0], alone=True) if origin is None else origin
+        samples = {path: self._looked_at(path, alone=False) for path in self.paths}
+        if origin is None:
+            origin = choose_origin(np.concatenate([np.empty((0, 3)), *samples.values()]))
+        need_detail(samples, origin)
+        return origin
 
     def __iter__(self) -> Iterator[GaussianCloud]:
         self.count = 0
@@ -173,6 +175,7 @@ def stream_gaussians(
     Raises:
         FileNotFoundError: there is no such file.
         FileFormatError: a folder without splats.
+        ValueError, when the stream is used: files so far apart that the coordinates of one would lose detail.
     """
     if isinstance(path, (str, os.PathLike)) or not isinstance(path, Sequence):
         need_path(path=path)

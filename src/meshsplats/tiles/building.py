@@ -122,7 +122,8 @@ def build_tiles(
     Raises:
         FileExistsError: the folder or a partial one exists, or with ``replace_old`` one of another program.
         FileNotFoundError: there is nothing to resume.
-        ValueError: options out of range, or other ones than the interrupted run had; no splat to convert.
+        ValueError: options out of range, or other ones than the interrupted run had; no splat to convert;
+            files that are too far apart for one origin.
         OSError: a full disk; what is done stays, for ``resume``.
         ClusterError: the workers are lost; what is done stays.
     """
@@ -132,8 +133,9 @@ def build_tiles(
     need(Workers, workers=workers, optional=True)
     check_threads(threads)
     chosen = options or TileOptions()
+    usual = default_up(source.origin)  # whose errors come before anything is written
     if chosen.up is None:
-        up = (default_up(source.origin) if source.up is None else source.up).astype(float).tolist()
+        up = (usual if source.up is None else source.up).astype(float).tolist()
         chosen = replace(chosen, up=(up[0], up[1], up[2]))
     conversion = chosen.resolved()
     target = Path(folder)
