@@ -302,3 +302,16 @@ def test_light_does_not_depend_on_settings_of_images(ball):
     baking.bake(view, [obj], samples=4)
     np.testing.assert_allclose(light_of(obj), expected, atol=1e-4)
     assert (view.cycles.film_exposure, view.cycles.max_bounces) == (4.0, 0)
+
+
+def test_an_appended_object_brings_its_stand_in(ball, tmp_path):
+    lit_ball(ball)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "ball.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.append(directory=str(tmp_path / "ball.blend" / "Object"), filename="ball")
+    obj = bpy.context.scene.objects["ball"]
+    (surface,) = (child for child in obj.children if child != baking.points_of(obj))
+    assert surface.name in bpy.context.scene.objects
+    assert stand_ins.is_current(obj)
+    bpy.data.objects.remove(surface)
+    assert not stand_ins.is_current(obj, counts_only=True), "nothing casts its shadow"

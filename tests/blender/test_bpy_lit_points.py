@@ -179,6 +179,27 @@ def shot(scene) -> np.ndarray:
         return rendering.read_pixels(Path(folder) / "image.exr")[..., :3]
 
 
+def test_linked_duplicates_have_light_of_their_own(scene):
+    obj = splat_points(ball(), "ball", scene.collection)
+    before = attributes(obj)
+    twin = obj.copy()
+    scene.collection.objects.link(twin)
+    lit(obj, fast=True)
+    assert not objects.is_lit(twin)
+    assert attributes(twin) == before
+    third = obj.copy()  # of lit splats
+    scene.collection.objects.link(third)
+    assert objects.needs_light(third, fast=True)
+    lit_points.unlight(third)
+    assert attributes(third) == before
+    assert objects.is_lit(obj)
+    assert stand_ins.is_current(obj)
+    obj.data = twin.data  # as an earlier release has left them: unlit together, with a stand-in
+    lit_points.unlight(obj)
+    assert not obj.children
+    assert obj.visible_shadow
+
+
 def test_edited_splats_need_light_anew(scene):
     obj = lit(splat_points(ball(), "ball", scene.collection), fast=True)
     assert stand_ins.is_current(obj)

@@ -111,6 +111,7 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
     if len(data.points) != len(prepared["splat_colors"]):
         raise ValueError(f"{obj.name} was edited meanwhile")
     unlight(obj)
+    data = _own(obj)
     _store(data, splat_points.COLOR, "FLOAT_COLOR", "color", prepared["splat_colors"])
     _store(data, materials.LIGHT, "FLOAT_COLOR", "color", np.ones((len(data.points), 4), np.float32))
     opacities = splat_points.imported_opacities(data)
@@ -135,10 +136,24 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
 
 def unlight(obj: Any) -> None:
     """Takes the light from the splats ``obj``, if they are lit: Blender then draws them as they were
-    imported."""
-    data = obj.data
-    if not data.get(LIT):
+    imported. Linked duplicates keep theirs."""
+    if obj.data.get(LIT):
+        _restore(_own(obj))
+    elif baking.POINTS not in obj:
         return
+    for name in (stand_ins.SHAPE, ROUGH):
+        obj.pop(name, None)
+    stand_ins.remove(obj)
+
+
+def _own(obj: Any) -> Any:
+    """The data of ``obj``, from now on its own: its light is that of its place."""
+    if obj.data.users - obj.data.use_fake_user > 1:
+        obj.data = obj.data.copy()
+    return obj.data
+
+
+def _restore(data: Any) -> None:
     _show_opacities(data, splat_points.imported_opacities(data))
     for name in (splat_points.COLOR, materials.LIGHT, splat_points.OPACITY, baking.POINT):
         if name in data.attributes:
@@ -149,9 +164,6 @@ def unlight(obj: Any) -> None:
         data.materials.clear()
     for name in (LIT, _MATERIAL):
         data.pop(name, None)
-    for name in (stand_ins.SHAPE, ROUGH):
-        obj.pop(name, None)
-    stand_ins.remove(obj)
     data.update_tag()
 
 

@@ -25,6 +25,8 @@ STAND_IN = light_state.STAND_IN
 """Property of the objects made here: True."""
 OWNER = "meshsplats_splats"
 """Property of the objects made here: the object of the splats that they were made for."""
+SURFACE, FINE = "meshsplats_surface", "meshsplats_fine"
+"""Properties of lit splats: what was made here, with the points, so that *Append* brings it."""
 ROUGH = "meshsplats_rough"
 """Property of the object of lit splats: whether surface and colours for light are those of a preview."""
 SHAPE = "meshsplats_shape"
@@ -46,7 +48,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     surface = meshes.make_mesh(f"{obj.name} stand-in", arrays["surface_vertices"], faces, rgba)
     surface.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
     surface.materials.append(materials.stand_in())
-    _child(obj, surface, home)
+    obj[SURFACE] = _child(obj, surface, home)
     if fine.any():
         used, index = np.unique(arrays["faces"][fine], return_inverse=True)
         thin = meshes.make_mesh(
@@ -56,7 +58,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
             arrays["colors"][used],
         )
         thin.materials.append(materials.stand_in("Stand-in, fine", fine=True, self_shadow=self_shadow))
-        _child(obj, thin, home)
+        obj[FINE] = _child(obj, thin, home)
     points = baking.make_points(
         f"{obj.name} light points", arrays["light_points"], arrays["light_normals"], size
     )
@@ -147,6 +149,9 @@ def is_current(obj: Any, *, counts_only: bool = False) -> bool:
         points = baking.points_of(obj)
         if points is None or points.get(OWNER) != obj:
             return False
+        # Files of an earlier release may have lost it when they were appended.
+        if not any(child.get(STAND_IN) and child != points for child in obj.children):
+            return False
     before, data = obj.get(SHAPE, ""), obj.data
     if counts_only:
         return before.startswith(_counts(data))
@@ -174,6 +179,6 @@ def remove(obj: Any) -> None:
     """Removes the stand-in of ``obj``, which then casts its own shadow."""
     for child in [c for c in obj.children if c.get(STAND_IN)]:
         _delete(child)
-    if baking.POINTS in obj:
-        del obj[baking.POINTS]
+    for name in (baking.POINTS, SURFACE, FINE):
+        obj.pop(name, None)
     obj.visible_shadow = obj.visible_diffuse = True
