@@ -103,7 +103,7 @@ def test_outputs_have_names_and_places():
     np.testing.assert_allclose(moved.means, few_splats().means - [0, 0, 1], atol=1e-6)
     with pytest.raises(OptionsError, match="origin: too far from the scene"):
         placed(few_splats(), (1e12, 0, 0))
-    with pytest.raises(OptionsError, match=r"output must end in .*, got 'a.stl'"):
+    with pytest.raises(OptionsError, match=r"output must end in .*, got 'a.stl'; 'meshsplats surface' makes"):
         check_mesh_suffix(Path("a.stl"))
     with pytest.raises(OptionsError, match=r"not as .glb2"):
         check_splat_endings("ply", "glb2")

@@ -33,6 +33,7 @@ _POINTS = (
     " mesh of the photographs of a scene, trainers such as Brush make splats of them"
 )
 _SCENE = "export it as .glb"
+_PRINT = f"which is not read: {_SCENE} or .obj; 'meshsplats surface' makes .glb of splats, too"
 _CODE = "which could run anything when it is opened, and is not read"
 _PICKLE = f"a pickle of Python, {_CODE}: save the splats as .ply"
 _KINDS: Sequence[_Kind] = (
@@ -44,10 +45,9 @@ _KINDS: Sequence[_Kind] = (
     _Kind(".blend", rb"BLENDER", f"a file of Blender: {_SCENE}"),
     _Kind(".max .ma .mb .c4d .3ds .skp .lwo .hip", b"", f"a scene of a modelling program: {_SCENE} there"),
     _Kind(".dae", rb"(<\?xml[^>]*>\s*)?<COLLADA", f"a COLLADA scene: {_SCENE}"),
-    _Kind(".stl", rb"solid [^\n]*\n\s*facet", f"an STL mesh: {_SCENE} or .obj"),
-    _Kind(
-        ".3mf .abc .x3d .wrl .step .stp .iges", b"", f"a mesh of a kind that is not read: {_SCENE} or .obj"
-    ),
+    _Kind(".stl", rb"solid [^\n]*\n\s*facet|MeshSplats, millimetres", f"an STL mesh, {_PRINT}"),
+    _Kind(".3mf", b"", f"a mesh for printing, {_PRINT}"),
+    _Kind(".abc .x3d .wrl .step .stp .iges", b"", f"a mesh of a kind that is not read: {_SCENE} or .obj"),
     _Kind(".psht", b"", "a project of Postshot: export the splats as .ply there"),
     _Kind(".ssproj", b"", "a project of SuperSplat: export the splats as .ply there"),
     _Kind(".psx .psz .rcproj .rsproj", b"", "a project of photogrammetry: export COLMAP's format there"),

@@ -122,6 +122,8 @@ def check_mesh_suffix(path: Path, remedy: str = "") -> None:
     """OptionsError, which ends with the ``remedy``, if no mesh can be written under this name."""
     if mesh_format_to_write(path) is None:
         known = ", ".join(written_mesh_suffixes())
+        if path.suffix.lower() in (".stl", ".3mf"):
+            remedy = f"; 'meshsplats surface' makes solids for printing, as {path.suffix}"
         raise OptionsError(f"``output`` must end in {known}, got {path.name!r}{remedy}")
 
 
@@ -188,6 +190,8 @@ def check_outputs(
         if not above.is_dir():
             raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
         if not os.access(above, os.W_OK):
+            if hasattr(os, "statvfs") and os.statvfs(above).f_flag & os.ST_RDONLY:
+                raise OSError(errno.EROFS, "this folder is on a read-only file system", str(above))
             raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
 
 
