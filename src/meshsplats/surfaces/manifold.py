@@ -67,7 +67,7 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def apart(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(n, 3) float64 vertices of a solid, of which none are at one place as float32.
 
-    Those that were have moved a little towards their neighbours, into the solid, or, where hollows touch, into
+    Those that were have moved a little towards their neighbours, into the solid or, where hollows touch, into
     these: away from each other. The one whose triangles reach around most stays.
     """
     from scipy.sparse import coo_matrix
