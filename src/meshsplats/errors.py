@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 
@@ -25,6 +26,13 @@ def with_options(text: str, how: Callable[[str], str]) -> str:
 
 class FileFormatError(NamingOptions, ValueError):
     """A file that cannot be read: broken, truncated, hostile or of another format."""
+
+    @property
+    def filename(self) -> str | None:
+        """The file or folder that the message begins with, as of an ``OSError``; None if there is none."""
+        parts = str(self).split(": ")
+        heads = (": ".join(parts[:count]) for count in range(1, len(parts)))
+        return next((head for head in heads if os.path.lexists(head)), None)
 
 
 class OverwritingError(ValueError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from meshsplats._files.atomic import refuse_existing
 from meshsplats._files.locks import lock_of, locked
-from meshsplats.errors import FileFormatError, OptionsError, OverwritingError
+from meshsplats.errors import DataWarning, FileFormatError, OptionsError, OverwritingError
 from meshsplats.formats.mesh_formats import mesh_format_to_write, mesh_suffixes
 from meshsplats.formats.outputs import (
     CONFIGURATION,
@@ -166,11 +167,15 @@ def _taken(paths: Sequence[Path], doubt: str) -> FileExistsError:
 
 def sources(paths: Sequence[Path]) -> list[Path]:
     """``paths``, with the splats and meshes inside in place of a folder that is no model, by name: of models,
-    files, links that lead nowhere and zip archives of splats. Raises FileNotFoundError, and FileFormatError
-    for a folder without any."""
+    files, links that lead nowhere, pipes and zip archives of splats. A DataWarning tells of folders in it that
+    are named as files. Raises FileNotFoundError, and FileFormatError for a folder without any."""
     found: list[Path] = []
     for path in paths:
-        found += _inside(path) if path.is_dir() else [path]
+        some = _inside(path) if path.is_dir() else [path]
+        for folder in sorted(path.iterdir()) if path not in some else ():
+            if folder.is_dir() and folder.name.lower().endswith(_suffixes()) and folder not in some:
+                warnings.warn(f"{folder}: a folder without splats, passed over", DataWarning, stacklevel=2)
+        found += some
     return found
 
 
@@ -274,6 +279,10 @@ def _is_splats(folder: Path) -> bool:
     return True
 
 
+def _suffixes() -> tuple[str, ...]:
+    return (*mesh_suffixes(), *splat_suffixes())
+
+
 def _inside(folder: Path) -> list[Path]:
     if _is_splats(folder):
         return [folder]
@@ -282,7 +291,7 @@ def _inside(folder: Path) -> list[Path]:
         for path in folder.iterdir()
         if path.is_dir() and not path.name.startswith(".") and _is_splats(path)
     ]
-    files = files_named(folder, (*mesh_suffixes(), *splat_suffixes()))
+    files = files_named(folder, _suffixes())
     found = sorted([*models, *files, *archives_of_splats(folder)])
     if not found:
         splat_file(folder)  # says what is wrong

@@ -156,6 +156,22 @@ def test_files_that_cannot_be_read_are_not_passed_over(tmp_path, monkeypatch, ca
     assert [path.name for path in stream_gaussians(folder).paths] == ["one.zip"]
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_pipes_and_folders_that_are_named_as_files_are_not_passed_over_in_silence(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    Path("scans", "sub.ply").mkdir(parents=True)
+    save_gaussians(few_splats(), "scans/a.ply")
+    os.mkfifo("scans/pipe.ply")
+    Path("scans/torn.ply").write_bytes(b"ply\nformat")
+    assert run("scans", "-o", "out", "--no-sidecar", "--json") == 1
+    out, err = capsys.readouterr()
+    assert "scans/sub.ply: a folder without splats, passed over" in err
+    assert "scans/pipe.ply: a pipe, not a file" in err
+    assert [line["error"]["path"] for line in lines(out)[1:]] == ["scans/pipe.ply", "scans/torn.ply"]
+
+
 def test_messages_about_one_of_several_inputs_name_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     cloud = few_splats()

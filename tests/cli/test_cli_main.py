@@ -143,6 +143,16 @@ def test_commands_are_quoted_for_the_shell_of_the_system(monkeypatch, platform, 
     assert command_line(["meshsplats", Path("info"), word]) == f"meshsplats info {written}"
 
 
+def test_errors_of_files_know_them(tmp_path):
+    path = tmp_path / "a: b.ply"
+    for message in (f"{path}: broken", f"{path}: property x: twice"):
+        assert messages.error_record(FileFormatError(message))["path"] is None
+    path.touch()
+    for message in (f"{path}: broken", f"{path}: property x: twice"):
+        assert messages.error_record(FileFormatError(message))["path"] == str(path)
+    assert messages.error_record(ValueError("empty"))["path"] is None
+
+
 def test_a_folder_in_place_of_a_file_is_named_as_one(monkeypatch, tmp_path):
     """Windows says that the permission is denied."""
     error = PermissionError(errno.EACCES, "Permission denied", str(tmp_path))

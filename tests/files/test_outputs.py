@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +39,7 @@ from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.formats.outputs import check_outputs
 from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh, save_mesh_blocks
 from meshsplats.images.writing import encode_array, save_animation, save_image
@@ -549,3 +551,12 @@ def test_locks_end_with_their_process(tmp_path):
                 break
     assert ours
     assert not path.exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "statvfs"), reason="no such question here")
+@pytest.mark.parametrize(("flags", "why"), [(1, "read-only file system"), (0, "no permission")])
+def test_a_folder_that_nothing_may_be_written_in_says_why(tmp_path, monkeypatch, flags, why):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=flags))
+    with pytest.raises(OSError, match=why):
+        check_outputs([tmp_path / "a.glb"], False)

@@ -61,8 +61,8 @@ def exit_code(error: BaseException) -> int:
 
 def error_record(error: BaseException) -> dict[str, Any]:
     """``error`` for JSON."""
-    path = os.fsdecode(error.filename) if isinstance(error, OSError) and error.filename else None
-    code = exit_code(error)
+    code, name = exit_code(error), getattr(error, "filename", None)
+    path = shown_path(os.fsdecode(name)) if name else None
     named = {"kind": KINDS[code], "code": code, "message": one_line(error), "path": path}
     return named | {"type": type(error).__name__}
 

@@ -90,16 +90,11 @@ def splat_file(path: Path) -> Path:
 
 def files_named(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     """The files of ``folder`` whose names end in one of ``suffixes``, by name; hidden ones are left out.
-    Links that lead nowhere are among them: whoever reads one says so."""
+    Links that lead nowhere and pipes are among them: whoever reads one says so."""
     return sorted(
         path
         for path in folder.iterdir()
         if path.name.lower().endswith(tuple(suffixes))
         and not path.name.startswith(".")
-        and (path.is_file() or is_broken_link(path))
+        and not path.is_dir()
     )
-
-
-def is_broken_link(path: Path) -> bool:
-    """Whether ``path`` is a symbolic link to what does not exist."""
-    return path.is_symlink() and not path.exists()
