@@ -167,8 +167,8 @@ def _taken(paths: Sequence[Path], doubt: str) -> FileExistsError:
 
 def sources(paths: Sequence[Path]) -> list[Path]:
     """``paths``, with the splats and meshes inside in place of a folder that is no model, by name: of models,
-    files, links that lead nowhere, pipes and zip archives of splats. A DataWarning tells of folders in it that
-    are named as files. Raises FileNotFoundError, and FileFormatError for a folder without any."""
+    files, links that lead nowhere, pipes and zip archives of splats. A DataWarning tells of other folders in it
+    with the name of a file. Raises FileNotFoundError, and FileFormatError for a folder without any."""
     found: list[Path] = []
     for path in paths:
         some = _inside(path) if path.is_dir() else [path]

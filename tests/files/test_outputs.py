@@ -39,9 +39,9 @@ from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.formats.outputs import check_outputs
 from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh, save_mesh_blocks
+from meshsplats.formats.outputs import check_outputs
 from meshsplats.images.writing import encode_array, save_animation, save_image
 from meshsplats.mesh import SplatMesh
 

@@ -94,7 +94,5 @@ def files_named(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(
         path
         for path in folder.iterdir()
-        if path.name.lower().endswith(tuple(suffixes))
-        and not path.name.startswith(".")
-        and not path.is_dir()
+        if path.name.lower().endswith(tuple(suffixes)) and not path.name.startswith(".") and not path.is_dir()
     )
