@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import levels, light_state, materials, meshes, versions
+from meshsplats.blender.inside import deforming, levels, light_state, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIGHT
 from meshsplats.blender.options import CAREFUL
@@ -117,6 +117,7 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
                 shown = {}
             if shown:
                 levels.show(chain, obj[levels.LEVEL])
+            deforming.follow(obj)
             shows = [(target, "hide_render", False), (target, "hide_viewport", False)]
             stand_in = [child for child in obj.children if child.get(light_state.STAND_IN)]
             try:

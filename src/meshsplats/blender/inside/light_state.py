@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator
 from typing import Any
 
-from meshsplats.blender.inside import meshes, versions
+from meshsplats.blender.inside import deforming, meshes, versions
 from meshsplats.blender.inside.host import bpy
 
 STAND_IN = "meshsplats_stand_in"
@@ -17,13 +17,45 @@ _SHAPES = ("MESH", "POINTCLOUD", "CURVE", "CURVES", "SURFACE", "META", "FONT", "
 _VALUES = ("BOOLEAN", "INT", "FLOAT", "ENUM", "STRING")
 _LOOKS = {
     *("name", "label", "select", "width", "height", "location", "location_absolute", "hide", "mute_ui"),
-    *("show_expanded", "show_options", "show_preview", "show_texture", "is_active", "use_pin_to_last"),
-    *("show_viewport", "show_in_editmode", "show_on_cage", "use_custom_color", "color_tag", "preview_ui"),
+    *("is_active", "use_pin_to_last", "use_custom_color", "color_tag", "preview_ui"),
     *("active_texture_index", "active_material_index", "use_fake_user", "tag", "warning_propagation"),
-    *("parent_index", "execution_time", "persistent_uid", "show_gizmo", "use_extra_user", "bl_icon"),
+    *("parent_index", "execution_time", "persistent_uid", "use_extra_user", "bake_directory"),
     "use_nodes",  # always, from Blender 5 on, where asking for it warns
 }
-"""RNA properties that do not change images."""
+"""RNA properties that do not change images; those of ``_SHOWN`` neither."""
+_SHOWN = ("bl_", "open_", "show_")
+_UNLIKE = {
+    *("shadow_buffer_bias", "shadow_color", "use_contact_shadow", "contact_shadow_distance"),
+    *("contact_shadow_bias", "contact_shadow_thickness", "shadow_method", "socket_idname", "bake_target"),
+    *("use_backface_culling_lightprobe_volume", "subsurface_method", "falloff", "flip_axis"),
+}
+"""RNA properties that Blender 5.3 lacks, or reads from a file of 4.2 with another value: all of little
+influence on light, or of none."""
+_NEWER = {
+    **{"exposure": 0.0, "normalize": True, "temperature": 6500.0, "use_temperature": False},
+    **{"edge_weight": "bevel_weight_edge", "vertex_weight": "bevel_weight_vert"},
+    **{"use_adaptive_subdivision": False, "adaptive_space": "PIXEL", "adaptive_pixel_size": 1.0},
+    **{"adaptive_object_edge_length": 0.01, "fill_rule": "EVEN_ODD", "fill_solver": "SWEEP_LINE"},
+    **{"surface_collision_distance": 0.005, "base": "DISPLACED", "convention": "OPENGL"},
+    "phase": "HENYEY_GREENSTEIN",
+}
+"""RNA properties that Blender 4.2 lacks, with the values that they have in its files, which do not count."""
+_NEWER_INPUTS = {
+    "ShaderNodeAttribute": {"LightIndex"},
+    "ShaderNodeBsdfGlass": {"Anisotropy", "Rotation", "Tangent", "Thin Film Thickness", "Thin Film IOR"},
+    "ShaderNodeBsdfPrincipled": {
+        *("Thin Wall", "Diffuse Roughness"),
+        *("Transmission Dispersion Scale", "Transmission Dispersion Abbe Number"),
+    },
+    "ShaderNodeBump": {"Filter Width"},
+    "ShaderNodeVectorTransform": {"LightIndex"},
+    "ShaderNodeVolumeScatter": {"IOR", "Backscatter", "Alpha", "Diameter"},
+}
+"""Inputs of nodes that Blender 4.2 lacks; their values do not count."""
+_RENAMED = {"dust_density": "aerosol_density", "NISHITA": "SINGLE_SCATTERING"}
+"""Names and values of RNA properties of Blender 4.2: what they are called in 5.3."""
+_CONSTANTS = ("ShaderNodeValue", "ShaderNodeRGB", "ShaderNodeNormal")
+"""Nodes whose outputs hold values."""
 _RAYS = ("diffuse", "glossy", "transmission", "volume_scatter", "shadow")
 """Those that bring light, or take it."""
 _WHOLE = 300_000
@@ -34,16 +66,17 @@ _LONG = 0.02
 """Processor seconds: what takes as long delays the window."""
 _REST = 30
 """After which multiple of its time a state that takes long is looked for again."""
+_ZERO = 1e-6
 _known: dict[tuple[str, ...], tuple[float, float, str]] = {}
 """When they began, how long they took, and what was found."""
 
 
 def state(scene: Any, obj: Any, layer: Any = None) -> str:
     """A checksum of what lights the splats ``obj`` in the view layer ``layer``, the active one by default:
-    lamps, sky, and what is rendered, with its modifiers and materials. Of other splats, only their places and
-    sizes: their light does not come from their nodes."""
+    lamps, sky, and what is rendered, with its modifiers and materials. Of splats, only their places, sizes
+    and what deforms them: their light does not come from their nodes."""
     layer = layer or bpy.context.view_layer
-    parts: list[Any] = [_numbers(obj.matrix_world)]
+    parts: list[Any] = [_numbers(obj.matrix_world), *_deformation(obj)]
     used: dict[str, Any] = {}
     for other in sorted(set(rendered(layer.layer_collection)), key=lambda other: other.name):
         if other != obj and not (other.parent == obj and other.get(STAND_IN)):
@@ -101,13 +134,18 @@ def _object(obj: Any, used: dict[str, Any]) -> list[Any]:
     if obj.type not in _SHAPES:
         return []
     if _LIT in obj.data:
-        return [*parts, meshes.size(obj.data)]
+        return [*parts, meshes.size(obj.data), *_deformation(obj)]
     used |= {slot.material.name: slot.material for slot in obj.material_slots if slot.material is not None}
-    for modifier in obj.modifiers:
+    return parts + _deformation(obj) + _shape(obj.data)
+
+
+def _deformation(obj: Any) -> list[Any]:
+    """Modifiers and shape keys of ``obj``."""
+    parts = []
+    for modifier in deforming.deformers(obj):
         parts += [*_values(modifier), *_targets(modifier)] if modifier.show_render else []
     keys = getattr(obj.data, "shape_keys", None)
-    parts += [] if keys is None else [[key.name, _plain(key.value), key.mute] for key in keys.key_blocks]
-    return parts + _shape(obj.data)
+    return parts + ([] if keys is None else [[k.name, _plain(k.value), k.mute] for k in keys.key_blocks])
 
 
 def _members(linked: Any) -> list[Any]:
@@ -162,12 +200,14 @@ def _block(block: Any) -> list[Any]:
 
 
 def _nodes(tree: Any, outer: frozenset[str]) -> list[Any]:
-    if tree is None or tree.name in outer:
+    if tree is None or tree.name in outer or _is_as_made(tree):
         return []
     parts: list[Any] = []
     for node in tree.nodes:
         parts += [node.name, node.bl_idname, *_values(node)]
-        for socket in (*node.inputs, *node.outputs):
+        newer = _NEWER_INPUTS.get(node.bl_idname, ())
+        inputs = (socket for socket in node.inputs if socket.identifier not in newer)
+        for socket in (*inputs, *(node.outputs if node.bl_idname in _CONSTANTS else ())):
             if hasattr(socket, "default_value") and not socket.is_linked:
                 parts.append(_plain(socket.default_value))
         image = getattr(node, "image", None)
@@ -184,24 +224,32 @@ def _nodes(tree: Any, outer: frozenset[str]) -> list[Any]:
     return parts + sorted(ends)
 
 
+def _is_as_made(tree: Any) -> bool:
+    """Whether ``tree`` only has the nodes that every lamp has from Blender 5 on, as they come."""
+    kinds = {node.bl_idname: node for node in tree.nodes}
+    if len(tree.nodes) != 2 or set(kinds) != {"ShaderNodeEmission", "ShaderNodeOutputLight"}:
+        return False
+    color, strength = kinds["ShaderNodeEmission"].inputs[:2]
+    return _plain(color.default_value) == [1.0] * 4 and strength.default_value == 1
+
+
 def _values(owner: Any) -> list[Any]:
-    """Names and values of the RNA properties of ``owner`` that a user may set."""
+    """Names and values of the RNA properties of ``owner`` that a user may set, in the order of the names."""
     found = []
     for prop in owner.bl_rna.properties:
         name = prop.identifier
-        if (
-            prop.type in _VALUES
-            and not prop.is_readonly
-            and name not in _LOOKS
-            and not name.startswith("bl_")
-        ):
-            found.append((name, _plain(getattr(owner, name, None))))
-    return found
+        if prop.type not in _VALUES or prop.is_readonly or name in _LOOKS | _UNLIKE:
+            continue
+        value = _plain(getattr(owner, name, None))
+        if not (name.startswith(_SHOWN) or (name in _NEWER and value == _NEWER[name])):
+            value = _RENAMED.get(value, value) if isinstance(value, str) else value
+            found.append((_RENAMED.get(name, name), value))
+    return sorted(found, key=lambda pair: pair[0])
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, float):
-        return float(f"{value:.4g}") + 0.0
+        return _number(value)
     if isinstance(value, (bool, int, str)) or value is None:
         return value
     if isinstance(value, (set, frozenset)):
@@ -212,4 +260,9 @@ def _plain(value: Any) -> Any:
 
 
 def _numbers(rows: Any) -> list[float]:
-    return [float(f"{value:.4g}") + 0.0 for row in rows for value in row]
+    return [_number(value) for row in rows for value in row]
+
+
+def _number(value: float) -> float:
+    """Four digits of ``value``; none of what rounding leaves of zero."""
+    return float(f"{value:.4g}") if abs(value) > _ZERO else 0.0
