@@ -167,14 +167,15 @@ def _taken(paths: Sequence[Path], doubt: str) -> FileExistsError:
 
 def sources(paths: Sequence[Path]) -> list[Path]:
     """``paths``, with the splats and meshes inside in place of a folder that is no model, by name: of models,
-    files, links that lead nowhere, pipes and zip archives of splats. A DataWarning tells of other folders in it
-    with the name of a file. Raises FileNotFoundError, and FileFormatError for a folder without any."""
+    files, links that lead nowhere, pipes and zip archives of splats. A DataWarning tells of other folders
+    that are named as files. Raises FileNotFoundError, and FileFormatError for a folder without any."""
     found: list[Path] = []
     for path in paths:
         some = _inside(path) if path.is_dir() else [path]
-        for folder in sorted(path.iterdir()) if path not in some else ():
-            if folder.is_dir() and folder.name.lower().endswith(_suffixes()) and folder not in some:
-                warnings.warn(f"{folder}: a folder without splats, passed over", DataWarning, stacklevel=2)
+        for inner in sorted(path.glob("[!.]*")) if path not in some else ():
+            if inner.is_dir() and inner.name.lower().endswith(_suffixes()) and inner not in some:
+                text = f"{inner}: a folder, and no model: passed over; name it to take what is in it"
+                warnings.warn(text, DataWarning, stacklevel=2)
         found += some
     return found
 
