@@ -18,15 +18,18 @@ DONE = {"delete": "deleted", "separate": "separated", "hide": "hid", "select": "
 def cut(operator, context, obj, mesh, faces, *, action="delete"):
     """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so again,
     and ``operator`` reports what was lost."""
-    from meshsplats.blender.inside import baking, cutting, materials
+    from meshsplats.blender.inside import baking, cutting, materials, objects
 
     baked = any(materials.shows_baked(material) for material in obj.data.materials)
+    even = objects.is_even(obj)
     separate = action != "delete"
     made, lost = cutting.cut(obj, mesh, faces, separate=separate, collection=obj.users_collection[0])
     report_lost(operator, {obj.name: lost})
     parts = [obj]
     if made is not None:
         copy_choices(made.meshsplats, obj.meshsplats)
+        if even:
+            objects.show_even(made)
     if action == "hide":  # before light is baked: it casts no shadow
         cutting.hide(made)
     elif made is not None:

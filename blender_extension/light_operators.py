@@ -11,6 +11,7 @@ from .settings import is_blenders
 from .work import LightWork, Modal, follow_shading, own_warnings, take_over, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
+LINEAR = ("linear", "Linear", "Colours as they are, but in linear light, for any view transform")
 
 
 DARK = 0.1
@@ -42,13 +43,19 @@ def is_dark(scene):
 
 
 class SetShading(Modal, bpy.types.Operator):
-    """Change between unlit and lit; edits since the import are kept"""
+    """Change between unlit, lit and the colours of lit ones without any light; edits since the import are
+    kept"""
 
     bl_idname = "object.meshsplats_shading"
     bl_label = "Change Shading"
     bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
 
-    shading: EnumProperty(items=SHADINGS)
+    shading: EnumProperty(items=[*SHADINGS, LINEAR])
+
+    @classmethod
+    def description(cls, context, properties):
+        (text,) = (text for name, _, text in (*SHADINGS, LINEAR) if name == properties.shading)
+        return f"{text}. {cls.__doc__}"
 
     @classmethod
     def poll(cls, context):
@@ -59,7 +66,7 @@ class SetShading(Modal, bpy.types.Operator):
     def execute(self, context):
         from meshsplats.blender.inside import foreign, levels, lit_points, objects
 
-        lit, self._own = self.shading == "lit", is_blenders(context.object)
+        lit, self._own = self.shading != "unlit", is_blenders(context.object)
         if self._own and not lit:
             lit_points.unlight(context.object)
             return {"FINISHED"}
@@ -75,13 +82,23 @@ class SetShading(Modal, bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        fast = self.shading == "lit" and context.scene.meshsplats_fast
-        return self.begin(context, LightWork(meshes, self.shading, fast))
+        fast = lit and context.scene.meshsplats_fast
+        return self.begin(context, LightWork(meshes, "lit" if lit else "unlit", fast))
 
     def done(self, context, work):
+        from meshsplats.blender.inside import baking, objects
+
         done = take_over(self, work)
-        if self._changed:
-            follow_shading(self, context.scene, self.shading == "lit")
+        for obj in map(bpy.data.objects.get, done):
+            if self.shading == "linear":
+                objects.show_even(obj)
+            elif objects.is_even(obj):
+                baking.forget([obj])
+        linear = self.shading == "linear"
+        if self._changed and not (linear and context.scene.view_settings.view_transform != "Raw"):
+            follow_shading(self, context.scene, self.shading != "unlit")
+        if linear:  # right under any view transform but Raw, without light
+            return
         if self._own:  # lamps alone do not light them
             bake(self, context, done, work.choices["fast"])
         if self.shading == "lit" and is_dark(context.scene):
@@ -233,6 +250,8 @@ class BakeLight(Modal, bpy.types.Operator):
         lit = [obj for obj in objects.subjects(context.scene) if objects.is_lit(obj)]
         if self.only_active:
             lit = [obj for obj in lit if obj == context.object]
+        else:  # linear ones are to keep their own colours
+            lit = [obj for obj in lit if not objects.is_even(obj)]
         if not lit:
             what = "the active object is not lit" if self.only_active else "no splats are lit"
             self.report({"ERROR"}, f"{what}: choose Lit for it first")

@@ -8,7 +8,7 @@ import bpy
 from .bounces import SetBounces, described, missing
 from .cut_operator import AdjustSplats, CleanSplats, CutSplats
 from .import_operator import ImportMeshSplats
-from .light_operators import BakeLight, SetShading, SetUpRender, SetUpStage
+from .light_operators import LINEAR, SHADINGS, BakeLight, SetShading, SetUpRender, SetUpStage
 from .object_operators import ConvertAgain, ConvertSplats, FitLevel, FollowBase, ShowLevel
 from .settings import LIT, draw_choices, is_blenders
 
@@ -20,9 +20,20 @@ BREAK_SPLATS = {"BOOLEAN", "DECIMATE", "REMESH", "SUBSURF", "MULTIRES", "SOLIDIF
 """Modifiers that make other triangles."""
 
 
+def shading_of(obj):
+    """The shading of ``obj``, as ``SetShading`` names it; None where it has none."""
+    if LIT not in obj.data:
+        return "unlit" if is_blenders(obj) else None
+    if not obj.data[LIT]:
+        return "unlit"
+    from meshsplats.blender.inside import objects
+
+    return "linear" if objects.is_even(obj) else "lit"
+
+
 def light_warning(scene, obj):
     """What is wrong with the baked light of ``obj``, or ''."""
-    if not obj.data.get(LIT) or obj.get("meshsplats_base") is not None:
+    if shading_of(obj) != "lit" or obj.get("meshsplats_base") is not None:
         return ""
     from meshsplats.blender.inside import baking, stand_ins
 
@@ -54,15 +65,14 @@ def draw_blenders(layout, scene, obj):
     if warning:
         draw_warning(layout, warning)
     layout.label(text="Light of these splats")
-    draw_shadings(layout, bool(obj.data.get(LIT)))
+    draw_shadings(layout, shading_of(obj))
 
 
 def draw_shadings(layout, now):
-    """Buttons for unlit and lit; ``now``: whether the object is lit, None where it is neither."""
+    """Buttons for the shadings, of which ``now`` is that of the object, or None."""
     row = layout.row(align=True)
-    for shading, lit in (("unlit", False), ("lit", True)):
-        shown = now is not None and bool(now) == lit
-        row.operator(SetShading.bl_idname, text=shading.capitalize(), depress=shown).shading = shading
+    for shading, text, _ in (*SHADINGS, LINEAR):
+        row.operator(SetShading.bl_idname, text=text, depress=shading == now).shading = shading
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -157,12 +167,13 @@ class MeshSplatsPanel(bpy.types.Panel):
         if LIT not in obj.data and not obj.data.color_attributes:
             return
         layout.label(text="Material and light of this object")
-        now = obj.data.get(LIT)
+        now = shading_of(obj)
         draw_shadings(layout, now)
-        if now:
+        if now == "lit":
             from meshsplats.blender.inside import materials
 
             baked = any(materials.shows_baked(material) for material in obj.data.materials)
+            row = layout.row(align=True)
             for live, text in ((False, "Baked"), (True, "Live")):
                 button = row.operator(BakeLight.bl_idname, text=text, depress=baked != live)
                 button.live, button.only_active, button.fast = live, True, bpy.context.scene.meshsplats_fast

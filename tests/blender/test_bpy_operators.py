@@ -25,16 +25,21 @@ from meshsplats.blender.inside import (
     far_to_near,
     materials,
     meshes,
+    notes,
     objects,
+    rendering,
     setting,
     sorted_copies,
+    stage,
     stand_ins,
     views,
 )
 from meshsplats.conversion import merging_views
 from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
+from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.images.reading import load_image
 
 
 @pytest.fixture
@@ -295,6 +300,58 @@ def test_sliders_show_colours_before_they_are_accepted(ball, extension, lit):
     assert dialog.execute(context) == {"FINISHED"}
     np.testing.assert_allclose(objects.as_splat_mesh(ball).colors[:, :3], shown[:, :3] / 2, atol=1e-4)
     assert not stand_ins.is_current(ball)
+
+
+@pytest.mark.slow
+def test_linear_shows_the_same_colours_in_any_light_under_the_view_transform(ball, extension, tmp_path):
+    """Of a saved file with other objects, whose import says so; and what keeps them so."""
+    name, scene = ball.name, bpy.context.scene
+    bpy.ops.object.meshsplats_clean()
+    scene.meshsplats_fast, scene.render.engine = True, "CYCLES"
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera.location, scene.camera.rotation_euler = (0, -4, 1), (np.pi / 2, 0, 0)
+    scene.collection.objects.link(scene.camera)
+    scene.render.resolution_x = scene.render.resolution_y = 40
+    stage.even_world((0, 0, 0))
+
+    def image(file):
+        rendering.render_to(scene, tmp_path / f"{file}.png")
+        return load_image(tmp_path / f"{file}.png") / np.float32(255)
+
+    exact = image("exact")
+    scene.view_settings.view_transform, scene.cycles.samples = "Standard", 16
+    pale = image("pale")
+    bpy.ops.object.meshsplats_shading(shading="linear")
+    ball = bpy.data.objects[name]
+    assert scene.view_settings.view_transform == "Standard"
+    panel = sys.modules["blender_extension.panel"]
+    assert (panel.shading_of(ball), panel.light_warning(scene, ball)) == ("linear", "")
+    dark = image("dark")
+    assert psnr(dark, exact) > psnr(pale, exact) + 6
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    sun.data.energy = 9
+    scene.collection.objects.link(sun)
+    np.testing.assert_allclose(image("sunny"), dark, atol=0.02)
+    with pytest.raises(RuntimeError, match="no splats are lit"):
+        bpy.ops.scene.meshsplats_bake_light(fast=True)
+    bpy.context.view_layer.objects.active = ball
+    bpy.ops.object.meshsplats_cut(action="separate", shape="all", by_color=True, color=(0.8, 0.2, 0.1))
+    parts = objects.splat_objects(scene)
+    assert [panel.shading_of(part) for part in parts] == ["linear"] * 2
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    assert [panel.shading_of(part) for part in parts].count("lit") == 1
+
+
+@pytest.mark.parametrize("view", ["AgX", "Raw"])
+def test_an_import_says_that_unlit_splats_look_pale(extension, tmp_path, view):
+    bpy.ops.wm.read_factory_settings()
+    bpy.context.scene.view_settings.view_transform = view
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    obj = objects.add(objects.prepare(convert(ball_splats(50)[0]), False), "ball", bpy.context.collection)
+    notes.take()
+    setting.set_up_render(bpy.context.scene, [obj], False)
+    said = any("pale under the view transform AgX: Linear" in note for note in notes.take())
+    assert said == (view == "AgX")
 
 
 @pytest.mark.slow

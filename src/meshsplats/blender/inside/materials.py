@@ -12,8 +12,8 @@ from meshsplats.spherical_harmonics import harmonic_terms
 SELF_SHADOW = "Self-shadow distance"
 """Name and label of the node with the distance within which layers do not shade each other."""
 BAKED = "Baked light"
-"""Name and label of the node that is 1 where the splats glow with the light of ``LIGHT``, 0 where the lamps
-of the scene light them."""
+"""Name and label of the node that is 1 where the splats glow with the light of ``LIGHT``, 2 where they glow
+with their own colours, in linear light, and 0 where the lamps of the scene light them."""
 LIT = "meshsplats_lit"
 """Property of the data of splats: whether their colours are linear light and their material lit."""
 LIGHT = "Light"
@@ -124,7 +124,7 @@ def lit(
     alpha = tree.math("MULTIPLY", 2, 5, color.outputs["Alpha"], seen)
     baked = tree.node("ShaderNodeValue", 0, 8, name=BAKED, label=BAKED)
     baked.outputs[0].default_value = 0
-    glow = _glow(tree, color.outputs["Color"])
+    glow = _glow(tree, color.outputs["Color"], baked.outputs[0])
     both = tree.node("ShaderNodeMixShader", 4, 0)
     tree.link(baked.outputs[0], versions.socket(both.inputs, "Fac", "Factor"))
     tree.link(shader, both.inputs[1])
@@ -140,19 +140,23 @@ def glowing(attribute: str, name: str = "Splats, lit") -> Any:
     tree = _Tree(material)
     color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
     out = tree.node("ShaderNodeOutputMaterial", 4, 0)
-    tree.link(_glow(tree, color.outputs["Color"]), out.inputs["Surface"])
     baked = tree.node("ShaderNodeValue", 0, 2, name=BAKED, label=BAKED)
     baked.outputs[0].default_value = 1
+    tree.link(_glow(tree, color.outputs["Color"], baked.outputs[0]), out.inputs["Surface"])
     material.cycles.emission_sampling = "NONE"
     return material
 
 
-def _glow(tree: _Tree, color: Any) -> Any:
-    """Output that glows with ``color`` times the light of ``LIGHT``."""
-    light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
+def _glow(tree: _Tree, color: Any, baked: Any) -> Any:
+    """Output that glows with ``color`` times the light of ``LIGHT``, or 1 where ``baked`` is 2."""
+    stored = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
+    light = tree.node("ShaderNodeVectorMath", 1, -1, operation="MULTIPLY_ADD")
+    tree.link(stored.outputs["Color"], light.inputs[0])
+    tree.link(tree.math("SUBTRACT", 0, -1, 2.0, baked), light.inputs[1])
+    tree.link(tree.math("SUBTRACT", 0, -2, baked, 1.0), light.inputs[2])
     product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
     tree.link(color, product.inputs[0])
-    tree.link(light.outputs["Color"], product.inputs[1])
+    tree.link(light.outputs[0], product.inputs[1])
     glow = tree.node("ShaderNodeEmission", 3, 0)
     tree.link(product.outputs[0], glow.inputs["Color"])
     return glow.outputs[0]
@@ -212,15 +216,34 @@ def _polynomial(tree: _Tree, d: tuple[Any, Any, Any], k: int) -> Any:
 
 def set_baked(material: Any, baked: bool) -> None:
     """Has the lit ``material`` show baked light, or that of the scene's lamps."""
-    node = material.node_tree.nodes.get(BAKED) if material is not None and material.node_tree else None
-    if node is not None:
-        node.outputs[0].default_value = float(baked)
+    _set_light(material, float(baked))
+
+
+def set_even(material: Any) -> None:
+    """Has the lit ``material`` glow with its own colours, in linear light, whatever light there is."""
+    _set_light(material, 2.0)
 
 
 def shows_baked(material: Any) -> bool:
     """Whether the lit ``material`` shows baked light."""
+    return _light_of(material) == 1
+
+
+def shows_even(material: Any) -> bool:
+    """Whether the lit ``material`` glows with its own colours."""
+    return _light_of(material) == 2
+
+
+def _set_light(material: Any, value: float) -> None:
     node = material.node_tree.nodes.get(BAKED) if material is not None and material.node_tree else None
-    return node is not None and node.outputs[0].default_value > 0.5
+    if node is not None:
+        node.outputs[0].default_value = value
+
+
+def _light_of(material: Any) -> float:
+    """The value of the node ``BAKED``; 0 where there is none."""
+    node = material.node_tree.nodes.get(BAKED) if material is not None and material.node_tree else None
+    return 0.0 if node is None else node.outputs[0].default_value
 
 
 def stand_in(name: str = "Stand-in", *, fine: bool = False, self_shadow: float = 0.0) -> Any:

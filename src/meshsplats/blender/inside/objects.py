@@ -145,6 +145,17 @@ def is_lit(obj: Any) -> bool | None:
     return bool(obj.data[LIT]) if obj.type == "MESH" and LIT in obj.data else None
 
 
+def is_even(obj: Any) -> bool:
+    """Whether the splats ``obj`` are lit, but glow with their own colours whatever light there is."""
+    return any(map(materials.shows_even, obj.data.materials))
+
+
+def show_even(obj: Any) -> None:
+    """Has the lit splats ``obj`` glow with their own colours, in linear light."""
+    for material in obj.data.materials:
+        materials.set_even(material)
+
+
 def replace_mesh(obj: Any, prepared: dict[str, Any], onto: Any = None) -> list[str]:
     """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay. So does what
     an artist has added to a mesh of the same triangles, or to ``onto``, a part of it (``cutting``).
@@ -162,8 +173,11 @@ def replace_mesh(obj: Any, prepared: dict[str, Any], onto: Any = None) -> list[s
         onto = remaking.copied(old)
     elif onto is None:
         lost = remaking.added(obj)
+    even = is_even(obj)
     data = _data(prepared, name, onto)
     obj.data = data
+    if prepared["lit"] and even:
+        show_even(obj)
     if onto is None:
         remaking.take_properties(data, old)
     far_to_near.add(obj, viewport=False)

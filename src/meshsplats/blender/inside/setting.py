@@ -117,8 +117,10 @@ def set_up_render(scene: Any, objs: list[Any], lit: bool, *, chosen: bool = Fals
         return
     versions.enable_cycles()
     rendering.layers_alone(scene, bounce_limit(bounces.layers_of(scene.objects)) if lit else 1024)
-    button = "Lit" if lit else "Exact"
+    button, seen = "Lit" if lit else "Exact", scene.view_settings.view_transform
     notes.add(f"this file has other objects, so its render settings stay: {button} in the panel sets them")
+    if not lit and seen != "Raw" and not all(obj.data.get(objects.LINEAR) for obj in objs):
+        notes.add(f"unlit, splats look pale under the view transform {seen}: Linear in the panel is for it")
 
 
 def _has_others(scene: Any) -> bool:
