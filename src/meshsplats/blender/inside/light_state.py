@@ -31,6 +31,7 @@ _UNLIKE = {
 }
 """RNA properties that Blender 5.3 lacks, or reads from a file of 4.2 with another value: all of little
 influence on light, or of none."""
+_SKIPPED = _LOOKS | _UNLIKE
 _NEWER = {
     **{"exposure": 0.0, "normalize": True, "temperature": 6500.0, "use_temperature": False},
     **{"edge_weight": "bevel_weight_edge", "vertex_weight": "bevel_weight_vert"},
@@ -238,10 +239,10 @@ def _values(owner: Any) -> list[Any]:
     found = []
     for prop in owner.bl_rna.properties:
         name = prop.identifier
-        if prop.type not in _VALUES or prop.is_readonly or name in _LOOKS | _UNLIKE:
+        if prop.type not in _VALUES or prop.is_readonly or name in _SKIPPED or name.startswith(_SHOWN):
             continue
         value = _plain(getattr(owner, name, None))
-        if not (name.startswith(_SHOWN) or (name in _NEWER and value == _NEWER[name])):
+        if name not in _NEWER or value != _NEWER[name]:
             value = _RENAMED.get(value, value) if isinstance(value, str) else value
             found.append((_RENAMED.get(name, name), value))
     return sorted(found, key=lambda pair: pair[0])
