@@ -8,6 +8,7 @@ import bpy
 from .bounces import SetBounces, described, missing
 from .cut_operator import AdjustSplats, CleanSplats, CutSplats
 from .import_operator import ImportMeshSplats
+from .instances import instance_warnings
 from .light_operators import LINEAR, SHADINGS, BakeLight, SetShading, SetUpRender, SetUpStage
 from .object_operators import ConvertAgain, ConvertSplats, FitLevel, FollowBase, ShowLevel
 from .settings import LIT, draw_choices, is_blenders
@@ -95,6 +96,8 @@ class MeshSplatsPanel(bpy.types.Panel):
         for collection in context.scene.collection.children_recursive:
             if CHAIN in collection:
                 self._chain(layout, collection)
+        for warning in instance_warnings(context.scene):
+            draw_warning(layout, warning)
         layout.separator()
         layout.label(text="Light, ground and camera")
         layout.prop(context.scene, "meshsplats_fast")
