@@ -111,6 +111,8 @@ def test_triangles_back_to_back_are_left_out():
     made, left = solid(points, faces)
     assert_solid(made, left)
     assert len(left) == 24
+    assert [len(part) for part in solid(square, both)] == [0, 0]
+    assert [len(part) for part in solid(points, faces[:, ::-1])] == [0, 0], "inside out"
     assert volume(made, left) == pytest.approx(2)
 
 

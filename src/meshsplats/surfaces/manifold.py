@@ -55,7 +55,10 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     are left out; so are parts that face inwards, and crumbs that were pinched off.
     """
     for _ in range(_ROUNDS):
-        vertices, faces = _fans(vertices, _without_flakes(faces))
+        faces = _without_flakes(faces)
+        if not len(faces):
+            return vertices[:0], faces
+        vertices, faces = _fans(vertices, faces)
         crowded = _edges(faces)[1]
         if not crowded:
             break
@@ -106,8 +109,6 @@ def apart(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def _without_flakes(faces: np.ndarray) -> np.ndarray:
     """The triangles without those that have a vertex twice, and without pairs back to back."""
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    if not len(faces):
-        return faces
     _, index, counts = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
     index = index.reshape(-1)
     first, row = np.argmin(faces, axis=1), np.arange(len(faces))  # the turn from there tells the winding
@@ -171,8 +172,6 @@ def _cones(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _large_solids(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The parts of a closed mesh that enclose something, and not much less than the largest."""
-    if not len(faces):
-        return vertices, faces
     part = parts_of(faces, len(vertices))
     volumes = np.bincount(part, _cones(vertices, faces))
     kept = faces[volumes[part] > _CRUMB * max(volumes.max(), 0)]
