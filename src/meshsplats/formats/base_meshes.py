@@ -143,7 +143,8 @@ def save_base(
     - `.npz`: of this project; without the texture.
     - A normal map is in `.glb`, with tangents, and USD unless they are unlit, and in `.obj` as ``norm``, a
       file NAME_normal.png beside; other formats leave it out.
-    - `.stl`, `.3mf`: the shape alone, for printing: z up, from 0 on, a scene unit is a millimetre.
+    - `.stl`, `.3mf`: the shape alone, for printing: z up, from 0 on, a scene unit is a millimetre. A
+      DataWarning says where it is no solid, as one whose edges do not have two triangles.
 
     Args:
         base: the surface; all of its faces have the first of its textures, or none has one.

@@ -103,7 +103,8 @@ def make_surface(
 
     Returns:
         The mesh in scene units and relative to the scene's origin, with a texture or, with ``texture=0``,
-        with vertex colours. A closed one has no holes and faces outwards.
+        with vertex colours. A closed one is a solid that faces outwards: with vertices at one place joined,
+        each edge has two triangles.
 
     Raises:
         ValueError: an option out of its range, a scene without extent, images that show nothing solid, or a
