@@ -180,7 +180,8 @@ def test_the_geometric_error_is_how_far_splats_are_moved(splats, tmp_path):
     cloud = type(cloud)(means, scales=np.full((n, 3), 0.5), **fields | {"opacities": np.full(n, 0.9)})
     order = rng.permutation(n)
     save_gaussian_blocks([cloud.take(order)], tmp_path / "rows.ply", n)
-    options = TileOptions(max_triangles=8 * 512, conversion=ConversionOptions(footprint="none"))
+    conversion = ConversionOptions(footprint="none")
+    options = TileOptions(max_triangles=8 * 512, alpha="mask", conversion=conversion)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(making, "SHARE", 2)
         build_tiles(stream_gaussians(tmp_path / "rows.ply"), tmp_path / "tiles", options)
