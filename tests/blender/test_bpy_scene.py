@@ -25,7 +25,7 @@ from meshsplats import (
     stream_gaussians,
 )
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import meshes, rendering
+from meshsplats.blender.inside import materials, meshes, rendering
 from meshsplats.blender.plan import PHASES
 from meshsplats.cli import main
 from meshsplats.demo_scene.city import city_blocks
@@ -224,3 +224,15 @@ def test_errors_inside_blender_come_out_in_words(tmp_path):
     with pytest.raises(BlenderError, match=r"sky\.hdr: Blender cannot read this environment image"):
         draw(random_mesh(5), cameras()[:1], images=[tmp_path / "a.png"], options=options)
     assert [path.name for path in tmp_path.iterdir()] == ["sky.hdr"]
+
+
+def test_view_layers_may_ask_for_the_smoothed_normals():
+    """By a shader AOV: each layer gives its normal, by its opacity."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    nodes = materials.lit(self_shadow=0.0).node_tree.nodes
+    (shown,) = (node for node in nodes if node.bl_idname == "ShaderNodeOutputAOV")
+    assert shown.aov_name == "Splat normal"
+    scale = shown.inputs["Color"].links[0].from_node
+    assert (scale.operation, scale.inputs["Scale"].links[0].from_socket.name) == ("SCALE", "Alpha")
+    turned = scale.inputs[0].links[0].from_node
+    assert turned.inputs["Vector"].links[0].from_node.attribute_name == meshes.NORMAL

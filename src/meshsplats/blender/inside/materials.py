@@ -14,6 +14,8 @@ SELF_SHADOW = "Self-shadow distance"
 BAKED = "Baked light"
 """Name and label of the node that is 1 where the splats glow with the light of ``LIGHT``, 2 where they glow
 with their own colours, in linear light, and 0 where the lamps of the scene light them."""
+NORMAL_AOV = "Splat normal"
+"""Name of the shader AOV with the smoothed normals in the world, whose length means nothing."""
 LIT = "meshsplats_lit"
 """Property of the data of splats: whether their colours are linear light and their material lit."""
 LIGHT = "Light"
@@ -104,6 +106,12 @@ def lit(
         )
         tree.link(normal.outputs["Vector"], turned.inputs["Vector"])
         tree.link(turned.outputs[0], surface.inputs["Normal"])
+        # Cycles adds it up over the layers; its pass Normal takes the first one that is half opaque.
+        weighted = tree.node("ShaderNodeVectorMath", 2, 4, operation="SCALE")
+        tree.link(turned.outputs[0], weighted.inputs[0])
+        tree.link(color.outputs["Alpha"], weighted.inputs["Scale"])
+        shown = tree.node("ShaderNodeOutputAOV", 3, 4, aov_name=NORMAL_AOV)
+        tree.link(weighted.outputs[0], shown.inputs["Color"])
         # Bump map correction darkens wherever the shading normal differs from the triangle's own.
         versions.set_if_there(material.cycles, use_bump_map_correction=False)
     if specular > 0:
