@@ -15,7 +15,7 @@ from PIL import Image
 
 import meshsplats as ms
 from meshsplats import draw_splats
-from meshsplats.cameras.framing import scene_bounds
+from meshsplats.cameras.framing import middle, scene_bounds
 from meshsplats.cameras.placing import has_surroundings, inside_cameras, outside_cameras
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
@@ -386,8 +386,8 @@ def test_windows_show_the_subject():
 
 
 def angles_of(cameras, cloud) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation in degrees of cameras around the middle of their optical axes, y down."""
-    center = scene_bounds(cloud).center
+    """Azimuth and elevation in degrees of cameras around the middle of their subject, y down."""
+    center = middle(scene_bounds(cloud), np.diag([1.0, -1.0, -1.0]))
     away = np.array([c.center for c in cameras]) - center
     return np.degrees(np.arctan2(away[:, 0], away[:, 2])), np.degrees(
         np.arcsin(-away[:, 1] / np.linalg.norm(away, axis=1))

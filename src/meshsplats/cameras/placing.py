@@ -12,6 +12,7 @@ from meshsplats.cameras.framing import (
     SURROUNDINGS,
     front_axes,
     guess_up,
+    middle,
     scene_bounds,
     unit_up,
     weighted_quantile,
@@ -69,7 +70,8 @@ def outside_cameras(
 ) -> list[Camera]:
     """``count`` cameras that look at the subject's middle, evenly spread over directions and distances.
 
-    Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
+    The middle is that of its extent: in the body of a guitar, where most of its splats are, its head would
+    often be out of the image. Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
     Every run of successive cameras is evenly spread, too. The other arguments are those of ``splat_dataset``.
     """
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
@@ -80,10 +82,11 @@ def outside_cameras(
     turns, heights, share = _sequence(count)
     low, high = np.sin(np.radians(elevations))
     away = fit * distance[0] * (distance[1] / distance[0]) ** share
+    target = middle(bounds, axes)
     return [
         look_at(
-            bounds.center + away[i] * _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i]),
-            bounds.center,
+            target + away[i] * _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i]),
+            target,
             up=axes[1],
             width=width,
             height=height,
