@@ -146,8 +146,8 @@ model.mkdir(parents=True)
 bpy.ops.import_scene.meshsplats(filepath=str(model / "point_cloud.ply"), at_origin=True)
 chair = bpy.context.object
 report["named"] = [chair.name, list(chair.location)]
-report["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio", fast=True))
-bpy.ops.scene.meshsplats_stage(lights="studio", fast=True)
+report["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio", camera=True, fast=True))
+bpy.ops.scene.meshsplats_stage(lights="studio", camera=True, fast=True)
 report["staged"] = sorted(c.name for c in scene.collection.children)
 report["camera"] = scene.camera.name
 report["dressed"] = chair.data.materials[0].name.startswith("Splats, lit")
@@ -213,7 +213,7 @@ report["level_materials"] = [c.objects[0].data.materials[0].name[:13] for c in c
 bpy.context.object.meshsplats.shading = "lit"
 bpy.ops.object.meshsplats_convert_again()
 report["level_materials"] += [c.objects[0].data.materials[0].name[:11] for c in collection.children]
-bpy.ops.scene.meshsplats_stage(lights="sun", fast=True)  # with a camera that just sees the ball and all else
+bpy.ops.scene.meshsplats_stage(lights="sun", camera=True, fast=True)  # which just sees the ball and all else
 scene.render.resolution_x = scene.render.resolution_y = 2000
 bpy.ops.scene.meshsplats_fit_level(chain="chain.001")
 shown()

@@ -156,7 +156,7 @@ def test_a_whole_session(packed, tmp_path):
         assert own.pop("material").startswith("Splats, lit")
         assert 0 < own.pop("triangles") <= 800
         assert own.pop("middle") == pytest.approx(7, abs=0.12), "the mesh stands where the splats do"
-        light = ["object.meshsplats_shading"] * 2 if bpy.app.version >= (5, 3, 0) else []
+        light = ["object.meshsplats_shading"] * 3 if bpy.app.version >= (5, 3, 0) else []
         assert own == {
             "buttons": ["import_scene.meshsplats", "object.meshsplats_from_splats", *light],
             "answer": ["FINISHED"],
