@@ -70,9 +70,10 @@ def outside_cameras(
 ) -> list[Camera]:
     """``count`` cameras that look at the subject's middle, evenly spread over directions and distances.
 
-    The middle is that of its extent: in the body of a guitar, where most of its splats are, its head would
-    often be out of the image. Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
-    Every run of successive cameras is evenly spread, too. The other arguments are those of ``splat_dataset``.
+    The middle is that of its extent: around the body of a guitar, where most of its splats are, its head
+    would often be out of the image. Directions are even on the sphere between two ``elevations`` (degrees),
+    distances on a logarithmic scale. Every run of successive cameras is evenly spread, too. The other
+    arguments are those of ``splat_dataset``.
     """
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
     bounds = scene_bounds(cloud)  # refuses an empty cloud
