@@ -15,8 +15,8 @@ from PIL import Image
 
 import meshsplats as ms
 from meshsplats import draw_splats
-from meshsplats.cameras.framing import middle, scene_bounds
-from meshsplats.cameras.placing import has_surroundings, inside_cameras, outside_cameras
+from meshsplats.cameras.framing import front_axes, scene_bounds
+from meshsplats.cameras.placing import has_surroundings, inside_cameras, outside_cameras, target_of
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.datasets.folder import load_dataset
@@ -386,8 +386,8 @@ def test_windows_show_the_subject():
 
 
 def angles_of(cameras, cloud) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation in degrees of cameras around the middle of their subject, y down."""
-    center = middle(scene_bounds(cloud), np.diag([1.0, -1.0, -1.0]))
+    """Azimuth and elevation in degrees of cameras around the middle of their optical axes, y down."""
+    center = scene_bounds(cloud).center
     away = np.array([c.center for c in cameras]) - center
     return np.degrees(np.arctan2(away[:, 0], away[:, 2])), np.degrees(
         np.arcsin(-away[:, 1] / np.linalg.norm(away, axis=1))
@@ -448,6 +448,24 @@ def test_the_fitting_distance_is_that_of_a_sphere_with_nine_tenths_of_the_opacit
     within = cloud_at(np.concatenate([shell, far]))
     cameras = outside_cameras(within, 5, distance=(1, 1))
     assert max(np.linalg.norm(camera.center) for camera in cameras) < 4 * 2.5 / np.sin(np.radians(25))
+
+
+def test_long_subjects_are_whole_in_images():
+    """A body with most of the splats and a neck: cameras look half-way between, at others at their middle."""
+    rng = np.random.default_rng(0)
+    body, neck = rng.uniform(-0.5, 0.5, (6000, 3)), rng.uniform(-0.1, 0.1, (3000, 3))
+    neck[:, 1] = rng.uniform(-3, -0.5, len(neck))
+    guitar, ball = cloud_at(np.concatenate([body, neck])), cloud_at(rng.normal(size=(2000, 3)))
+    bounds = scene_bounds(guitar)
+    assert bounds.center[1] > -0.4
+    target = target_of(bounds, front_axes(np.array([0.0, -1, 0])))
+    assert target[1] == pytest.approx(-1.25, abs=0.25)
+    cameras = outside_cameras(guitar, 20)
+    for camera in cameras:
+        gaze, away = camera.world_to_camera[2, :3], target - camera.center
+        assert gaze @ away == pytest.approx(np.linalg.norm(away))
+    round_one = scene_bounds(ball)
+    np.testing.assert_array_equal(target_of(round_one, np.eye(3)), round_one.center)
 
 
 def test_surroundings_are_noticed_and_keep_cameras_above_the_ground(monkeypatch):

@@ -10,6 +10,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     SAMPLE,
     SURROUNDINGS,
+    Bounds,
     front_axes,
     guess_up,
     middle,
@@ -32,6 +33,9 @@ hard to match that such views make the others worse."""
 INSIDE_ELEVATIONS = (-35.0, 35.0)
 DISTANCES = (0.9, 1.1)
 """Multiples of the distance at which the subject just fits."""
+LONG = 0.5
+"""A subject is long if less than this share of the opacity that is out of reach of cameras around most of it
+is out of reach around the middle of its extent."""
 SURROUNDINGS_SHARE = 0.01
 """A subject has surroundings if more than this share of the opacity lies beyond it."""
 MOST = 2_000_000
@@ -68,12 +72,10 @@ def outside_cameras(
     height: int = 400,
     fov: float = 50.0,
 ) -> list[Camera]:
-    """``count`` cameras that look at the subject's middle, evenly spread over directions and distances.
+    """``count`` cameras that look at a subject (``target_of``), evenly over directions and distances.
 
-    The middle is that of its extent: around the body of a guitar, where most of its splats are, its head
-    would often be out of the image. Directions are even on the sphere between two ``elevations`` (degrees),
-    distances on a logarithmic scale. Every run of successive cameras is evenly spread, too. The other
-    arguments are those of ``splat_dataset``.
+    Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
+    Every run of successive cameras is evenly spread, too. The other arguments are those of ``splat_dataset``.
     """
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
     bounds = scene_bounds(cloud)  # refuses an empty cloud
@@ -83,7 +85,7 @@ def outside_cameras(
     turns, heights, share = _sequence(count)
     low, high = np.sin(np.radians(elevations))
     away = fit * distance[0] * (distance[1] / distance[0]) ** share
-    target = middle(bounds, axes)
+    target = target_of(bounds, axes)
     return [
         look_at(
             target + away[i] * _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i]),
@@ -97,6 +99,18 @@ def outside_cameras(
         )
         for i in range(count)
     ]
+
+
+def target_of(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
+    """(3,) where cameras around a subject with these up and front ``axes`` (3, 3) look: where most of the
+    opacity is; or, of a long one, the middle of its extent. Around the body of a guitar, its head would often
+    be out of the image."""
+    half_way = middle(bounds, axes)
+    beyond, of_half_way = (
+        bounds.weights[np.linalg.norm(bounds.points - point, axis=1) > bounds.radius].sum()
+        for point in (bounds.center, half_way)
+    )
+    return half_way if of_half_way < LONG * beyond else bounds.center
 
 
 def _sequence(count: int) -> np.ndarray:

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import front_axes, middle, scene_bounds, unit_up, weighted_quantile
-from meshsplats.cameras.placing import outside_cameras
+from meshsplats.cameras.framing import front_axes, scene_bounds, unit_up, weighted_quantile
+from meshsplats.cameras.placing import outside_cameras, target_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.viewpoints.sample import COARSE, AllSplats, Sample
 from meshsplats.viewpoints.search import Places
@@ -57,7 +57,7 @@ def _coarse(count: int) -> float:
 def _dome(cloud: GaussianCloud, up: np.ndarray) -> list[Camera]:
     """Cameras around where most of the opacity is, for which ``FINE`` was chosen."""
     bounds = scene_bounds(cloud)
-    off = middle(bounds, front_axes(unit_up(up))) - bounds.center
+    off = target_of(bounds, front_axes(unit_up(up))) - bounds.center
     cameras = outside_cameras(cloud, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE)
     return [camera.relative_to(off) for camera in cameras]
 
