@@ -73,10 +73,16 @@ def need_detail(samples: Mapping[Any, np.ndarray], origin: np.ndarray) -> None:
             continue
         other = max(found, key=lambda place: float(np.linalg.norm(found[place][0] - center)))
         at, beside = (in_words(choose_origin(samples[place])) for place in (name, other))
+        lost = (
+            f"relative to {in_words(origin)}, places in {name} would be in steps of {_step(farthest):g}"
+            f" across an extent of {extent:.3g}"
+        )
+        if 2 * np.linalg.norm(found[other][0] - center) < np.linalg.norm(center):
+            text = f"{name}, around {at}, is too far from the origin that is given"
+            raise ValueError(f"{text}: {lost}; give one nearby, or none")
         raise ValueError(
-            f"{name}, around {at}, and {other}, around {beside}, are too far apart for one result: relative"
-            f" to {in_words(origin)}, places in {name} would be in steps of {_step(farthest):g} across an"
-            f" extent of {extent:.3g}; take each file by itself, or give both coordinates of one world"
+            f"{name}, around {at}, and {other}, around {beside}, are too far apart for one result: {lost};"
+            " take each file by itself, or give both coordinates of one world"
         )
 
 

@@ -316,6 +316,17 @@ def test_a_file_that_would_lose_its_detail_beside_others_is_refused(tmp_path, gi
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
+def test_files_side_by_side_are_refused_far_from_the_origin_that_is_given(tmp_path):
+    paths = [
+        write_ply(tmp_path / f"{name}.ply", [splat_table(splats(at=at)[0], DOUBLES)])
+        for name, at in (("one", FAR), ("other", FAR + 50))
+    ]
+    stream = stream_gaussians(paths, origin=(0, 0, 0))
+    with pytest.raises(ValueError, match=r"one.ply, around .*, is too far from the origin that is given"):
+        next(iter(stream))
+    assert next(iter(stream_gaussians(paths))).origin.any()
+
+
 def test_our_splats_come_back_exactly(tmp_path):
     values, _ = splats()
     cloud = load_gaussians(write_ply(tmp_path / "a.ply", [splat_table(values, DOUBLES)]))
