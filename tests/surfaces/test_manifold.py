@@ -130,6 +130,14 @@ def test_collapsed_surfaces_are_solids(seed, count):
 
 
 @needs_extra
+@pytest.mark.parametrize("seed", range(3))
+def test_a_surface_of_too_few_triangles_for_a_solid_has_some_more(seed):
+    made, left = simplified(*isosurface(noise(seed)), 4, closed=True)
+    assert_solid(made, left)
+    assert len(left) < 40
+
+
+@needs_extra
 def test_flat_sides_that_touch_in_their_middle_move_apart():
     angles = np.arange(4) * np.pi / 2
     parts = []

@@ -35,6 +35,9 @@ def simplified(
     aim, least = count, 0.0
     for _ in range(_ROUNDS):
         made = solid(*collapsed(vertices, faces, aim))
+        if not (len(made[1]) or least) and 2 * aim < len(faces):  # nothing is left of it
+            aim *= 2
+            continue
         if not 0 < len(made[1]) < len(faces) or _volume(*made) < least:  # no fewer, or not this shape
             break
         vertices, faces = made
@@ -42,7 +45,7 @@ def simplified(
         if len(faces) <= count:
             break
         aim = max(4, count - min(len(faces) - count, count // 20))
-    return vertices, faces
+    return (vertices, faces) if least else solid(vertices, faces)
 
 
 def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
