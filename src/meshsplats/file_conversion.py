@@ -57,7 +57,7 @@ class ConversionCallbacks:
     preview: Callable[..., None]
     """Draws a scene to a file, from a camera or None."""
     opening: Callable[[GaussianCloud, Path, Sequence[Camera] | None], Camera | None]
-    """The camera of the preview of splats from a file, and given cameras; None: one in front."""
+    """The camera of the preview of splats from a file, and given cameras; None: ``opening_camera``."""
 
 
 @dataclass(frozen=True)

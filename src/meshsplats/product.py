@@ -54,7 +54,7 @@ class Product:
     missing: MissingOfData = "few"
     up: str | None = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
-    file, else -y, or as an object stands."""
+    file, else -y, z of a survey, or as an object stands."""
     scale: float | None = None
     """Factor for all lengths of the result, of meshes and splats: metres in an output unit, say."""
     files: MeshFileOptions = field(default_factory=MeshFileOptions)

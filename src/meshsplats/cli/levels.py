@@ -65,7 +65,7 @@ class Levels(Command):
     centres."""
     up: option.Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
-    file, else -y, or as an object stands."""
+    file, else -y, z of a survey, or as an object stands."""
     origin: option.Origin = "keep"
     resume: bool = False
     """Continue an interrupted run of the same command, from the levels in FOLDER.partial."""

@@ -97,7 +97,7 @@ class SceneViews:
     wide. In place of ``fov``."""
     up: str | None = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
-    folder, of the file, else -y, as in COLMAP's scenes, or as an object stands."""
+    folder, of the file, else -y, as in COLMAP's scenes, z of a survey, or as an object stands."""
     width: Annotated[int | None, Range(1, MAX_SIDE)] = None
     """Image width in pixels. With ``cameras`` or ``data``, images are scaled to this width."""
     height: Annotated[int | None, Range(1, MAX_SIDE)] = None

@@ -25,6 +25,7 @@ from meshsplats.formats.surfaces.solids import upright
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_image
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.previews import SIDE
 from meshsplats.surfaces import draw_surface
 from meshsplats.surfaces.fusion import parts_of
 from meshsplats.surfaces.making import surfaces_from
@@ -216,10 +217,11 @@ class SurfaceRun:
     def _draw_preview(
         self, scene: GaussianCloud | SplatMesh, base: BaseMesh, place: FoundCameras | None
     ) -> None:
-        camera = opening_camera(scene, self.threads)
-        if place is not None:
+        if place is None:
+            camera = opening_camera(scene, self.threads)
+        else:
             self.say(place.seen_in_words())
-            camera = place.cameras[0].within(camera.width)
+            camera = place.cameras[0].within(SIDE)
         save_image(self.preview, draw_surface(base, camera, threads=self.threads))
 
 

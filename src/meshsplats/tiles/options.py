@@ -37,7 +37,7 @@ class TileOptions:
     (docs/viewers.md), and are 1.6 times as large with degree 1, twice with 2."""
     up: tuple[float, float, float] | None = None
     """Direction that points up in the world frame. None: that of the splat files, where they name it, else
-    (0, -1, 0)."""
+    (0, 0, 1) of a survey, (0, -1, 0) of other ones."""
     lit: bool = False
     """A material that scene lights shade, instead of an unlit one."""
     alpha: TilesAlpha = "auto"
@@ -113,7 +113,7 @@ class TilingOptions:
     """Only splats with their centre in this box, in the coordinates of the file."""
     up: str | None = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
-    files, else -y, or as an object stands."""
+    files, else -y, z of a survey, or as an object stands."""
     lit: bool = False
     """A material that takes light and shadow, not one that shows the colours as they are."""
     alpha: TilesAlpha = "auto"

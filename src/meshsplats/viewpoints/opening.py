@@ -77,8 +77,9 @@ def _sample(scene: SplatMesh | GaussianCloud) -> SplatMesh | GaussianCloud:
     elif scene.face_splat is None or not len(scene.faces):
         return scene.plain
     else:
-        step = -(-len(scene.splats) // SPLATS)
-        some = _splats_like(scene.take(scene.splats.of_face % step == 0))
+        splats = scene.splats
+        step = -(-len(splats) // SPLATS)
+        some = _splats_like(scene.take(splats.of_face % step == 0).plain)
     return replace(some, scales=some.scales * np.float32(step**0.5))
 
 
