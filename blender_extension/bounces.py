@@ -9,13 +9,14 @@ LAYERS = "meshsplats_layers"
 """Property of the data of splat meshes; ``meshsplats.blender.inside.bounces`` sets it."""
 
 
-def missing(scene):
-    """The limit on transparent bounces that ``scene`` lacks for its splats, or 0."""
+def missing(scene, *, now=True):
+    """The limit on transparent bounces that ``scene`` lacks for its splats, or 0; without ``now``, of a large
+    scene by what was so a short while ago."""
     if not any(LAYERS in data for data in bpy.data.meshes):  # or the panel would load our libraries
         return 0
     from meshsplats.blender.inside import bounces
 
-    return bounces.missing(scene)
+    return bounces.missing(scene, now=now)
 
 
 def described(scene, limit):

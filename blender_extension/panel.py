@@ -96,7 +96,7 @@ class MeshSplatsPanel(bpy.types.Panel):
         for collection in context.scene.collection.children_recursive:
             if CHAIN in collection:
                 self._chain(layout, collection)
-        for warning in instance_warnings(context.scene):
+        for warning in instance_warnings(context.scene, now=False):
             draw_warning(layout, warning)
         layout.separator()
         layout.label(text="Light, ground and camera")
@@ -114,7 +114,7 @@ class MeshSplatsPanel(bpy.types.Panel):
         button.live, button.fast = False, fast
         row.operator(BakeLight.bl_idname, text="Live Light").live = True
         layout.label(text="Render settings")
-        limit = missing(context.scene)
+        limit = missing(context.scene, now=False)
         if limit:
             draw_warning(layout, described(context.scene, limit))
             layout.operator(SetBounces.bl_idname, text=f"Set Bounces to {limit}")

@@ -378,9 +378,7 @@ for arguments in ({}, {"at_origin": True, "use_cycles": True}):
 
 # Edits of lit splats: the panel says so, and baking makes stand-in and light points anew.
 warning = sys.modules[addon + ".panel"].light_warning
-sys.modules["meshsplats.blender.inside.light_state"]._LONG = float(
-    "inf"
-)  # asked at once, on busy machines too
+sys.modules["meshsplats.blender.inside.pacing"]._LONG = float("inf")  # even on busy machines
 
 
 def only(*objs):

@@ -14,8 +14,8 @@ def extension() -> Iterator[ModuleType]:
     """The extension, registered while the tests of a file run."""
     from _blender_extension import registered
 
-    from meshsplats.blender.inside import light_state
+    from meshsplats.blender.inside import pacing
 
     with registered() as module, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(light_state, "_LONG", math.inf)  # the panel asks at once, on busy machines too
+        patch.setattr(pacing, "_LONG", math.inf)  # the panel asks at once, on busy machines too
         yield module

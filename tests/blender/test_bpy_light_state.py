@@ -11,7 +11,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats
 
 from meshsplats import convert
-from meshsplats.blender.inside import light_state, objects, stage, versions
+from meshsplats.blender.inside import light_state, objects, pacing, stage, versions
 
 
 def test_whatever_lights_splats_makes_another_state():
@@ -99,12 +99,12 @@ def test_what_was_baked_is_known_at_once(monkeypatch):
     scene = bpy.context.scene
     obj = objects.add(objects.prepare(convert(ball_splats(50)[0]), False), "ball", scene.collection)
     sun = stage.add_sun(np.array([0.5, 0, 0.9]), 3.0, 1.0, 0.01, scene.collection)
-    monkeypatch.setattr(light_state, "_LONG", -1)
-    monkeypatch.setattr(light_state, "_REST", 1e9)
-    before = light_state.renewed(scene, obj)
+    monkeypatch.setattr(pacing, "_LONG", -1)
+    monkeypatch.setattr(pacing, "_REST", 1e9)
+    before = light_state.latest(scene, obj, now=True)
     sun.data.energy = 7
     assert light_state.latest(scene, obj) == before
-    after = light_state.renewed(scene, obj)
+    after = light_state.latest(scene, obj, now=True)
     assert after == light_state.latest(scene, obj) == light_state.state(scene, obj) != before
 
 
@@ -131,4 +131,4 @@ def test_the_state_is_the_same_in_every_blender():
             node.inputs["Subsurface Scale"].default_value = 0.05
     sky.altitude = 0
     bpy.context.view_layer.update()
-    assert light_state.state(scene, obj) == "a1be7381"
+    assert light_state.state(scene, obj) == "8cb5f919"

@@ -128,6 +128,26 @@ def test_handlers_follow_shape_keys_and_armatures(placed):
             group.remove(function)
 
 
+def test_splats_are_at_rest_again_where_the_modifiers_of_the_base_do_nothing(placed):
+    obj, base, prior = placed
+    lift = base.modifiers.new("lift", "DISPLACE")
+    lift.direction, lift.mid_level = "Z", 0
+    for strength in (1, 0):
+        lift.strength = strength
+        bpy.context.view_layer.update()
+        assert priors.follow([obj], bpy.context.evaluated_depsgraph_get()) == 1
+        assert_follows(obj, prior, prior.base_vertices + np.float32([0, 0, strength]))
+
+
+def test_a_muted_tie_is_mended_by_itself(placed):
+    obj, _, _ = placed
+    obj.constraints[priors.TIE].mute = True
+    assert not priors.is_tied(obj)
+    priors.tie(obj)
+    assert priors.is_tied(obj)
+    assert len(obj.constraints) == 1
+
+
 def rendered(scene, path) -> list[np.ndarray]:
     """Frames 1 and 3, with the handler of the extension."""
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))

@@ -136,7 +136,7 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
                         levels.show(chain, level, where)
     layer = bpy.context.view_layer
     for obj in lit:
-        obj[STATE] = f"{light_state.renewed(scene, obj, layer)} {layer.name}"
+        obj[STATE] = f"{light_state.latest(scene, obj, layer, now=True)} {layer.name}"
     return len(lit)
 
 
@@ -215,13 +215,15 @@ def _bake(target: Any, layer: Any) -> None:
     # Whatever is selected, and shown by a window's local view.
     chosen = {"object": target, "active_object": target, "selected_objects": [target]}
     with bpy.context.temp_override(view_layer=layer, **chosen):
-        bpy.ops.object.bake(
+        done = bpy.ops.object.bake(
             type="DIFFUSE",
             pass_filter={"DIRECT", "INDIRECT"},
             target="VERTEX_COLORS",
             use_clear=True,
             use_selected_to_active=False,
         )
+    if "FINISHED" not in done:
+        raise RuntimeError("it was stopped")
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from meshsplats.blender.inside import levels, light_state
+from meshsplats.blender.inside import levels, light_state, pacing
 from meshsplats.blender.layers import bounce_limit
 
 LAYERS = "meshsplats_layers"
@@ -35,23 +35,32 @@ def count_layers(objs: Iterable[Any]) -> int:
     return sum(most.values())
 
 
-def layers_of(objs: Iterable[Any]) -> int:
+def layers_of(objs: Iterable[Any], known: dict[Any, int] | None = None) -> int:
     """Most layers behind each other of the splat meshes among ``objs`` and of what their instances of
-    collections show, each of them."""
-    unique = set(objs)
+    collections show, each of them. ``known``: the layers of collections, which are counted once."""
+    unique, known = set(objs), {} if known is None else known
     layers = count_layers(filter(_is_splats, unique))
-    return layers + sum(layers_of(light_state.rendered(home)) for home in map(_instances, unique) if home)
+    for home in filter(None, map(_instances, unique)):
+        if home not in known:
+            known[home] = layers_of(light_state.rendered(home), known)
+        layers += known[home]
+    return layers
 
 
-def missing(scene: Any) -> int:
+def missing(scene: Any, *, now: bool = True) -> int:
     """The limit on transparent bounces that the splats in images of ``scene`` need, where images are made by
-    Cycles and it has less than there are layers; else 0."""
+    Cycles and it has less than there are layers; else 0. Without ``now``, layers of a large scene may have
+    been counted a short while ago."""
     if scene.render.engine != "CYCLES":
         return 0
-    shown = (light_state.rendered(layer.layer_collection) for layer in scene.view_layers if layer.use)
-    layers = max(map(layers_of, shown), default=0)
+    layers = pacing.paced(("layers", scene.name), lambda: _rendered_layers(scene), now=now)
     limit = bounce_limit(layers)
     return limit if scene.cycles.transparent_max_bounces < min(layers, limit) else 0
+
+
+def _rendered_layers(scene: Any) -> int:
+    shown = (light_state.rendered(layer.layer_collection) for layer in scene.view_layers if layer.use)
+    return max(map(layers_of, shown), default=0)
 
 
 def _is_splats(obj: Any) -> bool:

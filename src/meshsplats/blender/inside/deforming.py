@@ -36,10 +36,11 @@ def follow(obj: Any) -> None:
     stays as it is."""
     if obj.type != "MESH":
         return
-    data = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    data = obj.evaluated_get(depsgraph).data
     moves = bool(deformers(obj)) or obj.data.shape_keys is not None
-    if moves and data.is_evaluated:  # a mere copy of the one at rest
-        return
+    if moves and data.is_evaluated and not versions.shows(depsgraph, {obj}):
+        return  # it is a mere copy of the one at rest
     whole = moves and len(data.vertices) == len(obj.data.vertices)
     for child in [child for child in obj.children if child.get(_STAND_IN)]:
         if whole or _REST in child.data.attributes:

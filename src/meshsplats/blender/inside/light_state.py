@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 import zlib
 from collections.abc import Iterator
 from typing import Any
 
-from meshsplats.blender.inside import deforming, meshes, versions
+from meshsplats.blender.inside import deforming, meshes, pacing, versions
 from meshsplats.blender.inside.host import bpy
 
 STAND_IN = "meshsplats_stand_in"
@@ -63,13 +62,7 @@ _WHOLE = 300_000
 """Vertices of a mesh up to which all of them count; of larger ones, some."""
 _SOME = 500
 _LIT = "meshsplats_lit"
-_LONG = 0.02
-"""Processor seconds: what takes as long delays the window."""
-_REST = 30
-"""After which multiple of its time a state that takes long is looked for again."""
 _ZERO = 1e-6
-_known: dict[tuple[str, ...], tuple[float, float, str]] = {}
-"""When they began, how long they took, and what was found."""
 
 
 def state(scene: Any, obj: Any, layer: Any = None) -> str:
@@ -78,34 +71,24 @@ def state(scene: Any, obj: Any, layer: Any = None) -> str:
     and what deforms them: their light does not come from their nodes."""
     layer = layer or bpy.context.view_layer
     parts: list[Any] = [_numbers(obj.matrix_world), *_deformation(obj)]
-    used: dict[str, Any] = {}
+    used: dict[Any, None] = {}
     for other in sorted(set(rendered(layer.layer_collection)), key=lambda other: other.name):
         if other != obj and not (other.parent == obj and other.get(STAND_IN)):
             parts += _object(other, used)
-    parts += [part for material in used.values() for part in _block(material)]
+    materials = (block for block in used if isinstance(block, bpy.types.Material))
+    parts += [part for material in materials for part in _block(material)]
     world = layer.world_override or scene.world
     if world is not None:
         parts += _block(world)
     return f"{zlib.crc32(repr(parts).encode()):08x}"
 
 
-def latest(scene: Any, obj: Any, layer: Any = None) -> str:
-    """``state``, for the panel, which asks whenever it is drawn: of a large scene, now and then."""
+def latest(scene: Any, obj: Any, layer: Any = None, *, now: bool = False) -> str:
+    """``state``, for the panel, which asks whenever it is drawn: of a large scene, now and then. With
+    ``now``, ``state`` itself, which is known then."""
     layer = layer or bpy.context.view_layer
-    key, now, begun = (scene.name, obj.name, layer.name), time.monotonic(), time.thread_time()
-    when, took, found = _known.get(key, (0.0, 0.0, ""))
-    if took > _LONG and now - when < _REST * took:
-        return found
-    found = state(scene, obj, layer)
-    took = time.thread_time() - begun
-    _known[key] = (now, took, found)
-    return found
-
-
-def renewed(scene: Any, obj: Any, layer: Any = None) -> str:
-    """``state``, which ``latest`` then knows."""
-    _known.pop((scene.name, obj.name, (layer or bpy.context.view_layer).name), None)
-    return latest(scene, obj, layer)
+    key = ("light", scene.name, obj.name, layer.name)
+    return pacing.paced(key, lambda: state(scene, obj, layer), now=now)
 
 
 def rendered(place: Any) -> Iterator[Any]:
@@ -120,12 +103,17 @@ def rendered(place: Any) -> Iterator[Any]:
         yield from rendered(child)
 
 
-def _object(obj: Any, used: dict[str, Any]) -> list[Any]:
-    """What it is and where; its materials join those that are ``used``."""
+def _object(obj: Any, used: dict[Any, None]) -> list[Any]:
+    """What it is and where; its materials join what is ``used``, as do collections and shapes, which count
+    once however many objects show them."""
     parts = [obj.name, _numbers(obj.matrix_world)]
     if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
-        for inner in sorted(set(rendered(obj.instance_collection)), key=lambda inner: inner.name):
-            parts += _object(inner, used)
+        home = obj.instance_collection
+        parts.append(home.name)
+        if home not in used:
+            used[home] = None
+            for inner in sorted(set(rendered(home)), key=lambda inner: inner.name):
+                parts += _object(inner, used)
         return parts
     parts += [getattr(obj, f"visible_{way}") for way in _RAYS]
     for linked in (obj.light_linking.receiver_collection, obj.light_linking.blocker_collection):
@@ -136,8 +124,12 @@ def _object(obj: Any, used: dict[str, Any]) -> list[Any]:
         return []
     if _LIT in obj.data:
         return [*parts, meshes.size(obj.data), *_deformation(obj)]
-    used |= {slot.material.name: slot.material for slot in obj.material_slots if slot.material is not None}
-    return parts + _deformation(obj) + _shape(obj.data)
+    used |= dict.fromkeys(slot.material for slot in obj.material_slots if slot.material is not None)
+    parts += [*_deformation(obj), obj.data.name]
+    if obj.data not in used:
+        used[obj.data] = None
+        parts += _shape(obj.data)
+    return parts
 
 
 def _deformation(obj: Any) -> list[Any]:

@@ -72,9 +72,9 @@ def tie(obj: Any) -> None:
     if obj.data.library is not None:
         obj.data = obj.data.copy()
     if not is_tied(obj):
-        constraint = obj.constraints.new("SHRINKWRAP")
+        constraint = obj.constraints.get(TIE) or obj.constraints.new("SHRINKWRAP")
         constraint.name, constraint.target, constraint.influence = TIE, base, 0
-        constraint.show_expanded = False
+        constraint.mute = constraint.show_expanded = False
 
 
 def is_tied(obj: Any) -> bool:
@@ -142,11 +142,15 @@ def followers(scene: Any) -> list[Any]:
     return [obj for obj in dict.fromkeys(_shown(scene.objects)) if not obj.library and base_of(obj)]
 
 
-def _shown(objs: Iterable[Any]) -> Iterator[Any]:
+def _shown(objs: Iterable[Any], known: set[Any] | None = None) -> Iterator[Any]:
+    """``objs`` and the objects of collections that they show, other than those that are ``known``."""
+    known = set() if known is None else known
     for obj in objs:
         yield obj
-        if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
-            yield from _shown(obj.instance_collection.all_objects)
+        home = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+        if home is not None and home not in known:
+            known.add(home)
+            yield from _shown(home.all_objects, known)
 
 
 def _move(obj: Any, depsgraph: Any) -> bool:
@@ -154,7 +158,7 @@ def _move(obj: Any, depsgraph: Any) -> bool:
     if obj.data.library is not None:
         raise ValueError(f"its mesh is linked from {obj.data.library.name}: Follow Base Now makes it local")
     binding, base = binding_of(obj), base_of(obj)
-    vertices = _evaluated(base, depsgraph)
+    vertices = _evaluated(base, depsgraph, {base, obj} if is_tied(obj) else {base})
     if vertices is None:
         return False
     if len(vertices) != len(binding.base_vertices):
@@ -176,16 +180,18 @@ def _move(obj: Any, depsgraph: Any) -> bool:
     return True
 
 
-def _evaluated(base: Any, depsgraph: Any) -> np.ndarray | None:
+def _evaluated(base: Any, depsgraph: Any, shown: set[Any]) -> np.ndarray | None:
     """(n, 3) float32 vertices of the object ``base`` as displayed, in its own frame; None where ``depsgraph``
-    has not evaluated them."""
+    has not evaluated them, as it shows none of the objects ``shown``."""
     if base.mode == "EDIT":  # no evaluated mesh while it is edited
         import bmesh
 
         edited = bmesh.from_edit_mesh(base.data)
         return np.array([vertex.co[:] for vertex in edited.verts], np.float32).reshape(-1, 3)
     evaluated = base.evaluated_get(depsgraph)
-    if not evaluated.is_evaluated or (evaluated.data.is_evaluated and _deforms(base, depsgraph)):
+    if not evaluated.is_evaluated:
+        return None
+    if evaluated.data.is_evaluated and _deforms(base, depsgraph) and not versions.shows(depsgraph, shown):
         return None  # the mesh is a mere copy of the one at rest
     mesh = evaluated.to_mesh()
     try:
@@ -203,10 +209,9 @@ def _deforms(base: Any, depsgraph: Any) -> bool:
 def after_update(scene: Any, depsgraph: Any) -> None:
     """Follows the bases whose shape has changed, a handler of ``depsgraph_update_post``. Moved splats change
     too, but are no bases."""
-    following = followers(scene)
-    if following:
-        changed = {update.id.original for update in depsgraph.updates if update.is_updated_geometry}
-        follow([t for t in following if base_of(t) in changed or base_of(t).data in changed], depsgraph)
+    changed = {update.id.original for update in depsgraph.updates if update.is_updated_geometry}
+    following = followers(scene) if changed else []
+    follow([t for t in following if base_of(t) in changed or base_of(t).data in changed], depsgraph)
 
 
 def after_frame(scene: Any, depsgraph: Any) -> None:

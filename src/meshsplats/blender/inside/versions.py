@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,12 @@ def integer_math() -> str:
     """The node that calculates with whole numbers; before 4.3, those beyond 2^24 are rounded."""
     exact = "FunctionNodeIntegerMath"
     return exact if hasattr(bpy.types, exact) else "ShaderNodeMath"
+
+
+def shows(depsgraph: Any, objs: Collection[Any]) -> bool:
+    """Whether ``depsgraph`` shows any of ``objs``, also as an instance, and so has evaluated it. From Blender
+    5 on, the evaluated mesh does not tell, where modifiers do nothing."""
+    return any(one.object.original in objs for one in depsgraph.object_instances)
 
 
 def enable_cycles() -> None:
