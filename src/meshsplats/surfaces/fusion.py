@@ -118,12 +118,12 @@ def close_gaps(field: np.ndarray) -> None:
     field[np.isnan(field) & near] = -_CLOSE
 
 
-def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def isosurface(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The surface where ``field``, an (x, y, z) grid, is 0, between points that all are numbers.
 
     The triangles face the positive side. Parts of the interior with less than ``MIN_PART`` of the volume of
-    the largest part are removed, and of an open surface those with less than that of its triangles.
-    ``faces`` is the approximate maximum number of triangles; 0: no maximum.
+    the largest part are removed, and of an open surface those with less than that of its triangles. Hollows
+    of a closed one, whose points all are numbers, are filled.
 
     Returns:
         (n, 3) float64 vertices in grid steps, (m, 3) int32 triangles.
@@ -147,8 +147,6 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     )
     if not known.all():
         vertices, triangles = large_parts(vertices, triangles)
-    if 0 < faces < len(triangles):
-        return collapsed(vertices, triangles, faces)
     return vertices.astype(np.float64), triangles.astype(np.int32)
 
 
