@@ -117,10 +117,10 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
                 shown = {}
             if shown:
                 levels.show(chain, obj[levels.LEVEL])
-            deforming.follow(obj)
             shows = [(target, "hide_render", False), (target, "hide_viewport", False)]
             stand_in = [child for child in obj.children if child.get(light_state.STAND_IN)]
             try:
+                deforming.follow(obj)
                 # Lit as if it were visible.
                 with _held([*shows, (obj, "hide_render", False)]), _at_hand(scene, stand_in):
                     _bake(target, layer)

@@ -19,10 +19,10 @@ def splat_objects(scene: Any) -> list[Any]:
 
 
 def instanced(objs: Iterable[Any]) -> list[Any]:
-    """The splat meshes that those of ``objs`` show that are instances of collections, some of them
-    more than once."""
-    within = [obj for home in map(_instances, objs) if home for obj in home.all_objects]
-    return [*filter(_is_splats, within), *(instanced(within) if within else [])]
+    """The splat meshes that those of ``objs`` show that are instances of collections."""
+    homes = dict.fromkeys(filter(None, map(_instances, objs)))
+    within = dict.fromkeys(obj for home in homes for obj in home.all_objects)
+    return list(dict.fromkeys([*filter(_is_splats, within), *(instanced(within) if within else [])]))
 
 
 def count_layers(objs: Iterable[Any]) -> int:
