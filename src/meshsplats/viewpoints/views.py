@@ -146,6 +146,7 @@ class Chooser:
         self.rich = total >= RICH * np.quantile(total, 0.9)
         self._checked: dict[int, Checked] = {}
         self.pool = self.in_order(None, POOL, np.inf)
+        """The best candidates, whether they are good pictures or not."""
 
     def _shown(self) -> np.ndarray:
         """(candidates, TARGETS) float32 whole numbers up to STEPS: how well each shows each splat."""
@@ -254,7 +255,7 @@ class Chooser:
         place, gaze = view.camera.center, view.camera.world_to_camera[2, :3]
         away = self.subject() - place
         distance = float(np.linalg.norm(away))
-        if away @ gaze < TURNED * distance:
+        if away @ gaze <= TURNED * distance:
             return view
         for back in STEPS_BACK:
             stand = place + (1 - back) * away
@@ -273,7 +274,7 @@ def choose_views(
     limit = chooser.fog_limit()
     chosen = [chooser.checked(k) for k in chooser.in_order(chooser.opening(limit), count, limit)]
     if not chosen:  # none is good: the narrowest of the best there are
-        best = [chooser.checked(k) for k in chooser.in_order(None, min(count, POOL), np.inf)]
+        best = [chooser.checked(k) for k in chooser.pool[:count]]
         return [(view, len(view.focal) - 1) for view in best]
     lenses = [view.widest(limit) for view in chosen]
     views = [(view, lens) for view, lens in zip(chosen, lenses, strict=True) if lens is not None]
