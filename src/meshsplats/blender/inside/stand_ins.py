@@ -149,8 +149,10 @@ def is_current(obj: Any, *, counts_only: bool = False) -> bool:
         points = baking.points_of(obj)
         if points is None or points.get(OWNER) != obj:
             return False
-        # Files of an earlier release may have lost it when they were appended.
-        if not any(child.get(STAND_IN) and child != points for child in obj.children):
+        # Files of an earlier release may have lost it when they were appended. Blender finds children by
+        # looking at all objects, which the panel cannot wait for.
+        made = [part for part in (obj.get(SURFACE), obj.get(FINE)) if part is not None and part.parent == obj]
+        if not made and not any(child.get(STAND_IN) and child != points for child in obj.children):
             return False
     before, data = obj.get(SHAPE, ""), obj.data
     if counts_only:
