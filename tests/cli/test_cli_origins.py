@@ -73,7 +73,8 @@ def write_scene(folder: Path, move: np.ndarray) -> Scene:
     names = ["x", "y", "z", *(f"f_dc_{k}" for k in range(3)), "opacity", *(f"scale_{k}" for k in range(3))]
     names += [f"rot_{k}" for k in range(4)]
     values = dict(zip(names, rows, strict=True))
-    write_ply(folder / "splats.ply", [splat_table(values, dict.fromkeys("xyz", "double"))])
+    table = splat_table(values, dict.fromkeys("xyz", "double"))
+    write_ply(folder / "splats.ply", [table], comments=["Vertical axis: y"])  # which means -y
     box = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.4, 0.8) for z in (-0.6, 0.6)])
     quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
     for name, corners in (("base.obj", box), ("edited.obj", box + np.array([0.75, 0, 0]))):
