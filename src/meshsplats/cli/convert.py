@@ -125,8 +125,8 @@ class Convert(Command):
         formats = formats_of(self.output, self.formats, folder=folder, as_splats=product.as_splats)
         if self.force and self.skip_existing:
             raise UsageError("give --force or --skip-existing, not both")
-        product.check(formats or [ending], self.input, self.output)
         found = sources(self.input)
+        product.check(formats or [ending], found, self.output)
         if formats:
             found = without_results(found, self.input, self.output, formats)
         records = {"preview": not (product.no_preview or product.stream), "sidecars": not product.no_sidecar}
