@@ -174,15 +174,16 @@ def _blank(
     """The surface of these triangles with a texture without colours. Its charts are as large as on the
     ``grid``: what is far from all cameras of a place needs few texels. Where they do not fit, or the library
     fails, it has fewer triangles, but not fewer than ``least``."""
+    count = len(faces)
     while True:
         try:
             uv, texels = _blank_texture(grid.contracted(vertices), faces, side)
             return Surface(vertices, faces, uv, texels)
         except ValueError:
-            fewer = int(_FEWER * len(faces))
-            if fewer < max(least, CLOSED[0]):
+            count = int(_FEWER * count)
+            if count < max(least, CLOSED[0]):
                 raise
-            points, faces = simplified(grid.contracted(vertices), faces, fewer, closed=closed)
+            points, faces = simplified(grid.contracted(vertices), faces, count, closed=closed)
             vertices = grid.in_scene(points)
 
 

@@ -241,10 +241,10 @@ class Chooser:
         start = np.array([view.center for view in views])
         gaze = np.array([view.world_to_camera[2, :3] for view in views])
         across = np.eye(3) - gaze[:, :, None] * gaze[:, None, :]
-        weight = np.ones(len(views))
+        middle, weight = start.mean(axis=0), np.ones(len(views))
         for _ in range(CROSSINGS):
             total = np.einsum("n,nij->ij", weight, across) + 1e-9 * weight.sum() * np.eye(3)
-            point = np.linalg.solve(total, np.einsum("n,nij,nj->i", weight, across, start))
+            point = middle + np.linalg.solve(total, np.einsum("n,nij,nj->i", weight, across, start - middle))
             missed = np.linalg.norm(np.einsum("nij,nj->ni", across, point - start), axis=1)
             weight = 1 / (missed + 0.05 * np.median(np.linalg.norm(point - start, axis=1)))
         return point
