@@ -88,13 +88,12 @@ class SetShading(Modal, bpy.types.Operator):
     def done(self, context, work):
         from meshsplats.blender.inside import baking, objects
 
-        done = take_over(self, work)
+        done, linear = take_over(self, work), self.shading == "linear"
         for obj in map(bpy.data.objects.get, done):
-            if self.shading == "linear":
+            if linear:
                 objects.show_even(obj)
             elif objects.is_even(obj):
                 baking.forget([obj])
-        linear = self.shading == "linear"
         if self._changed and not (linear and context.scene.view_settings.view_transform != "Raw"):
             follow_shading(self, context.scene, self.shading != "unlit")
         if linear:  # right under any view transform but Raw, without light

@@ -79,20 +79,37 @@ def outside_cameras(
     """
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
     bounds = scene_bounds(cloud)  # refuses an empty cloud
+    return cameras_around(
+        bounds, target_of(bounds, axes), axes, count, elevations, distance, size=(width, height), fov=fov
+    )
+
+
+def cameras_around(
+    bounds: Bounds,
+    target: np.ndarray,
+    axes: np.ndarray,
+    count: int,
+    elevations: tuple[float, float] = OBJECT_ELEVATIONS,
+    distance: tuple[float, float] = DISTANCES,
+    *,
+    size: tuple[int, int],
+    fov: float = 50.0,
+) -> list[Camera]:
+    """Those of ``outside_cameras`` for a subject of these ``bounds`` and up and front ``axes`` (3, 3), which
+    look at ``target`` (3,), with images of ``size``, width and height."""
     # Surroundings may have most of the opacity; then only the subject has to fit.
     reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max(initial=0))
     fit = (min(bounds.radius, reach) or bounds.radius) / np.sin(np.radians(fov / 2))
     turns, heights, share = _sequence(count)
     low, high = np.sin(np.radians(elevations))
     away = fit * distance[0] * (distance[1] / distance[0]) ** share
-    target = target_of(bounds, axes)
     return [
         look_at(
             target + away[i] * _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i]),
             target,
             up=axes[1],
-            width=width,
-            height=height,
+            width=size[0],
+            height=size[1],
             fov=fov,
             near=away[i] * NEAR_SHARE,
             name=f"view_{i:04d}",

@@ -77,16 +77,14 @@ class AlphaChoice:
             return None
         modes = {"blend": "blend", "mask": f"mask with cutoff {self.cutoff:g}"}
         other = "mask" if self.alpha == "blend" else "blend"
-        chosen, second = (
-            "equal to" if value >= _MOST else f"{value:.1f} dB from"
-            for value in (getattr(self, self.alpha), getattr(self, other))
-        )
+        best, rest = getattr(self, self.alpha), getattr(self, other)
+        near = "equal to" if best >= _MOST else f"{best:.1f} dB from"
         sorting = (
             "" if self.alpha == "blend" else " (``alpha`` blend for ray tracers and Blender's own importer)"
         )
         return (
-            f"alpha: {modes[self.alpha]}, {chosen} the sorted image in viewers that do not sort, seen from"
-            f" afar; {modes[other]}: {second.removesuffix(' from').removesuffix(' to')}{sorting}"
+            f"alpha: {modes[self.alpha]}, {near} the sorted image in viewers that do not sort, seen from"
+            f" afar; {modes[other]}: {'equal' if rest >= _MOST else f'{rest:.1f} dB'}{sorting}"
         )
 
 

@@ -21,6 +21,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.layers import SMALLEST, affordable
+from meshsplats.rendering.previews import USUAL
 from meshsplats.viewer.page import Page, PageOptions, estimated_size, make_page
 
 SIDE = 400
@@ -217,4 +218,4 @@ def _check_size(triangles: int) -> None:
 
 def _camera(scene: SplatMesh | GaussianCloud, cameras: Sequence[Camera]) -> Camera:
     """The view of the measurements."""
-    return cameras[0].within(SIDE) if cameras else orbit(scene, 1, azimuth=30, width=SIDE, height=SIDE)[0]
+    return cameras[0].within(SIDE) if cameras else orbit(scene, 1, azimuth=USUAL, width=SIDE, height=SIDE)[0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import front_axes, scene_bounds, unit_up, weighted_quantile
-from meshsplats.cameras.placing import outside_cameras, target_of
+from meshsplats.cameras.placing import cameras_around
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.viewpoints.sample import COARSE, AllSplats, Sample
 from meshsplats.viewpoints.search import Places
@@ -56,10 +56,8 @@ def _coarse(count: int) -> float:
 
 def _dome(cloud: GaussianCloud, up: np.ndarray) -> list[Camera]:
     """Cameras around where most of the opacity is, for which ``FINE`` was chosen."""
-    bounds = scene_bounds(cloud)
-    off = target_of(bounds, front_axes(unit_up(up))) - bounds.center
-    cameras = outside_cameras(cloud, OUTSIDE_VIEWS, up=up, width=OUTSIDE_SIDE, height=OUTSIDE_SIDE)
-    return [camera.relative_to(off) for camera in cameras]
+    bounds, axes = scene_bounds(cloud), front_axes(unit_up(up))
+    return cameras_around(bounds, bounds.center, axes, OUTSIDE_VIEWS, size=(OUTSIDE_SIDE, OUTSIDE_SIDE))
 
 
 def _fineness(cloud: GaussianCloud, coarse: float, cameras: Sequence[Camera], threads: int | None) -> float:

@@ -16,13 +16,12 @@ import numpy as np
 from meshsplats.blender.inside import deforming, levels, light_state, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIGHT
+from meshsplats.blender.inside.meshes import POINTS as POINTS
 from meshsplats.blender.options import CAREFUL
 from meshsplats.errors import DataWarning
 
 POINT = "light_point"
 """Attribute of the splats: index of the point whose light each vertex takes."""
-POINTS = "meshsplats_light_points"
-"""Property of the splats' object: the object of the points."""
 SIZE = "meshsplats_spacing"
 """Property of the points' mesh: distance of neighbouring points, scene units."""
 STATE = "meshsplats_light_state"
@@ -118,7 +117,7 @@ def bake(scene: Any, objs: list[Any], *, samples: int = CAREFUL.samples) -> int:
             if shown:
                 levels.show(chain, obj[levels.LEVEL])
             shows = [(target, "hide_render", False), (target, "hide_viewport", False)]
-            stand_in = [child for child in obj.children if child.get(light_state.STAND_IN)]
+            stand_in = [child for child in obj.children if child.get(meshes.STAND_IN)]
             try:
                 deforming.follow(obj)
                 # Lit as if it were visible.

@@ -14,10 +14,6 @@ from meshsplats.blender.inside.host import bpy
 
 _REST = "meshsplats_rest"
 """Attribute of a stand-in that was deformed: where its vertices are at rest."""
-_STAND_IN = "meshsplats_stand_in"
-"""``light_state.STAND_IN``."""
-_POINTS = "meshsplats_light_points"
-"""``baking.POINTS``."""
 _NEAREST = 8
 """Splats that a vertex moves with."""
 _STIFF = 1e-3
@@ -42,7 +38,7 @@ def follow(obj: Any) -> None:
     if moves and data.is_evaluated and not versions.shows(depsgraph, {obj}):
         return  # it is a mere copy of the one at rest
     whole = moves and len(data.vertices) == len(obj.data.vertices)
-    for child in [child for child in obj.children if child.get(_STAND_IN)]:
+    for child in [child for child in obj.children if child.get(meshes.STAND_IN)]:
         if whole or _REST in child.data.attributes:
             rest = _rest(child.data)
             places = _moved(obj, versions.positions(data), child, rest) if whole else rest
@@ -66,7 +62,7 @@ def _moved(obj: Any, deformed: np.ndarray, child: Any, rest: np.ndarray) -> np.n
     """(v, 3) places of the vertices ``rest`` (v, 3) of ``child``. Points of light are triangles, which stay
     as they are."""
     before, after = (_centers(obj.data, places) for places in (versions.positions(obj.data), deformed))
-    parts = rest.reshape(-1, 3 if obj.get(_POINTS) == child else 1, 3).astype(np.float64)
+    parts = rest.reshape(-1, 3 if obj.get(meshes.POINTS) == child else 1, 3).astype(np.float64)
     near = _nearest(before, parts.mean(axis=1))
     old, new = before[near], after[near]
     middle, to = old.mean(axis=1, keepdims=True), new.mean(axis=1, keepdims=True)

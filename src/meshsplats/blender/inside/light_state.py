@@ -8,9 +8,7 @@ from typing import Any
 
 from meshsplats.blender.inside import deforming, meshes, pacing, versions
 from meshsplats.blender.inside.host import bpy
-
-STAND_IN = "meshsplats_stand_in"
-"""Property of the objects that take light in place of splats: True."""
+from meshsplats.blender.inside.materials import LIT
 
 _SHAPES = ("MESH", "POINTCLOUD", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME")
 _VALUES = ("BOOLEAN", "INT", "FLOAT", "ENUM", "STRING")
@@ -61,7 +59,6 @@ _RAYS = ("diffuse", "glossy", "transmission", "volume_scatter", "shadow")
 _WHOLE = 300_000
 """Vertices of a mesh up to which all of them count; of larger ones, some."""
 _SOME = 500
-_LIT = "meshsplats_lit"
 _ZERO = 1e-6
 
 
@@ -73,7 +70,7 @@ def state(scene: Any, obj: Any, layer: Any = None) -> str:
     parts: list[Any] = [_numbers(obj.matrix_world), *_deformation(obj)]
     used: dict[Any, None] = {}
     for other in sorted(set(rendered(layer.layer_collection)), key=lambda other: other.name):
-        if other != obj and not (other.parent == obj and other.get(STAND_IN)):
+        if other != obj and not (other.parent == obj and other.get(meshes.STAND_IN)):
             parts += _object(other, used)
     materials = (block for block in used if isinstance(block, bpy.types.Material))
     parts += [part for material in materials for part in _block(material)]
@@ -122,7 +119,7 @@ def _object(obj: Any, used: dict[Any, None]) -> list[Any]:
         return parts + _block(obj.data)
     if obj.type not in _SHAPES:
         return []
-    if _LIT in obj.data:
+    if LIT in obj.data:
         return [*parts, meshes.size(obj.data), *_deformation(obj)]
     used |= dict.fromkeys(slot.material for slot in obj.material_slots if slot.material is not None)
     parts += [*_deformation(obj), obj.data.name]
@@ -144,7 +141,7 @@ def _deformation(obj: Any) -> list[Any]:
 def _members(linked: Any) -> list[Any]:
     """What a collection of light linking includes and excludes, whose stand-ins follow their splats."""
     own = zip(linked.objects, linked.collection_objects, strict=True)
-    states = [(obj.name, kept.light_linking.link_state) for obj, kept in own if not obj.get(STAND_IN)]
+    states = [(obj.name, kept.light_linking.link_state) for obj, kept in own if not obj.get(meshes.STAND_IN)]
     children = zip(linked.children, linked.collection_children, strict=True)
     parts: list[Any] = sorted(states)
     for child, kept in children:

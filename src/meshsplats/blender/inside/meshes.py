@@ -25,6 +25,10 @@ NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
 """Face attribute: index of the splat that each was made from."""
+STAND_IN = "meshsplats_stand_in"
+"""Property of the objects that take light in place of splats: True."""
+POINTS = "meshsplats_light_points"
+"""Property of the splats' object: the object of the points that light on them is gathered at."""
 _VISIBLE = 0.1
 """Opacity from which a vertex counts as visible."""
 

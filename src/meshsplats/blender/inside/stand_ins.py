@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, light_state, materials, meshes, versions
+from meshsplats.blender.inside import baking, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.inside.meshes import STAND_IN as STAND_IN
 from meshsplats.blender.inside.splat_points import values
 
 SPLATS = ("vertices", "faces", "colors")
@@ -21,8 +22,6 @@ ARRAYS = (
     *("light_points", "light_normals", "light_point_of"),
 )
 """Fields of ``StandIn``, as ``subject.lit_subject`` names them."""
-STAND_IN = light_state.STAND_IN
-"""Property of the objects made here: True."""
 OWNER = "meshsplats_splats"
 """Property of the objects made here: the object of the splats that they were made for."""
 SURFACE, FINE = "meshsplats_surface", "meshsplats_fine"
