@@ -16,7 +16,9 @@ from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
+from meshsplats.choices import Look
 from meshsplats.conversion.driver import worth_drawing
+from meshsplats.conversion.gaps import with_usual_look
 from meshsplats.conversion.merging_views import convert_within_limits, simplify_for_views
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
@@ -98,9 +100,12 @@ class Converter:
         cloud = self.callbacks.load(job.source)
         seen = seen_from(cameras, job.source, cloud.origin)
         read = time.perf_counter()
+        options = product.conversion
+        if product.preset == "default" and not seen and not product.merges:
+            options = with_usual_look(cloud, options, self.threads)
         mesh = convert_within_limits(
             cloud,
-            product.conversion,
+            options,
             preset=product.preset,
             cameras=seen,
             up=product.direction,
@@ -115,8 +120,9 @@ class Converter:
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
             "merged": product.merges,
+            "look": (look := product.look if options.look is None else options.look),
             **self._finish(mesh, job, seen, times, opening, measured),
-            "fidelity": self._fidelity(cloud, mesh, seen),
+            "fidelity": self._fidelity(cloud, mesh, seen, look),
         }
 
     def _mesh_in_blocks(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
@@ -160,15 +166,15 @@ class Converter:
         return {"read": source.count, "written": count, "seconds": seconds}
 
     def _fidelity(
-        self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera]
+        self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera], look: Look
     ) -> dict[str, Any] | None:
-        """Scores of the mesh against its splats."""
+        """Scores of the mesh against its splats with this ``look``."""
         if self.product.fidelity is None:
             return None
         if self.product.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.product.conversion.crop)
         counted = self.product.fidelity
-        return fidelity(cloud, mesh, cameras, counted, self.product.look, threads=self.threads)
+        return fidelity(cloud, mesh, cameras, counted, look, threads=self.threads)
 
     def _views_for_alpha(self, cloud: GaussianCloud, job: Job) -> list[Camera]:
         """Views by which the alpha mode is chosen where no cameras are given: those that are found in a

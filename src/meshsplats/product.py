@@ -73,7 +73,7 @@ class Product:
     """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
     stream: bool = False
     """Convert in blocks, so that memory does not grow with the file: into a .ply mesh, or with ``as_splats``
-    into a .ply of splats, without a preview. The result is the same."""
+    into a .ply of splats, without a preview. The result is the same where ``look`` is given."""
     origin: WantedOrigin = "keep"  # as of outputs.placed
     no_preview: bool = False
     """Write no preview."""

@@ -28,6 +28,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.cleaning import cropped
+from meshsplats.conversion.gaps import with_usual_look
 from meshsplats.conversion.merging_views import convert_within_limits, views_of_place
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
@@ -169,6 +170,8 @@ class PictureOptions:
         # Crossed ellipses stand upright on the surface, where they catch too little light.
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
         options = ConversionOptions(max_splats=self.most_splats, mode=mode)
+        if not self.merges(scene):
+            options = with_usual_look(scene, options, self.threads)
         # Merging by what is seen takes three times as long; of an object, it is worth 0.4 dB.
         if self.fast and self.merges(scene) and self._is_object(scene, source):
             return convert(scene, options, up=self.up, threads=self.threads)

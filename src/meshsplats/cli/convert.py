@@ -265,12 +265,12 @@ class Convert(Command):
             if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
-                    lines.append(f"better there: {self._for_depth_buffers()}")
+                    lines.append(f"better there: {self._for_depth_buffers(result['look'])}")
                     lines.append(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
         if result["preview"]:
             lines.append(f"preview: {result['preview']}")
         if result.get("converted") is not None and self.product.files.compression == "none":
-            lines.append(f"next: {self._next(seen_from(cameras, job.source, zero_origin()))}")
+            lines.append(f"next: {self._next(seen_from(cameras, job.source, zero_origin()), result['look'])}")
         return lines
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:
@@ -285,22 +285,23 @@ class Convert(Command):
         alpha = f", alpha {choice['alpha']}" if (choice := result.get("alpha")) else ""
         self.finish(result, f"{job.shown}: {sizes}: {files}{alpha}", indent=None)
 
-    def _next(self, cameras: Sequence[Camera] | None) -> str:
+    def _next(self, cameras: Sequence[Camera] | None, look: str) -> str:
         """The command that compares the mesh with the splats in its cameras, or one that renders it if only a
         part of them was converted."""
         folder, source, product = self.output.with_suffix(""), shown_path(self.input[0]), self.product
         if product.conversion.crop is not None or source == "-" or product.scale is not None:
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
-        words += ["--look", product.look] if product.look != "area" else []
+        words += ["--look", look] if look != "area" else []
         words += again(product, "data", missing="few")
         if cameras and product.data is None:
             words += ["--cameras", source if product.cameras is None else product.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
 
-    def _for_depth_buffers(self) -> str:
+    def _for_depth_buffers(self, look: str) -> str:
         """The command that makes a mesh for viewers that do not sort, and what is gained by it."""
         words: list[object] = ["meshsplats", "finetune", shown_path(self.input[0])]
-        words += [*again(self.product, "data", missing="few"), *self.reading.again()]
+        words += [*again(self.product, "data", missing="few"), *(["--look", look] if look != "area" else [])]
+        words += self.reading.again()
         words += ["-o", self.output.with_suffix(".solid.glb"), "--opacity", "cutoff", "--soft-share", "0.05"]
         return f"{command_line(words)} ({ENGINE_GAIN})"

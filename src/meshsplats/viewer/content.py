@@ -14,6 +14,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion.budget import usual_triangles_each
+from meshsplats.conversion.gaps import with_usual_look
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.merging_views import merging_views, views_of_place
 from meshsplats.evaluation.metrics import psnr
@@ -112,7 +113,7 @@ def content_of_splats(
     _check_size(each * min(count, len(cloud)))
     views = merging_views(cloud, up=up, threads=threads) if count < len(cloud) else None
     kept = simplify_in_blocks(cloud, count, cameras=views, threads=threads)
-    mesh = convert(kept, threads=threads)
+    mesh = convert(kept, with_usual_look(kept, threads=threads) if kept is cloud else None, threads=threads)
     coarse = _coarse(mesh, kept, views, up, threads)
     content = Content(mesh, kept.of_degree(0) if shown else None, coarse, kept=len(kept))
     if kept is cloud:

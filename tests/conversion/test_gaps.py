@@ -1,0 +1,71 @@
+"""Laws of the look that files get whose splats are smaller than the gaps between them."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from meshsplats.cli import main
+from meshsplats.conversion.gaps import gap_share, with_usual_look
+from meshsplats.conversion.options import ConversionOptions
+from meshsplats.errors import DataWarning
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.viewer.content import content_of_splats
+
+
+def wall(sigma: float, side: int = 60) -> GaussianCloud:
+    """A square of ``side`` x ``side`` round opaque splats, one unit apart."""
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    n = x.size
+    return GaussianCloud(
+        means=np.column_stack([x.ravel(), y.ravel(), np.zeros(n)]).astype(np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        scales=np.full((n, 3), sigma, np.float32),
+        opacities=np.full(n, 0.99, np.float32),
+        sh=np.zeros((n, 1, 3), np.float32),
+    )
+
+
+@pytest.fixture(autouse=True)
+def small_images(monkeypatch):
+    """Of 120 pixels, in which a unit is about 1.5 pixels wide: a splat viewer adds a sigma of 0.35 to it."""
+    monkeypatch.setattr("meshsplats.conversion.gaps.SIDE", 120)
+
+
+def test_only_gaps_that_a_splat_viewer_closes_count():
+    assert gap_share(wall(0.6)) == 0  # they overlap
+    assert gap_share(wall(0.3)) > 0.5
+    assert gap_share(wall(0.02)) == 0  # a splat viewer shows a sieve, too
+    assert gap_share(wall(0.3).take([])) == 0
+
+
+def test_the_look_is_widened_with_a_word_and_only_where_nobody_chose_it():
+    with pytest.warns(DataWarning, match=r"smaller than the gaps between them; .*look splats"):
+        assert with_usual_look(wall(0.3)) == ConversionOptions(look="splats")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert with_usual_look(wall(0.6)) == ConversionOptions()
+        for given in ({"look": "area"}, {"footprint": "none"}, {"footprint_px2": 0.1}):
+            assert with_usual_look(wall(0.3), ConversionOptions(**given)) == ConversionOptions(**given)
+
+
+def test_programs_that_make_a_first_image_take_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_gaussians(wall(0.3), "fine.ply")
+    save_gaussians(wall(0.6), "plain.ply")
+    sizes = {}
+    for name, options in (("fine", []), ("area", ["--look", "area"]), ("splats", ["--look", "splats"])):
+        assert main(["convert", "fine.ply", "-o", f"{name}.npz", "--no-preview", *options]) == 0
+        captured = capsys.readouterr()
+        assert ("gaps between them" in captured.err) == (name == "fine")
+        assert ("--look splats" in captured.out) == (name != "area")  # the next command scores that look
+        with np.load(f"{name}.npz") as arrays:
+            sizes[name] = arrays["vertices"].copy()
+    np.testing.assert_array_equal(sizes["fine"], sizes["splats"])
+    assert np.abs(sizes["fine"] - sizes["area"]).max() > 0.01
+    assert main(["convert", "plain.ply", "-o", "plain.npz", "--no-preview"]) == 0
+    assert "gaps" not in capsys.readouterr().err
+    with pytest.warns(DataWarning, match="gaps between them"):
+        content = content_of_splats(wall(0.3))
+    np.testing.assert_allclose(content.mesh.vertices, sizes["fine"], atol=1e-4)
