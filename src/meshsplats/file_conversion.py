@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._files.atomic import together
+from meshsplats._files.atomic import in_words, together
 from meshsplats._words import plural
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
@@ -23,7 +24,7 @@ from meshsplats.conversion.merging_views import convert_within_limits, simplify_
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.draw_order import DrawOrder
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.comparison import fidelity
 from meshsplats.evaluation.viewers import SIDE, VIEWS
 from meshsplats.formats.base_meshes import load_vertex_colored
@@ -43,6 +44,8 @@ from meshsplats.product import Product
 from meshsplats.viewpoints.showing import default_views
 
 LARGE_BYTES = 1_000_000_000
+_FACE_BYTES, _VERTEX_BYTES = 12, 24
+"""Of a .glb that is not compressed, about."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,8 @@ class Converter:
         ``cameras``; ``order``: one that the mesh has already."""
         start, files, threads = time.perf_counter(), self.product.files, self.threads
         choice = None
+        if files.compression == "none":
+            _warn_of_size(mesh, job.outputs)
         if order is None:
             choice = files.choice(mesh, job.outputs, cameras if measured is None else measured, threads)
             order = files.order(mesh, job.outputs, cameras, threads)
@@ -322,11 +327,14 @@ def times_in_words(seconds: dict[str, float]) -> str:
     return ", ".join(f"{words[name]} {value:.2f} s" for name, value in seconds.items() if value)
 
 
-def too_large(path: Path) -> list[str]:
-    """A line about a .glb that viewers in browsers do not take: they hold it in memory, more than once."""
-    if path.suffix.lower() != ".glb" or path.stat().st_size <= LARGE_BYTES:
-        return []
-    return [
-        "too large for viewers in browsers, and for most engines: ``max_triangles`` 2000000 merges splats"
-        " first, 'meshsplats tiles' keeps them all"
-    ]
+def _warn_of_size(mesh: SplatMesh, outputs: Sequence[Path]) -> None:
+    """Warns of a .glb that viewers in browsers will not take: they hold it in memory, more than once."""
+    size = _FACE_BYTES * len(mesh.faces) + _VERTEX_BYTES * len(mesh.vertices)
+    if size > LARGE_BYTES and any(path.suffix.lower() == ".glb" for path in outputs):
+        warnings.warn(
+            f"{plural(len(mesh.faces), 'triangle')}: the .glb will have about {in_words(size)}, too large for"
+            " viewers in browsers and for most engines. ``max_triangles`` 2000000 merges splats first,"
+            " 'meshsplats tiles' keeps them all",
+            DataWarning,
+            stacklevel=2,
+        )

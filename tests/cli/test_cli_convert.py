@@ -401,9 +401,26 @@ def test_a_file_that_no_viewer_opens_says_so(tmp_path, capsys, monkeypatch):
     for limit, said in ((10**6, False), (1000, True)):
         monkeypatch.setattr("meshsplats.file_conversion.LARGE_BYTES", limit)
         assert run(source, "-o", tmp_path / "m.glb", "--no-preview", "--force") == 0
-        assert ("too large for viewers" in capsys.readouterr().out) == said
+        err = capsys.readouterr().err
+        assert ("too large for viewers" in err) == ("--max-triangles 2000000 merges" in err) == said
     assert run(source, "-o", tmp_path / "m.npz", "--no-preview") == 0
-    assert "too large" not in capsys.readouterr().out
+    assert "too large" not in capsys.readouterr().err
+
+
+def test_the_size_is_said_before_anything_is_written(tmp_path, capsys, monkeypatch):
+    source, out = tmp_path / "balls.ply", tmp_path / "m.glb"
+    save_gaussians(nested_balls(0.95), source)
+    monkeypatch.setattr("meshsplats.file_conversion.LARGE_BYTES", 1000)
+    monkeypatch.setattr(
+        "meshsplats.evaluation.mesh_files.MeshFileOptions.save", lambda *_: pytest.fail("stop")
+    )
+    with pytest.raises(pytest.fail.Exception):
+        run(source, "-o", out, "--no-preview")
+    said = re.search(r"about ([\d.]+) kB", capsys.readouterr().err)
+    assert not out.exists()
+    monkeypatch.undo()
+    assert run(source, "-o", out, "--no-preview") == 0
+    assert float(said[1]) == pytest.approx(out.stat().st_size / 1000, rel=0.25)  # 16-bit indices
 
 
 def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):

@@ -251,7 +251,7 @@ class Convert(Command):
     def _lines(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> list[str]:
         from meshsplats._origin import zero_origin
         from meshsplats.evaluation.viewers import AlphaChoice
-        from meshsplats.file_conversion import counts_in_words, seen_from, times_in_words, too_large
+        from meshsplats.file_conversion import counts_in_words, seen_from, times_in_words
 
         made = named(self.output)
         if result["skipped"]:
@@ -261,14 +261,14 @@ class Convert(Command):
             lines = [f"{result['written']:,} of {read} in {result['seconds']:.2f} s", made]
         else:
             lines = [counts_in_words(result), f"{made}: {times_in_words(result['seconds'])}"]
-            lines += too_large(self.output)
             if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
                     lines.append(f"better there: {self._for_depth_buffers(result['look'])}")
                     lines.append(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
         if result["preview"]:
-            lines.append(f"preview: {result['preview']}")
+            as_sorted = ", sorted" if result.get("alpha") else ""
+            lines.append(f"preview{as_sorted}: {result['preview']}")
         if result.get("converted") is not None and self.product.files.compression == "none":
             lines.append(f"next: {self._next(seen_from(cameras, job.source, zero_origin()), result['look'])}")
         return lines
