@@ -57,6 +57,25 @@ def test_a_list_of_test_images_is_followed(tmp_path):
     assert [view.name for view in dataset.train] == ["p00.png", "p02.png", "p04.png"]
 
 
+def test_a_list_of_test_images_that_does_not_match_is_named_or_refused(tmp_path):
+    folder = simple_colmap(tmp_path, 5)
+    listed = folder / "sparse/0/test.txt"
+    for text in ("images/p03.png\n", "p01.png p03.png\n", "IMG_3025.JPG\n"):
+        listed.write_text(text)
+        refused(folder, r"none of its images is in test\.txt, which has '.*their names are such as 'p00'")
+    listed.write_text("p03.png\nIMG_9999.JPG\n")
+    with pytest.warns(DataWarning, match=r"1 of 2 names in test\.txt are of no image.*\('IMG_9999'\)"):
+        assert [view.name for view in load_dataset(folder).test] == ["p03.png"]
+    listed.write_text("\n")
+    with pytest.warns(DataWarning, match=r"test\.txt: lists no image, so no view is held out"):
+        assert load_dataset(folder).test == ()
+    listed.write_text("p01.png\np03.png\n")
+    (folder / "images/p03.png").unlink()  # of which there is a warning of its own
+    with pytest.warns(DataWarning, match="1 images are missing") as warned:
+        assert [view.name for view in load_dataset(folder).test] == ["p01.png"]
+    assert len(warned) == 1
+
+
 def test_intrinsics_follow_the_images_real_size(tmp_path):
     """The model was made of images twice as large, the folder of smaller ones a pixel short."""
     folder = simple_colmap(tmp_path, 2)
@@ -303,8 +322,19 @@ def test_held_out_views_are_those_that_are_there(tmp_path):
         load_dataset(folder, missing="error")
     with pytest.warns(DataWarning, match=r"2 images are missing.*images/p01\.png, images/p03\.png"):
         dataset = load_dataset(folder, test_every=2)
-    # Held out is every second of those that are there.
-    assert [view.name for view in dataset.test] == ["p00.png", "p04.png"]
+    assert len(dataset.views) == 3
+
+
+@pytest.mark.parametrize("lost", [3, 4])
+def test_a_missing_photograph_leaves_the_others_on_their_side(tmp_path, lost):
+    folder = simple_colmap(tmp_path, 12)
+    whole = load_dataset(folder, test_every=4)
+    (folder / f"images/p{lost:02d}.png").unlink()
+    with pytest.warns(DataWarning, match="1 images are missing"):
+        dataset = load_dataset(folder, test_every=4)
+    for before, after in (whole.train, dataset.train), (whole.test, dataset.test):
+        kept = [view.name for view in before if view.name != f"p{lost:02d}.png"]
+        assert [view.name for view in after] == kept
 
 
 def test_no_images_at_all_says_where_they_were_expected(tmp_path):

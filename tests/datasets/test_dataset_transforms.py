@@ -110,6 +110,18 @@ def test_validation_views_stand_in_for_missing_test_views(tmp_path):
         assert load_dataset(tmp_path).test == ()
 
 
+def test_images_to_train_with_are_not_held_out(tmp_path):
+    """As where transforms_train.json was copied for programs that want a file of test views."""
+    nerf(tmp_path, train=2, test=1)
+    own = json.loads((tmp_path / "transforms_test.json").read_text())
+    train = json.loads((tmp_path / "transforms_train.json").read_text())
+    write_json(tmp_path / "transforms_test.json", own | {"frames": own["frames"] + train["frames"]})
+    with pytest.warns(DataWarning, match=r"2 images are both .* not held out \(train/r_0, train/r_1\)"):
+        dataset = load_dataset(tmp_path)
+    assert [view.name for view in dataset.train] == ["train/r_0", "train/r_1"]
+    assert [view.name for view in dataset.test] == ["test/r_0"]
+
+
 def test_a_named_file_decides_the_layout(tmp_path):
     studio(nerf(tmp_path))
     assert len(load_dataset(tmp_path).train) == 3
@@ -159,6 +171,33 @@ def test_the_files_own_split(tmp_path):
         "none of its images is in 'train_",
     )
     refused(studio(tmp_path, 5, test_filenames="all"), "'test_filenames' must be a list")
+
+
+def test_a_list_that_the_file_lacks_has_the_rest(tmp_path):
+    names = [f"images/f{i}.png" for i in range(5)]
+    for lists, test in [
+        ({"test_filenames": names[3:]}, names[3:]),
+        ({"val_filenames": names[2:3]}, names[2:3]),
+        ({"train_filenames": names[1:]}, names[:1]),
+        ({"train_filenames": names}, names[:1]),  # which leave nothing: every 8th
+    ]:
+        dataset = load_dataset(studio(tmp_path, 5, **lists))
+        assert [view.name for view in dataset.test] == test
+        assert [view.name for view in dataset.train] == [name for name in names if name not in test]
+
+
+def test_lists_of_the_file_that_do_not_match_are_named_or_refused(tmp_path):
+    names = [f"images/f{i}.png" for i in range(5)]
+    lists = {"train_filenames": names[:3], "test_filenames": ["f3.png", "f4.png"]}
+    refused(studio(tmp_path, 5, **lists), "none of its images is in 'test_filenames', which has 'f3.png'")
+    lists["test_filenames"] = ["f3.png", *names[2:]]
+    with (
+        pytest.warns(DataWarning, match="1 of 4 names in 'test_filenames' are of no image"),
+        pytest.warns(DataWarning, match=r"1 images are both .* not held out \(images/f2\.png\)"),
+    ):
+        dataset = load_dataset(studio(tmp_path, 5, **lists))
+    assert [view.name for view in dataset.train] == names[:3]
+    assert [view.name for view in dataset.test] == names[3:]
 
 
 def test_brown_distortion_is_taken_out(tmp_path):

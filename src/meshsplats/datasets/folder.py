@@ -16,7 +16,7 @@ from meshsplats._kinds import need_path
 from meshsplats._origin import choose_origin
 from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.colmap import read_model
-from meshsplats.datasets.image_files import Album, Frame, Taken, split
+from meshsplats.datasets.image_files import Album, Frame, Taken, first_names, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
 from meshsplats.datasets.llff import read_poses_bounds
 from meshsplats.datasets.photo_file import PhotoFile
@@ -62,43 +62,88 @@ def _colmap(layout: Layout, album: Album, test_every: int) -> Views:
             stacklevel=2,
         )
     # Cameras of the model have the size of the files in images/; without it, these may lie beside sparse/.
-    taken = _taken(read_model(model, layout.images), model, album)
+    frames = read_model(model, layout.images)
     listed = model.parent.name == "sparse" or model.name == "sparse"
     chosen = _listed_test(model / "test.txt") if listed else None
     if chosen is None:
-        return _views(*split(taken, test_every))
-    stems = {name.rsplit(".", 1)[0] for name in chosen}
-    test = [views for views in taken if _stem(views) in stems]
-    return _views([views for views in taken if _stem(views) not in stems], test)
+        return _views(*split(_taken(frames, model, album), test_every))
+    stems = [_stem(frame.name) for frame in frames]
+    chosen = {_stem(name) for name in chosen}
+    _check_names(model, "test.txt", chosen, stems)
+    taken = _taken(frames, model, album)
+    train, test = (_members(taken, [(stem in chosen) is held for stem in stems]) for held in (False, True))
+    return _views(train, test)
 
 
 def _taken(frames: list[Frame], where: Path, album: Album, *, needed: bool = True) -> list[Taken]:
     taken = album.views(frames, str(where))
-    album.report(str(where), len(taken), needed=needed)
+    album.report(str(where), sum(map(bool, taken)), needed=needed)
     return taken
 
 
-def _stem(views: Taken) -> str:
-    return views[0][0].name.rsplit(".", 1)[0]
+def _stem(name: str) -> str:
+    return name.rsplit(".", 1)[0]
+
+
+def _members(taken: Sequence[Taken], chosen: Sequence[bool]) -> list[Taken]:
+    return [views for views, one in zip(taken, chosen, strict=True) if one]
+
+
+def _check_names(where: Path, place: str, listed: set[str], names: Sequence[str]) -> None:
+    """Warns of images that are ``listed`` in a ``place`` and have none of the ``names`` of those that there
+    are. FileFormatError if no listed one has."""
+    unknown = [repr(name[:60]) for name in sorted(listed.difference(names))]
+    if unknown and len(unknown) == len(listed):
+        raise FileFormatError(
+            f"{where}: none of its images is in {place}, which has {unknown[0]}; their names are such as"
+            f" {min(names)[:60]!r}"
+        )
+    if unknown:
+        warnings.warn(
+            f"{where}: {len(unknown)} of {len(listed)} names in {place} are of no image and are passed over"
+            f" ({first_names(unknown)})",
+            DataWarning,
+            stacklevel=2,
+        )
+
+
+def _apart(where: Path, train: list[Taken], test: list[Taken]) -> Views:
+    """The views of ``train``, and of ``test`` those of photographs that are not in it, with a DataWarning of
+    the others."""
+    known = {views[0][1].path for views in train if views}
+    learned = [bool(views) and views[0][1].path in known for views in test]
+    if any(learned):
+        both = [views[0][1].name for views in _members(test, learned)]
+        warnings.warn(
+            f"{where}: {len(both)} images are both to train and to test with: they are trained on, and not"
+            f" held out ({first_names(both)})",
+            DataWarning,
+            stacklevel=2,
+        )
+    return _views(train, _members(test, [not one for one in learned]))
 
 
 def _listed_test(path: Path) -> set[str] | None:
-    """Names in INRIA's ``sparse/0/test.txt``, one a line; None if there is no such file."""
+    """Names in INRIA's ``sparse/0/test.txt``, one a line; None if there is no such file. Warns of one without
+    a name."""
     if not path.is_file():
         return None
     with open(path, "rb") as file:
         text = file.read(MAX_LIST_BYTES)
     try:
-        return {line.strip() for line in text.decode("utf-8-sig").splitlines() if line.strip()}
+        names = {line.strip() for line in text.decode("utf-8-sig").splitlines() if line.strip()}
     except UnicodeDecodeError:
         raise FileFormatError(f"{path}: not UTF-8 text") from None
+    if not names:
+        warnings.warn(f"{path}: lists no image, so no view is held out", DataWarning, stacklevel=2)
+    return names
 
 
 def _nerf_synthetic(folder: Path, album: Album) -> Views:
     train = _numbered(folder / "transforms_train.json", album)
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
-            return _views(train, _numbered(folder / name, album, needed=False))
+            return _apart(folder / name, train, _numbered(folder / name, album, needed=False))
     warnings.warn(
         f"{folder}: neither transforms_test.json nor transforms_val.json: there are no test views",
         DataWarning,
@@ -122,19 +167,21 @@ def _by_number(frame: Frame) -> tuple[str, int, str]:
 def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
     content = read_transforms(path)
     frames = sorted(content.frames, key=lambda frame: frame.name)
+    names = [frame.name for frame in frames]
+    listed = {
+        part: {name.removeprefix("./") for name in some} for part, some in content.splits.items() if some
+    }
+    out = "test" if "test" in listed else "val"
+    for part in ("train", out):
+        if part in listed:
+            _check_names(path, f"'{part}_filenames'", listed[part], names)
     taken = _taken(frames, path, album)
-    held = {key: {name.removeprefix("./") for name in names} for key, names in content.splits.items()}
-    out = held.get("test") or held.get("val")
-    if not held.get("train") or not out:
+    # A list that is missing has what is in no other.
+    rest = set(names).difference(*listed.values())
+    train, test = listed.get("train", rest), listed.get(out, rest)
+    if not listed or not test:
         return _views(*split(taken, test_every))
-
-    def members(names: set[str]) -> list[Taken]:
-        return [views for views in taken if views[0][1].name in names]
-
-    train, test = members(held["train"]), members(out)
-    if not train:
-        raise FileFormatError(f"{path}: none of its images is in 'train_filenames'")
-    return _views(train, test)
+    return _apart(path, *(_members(taken, [name in part for name in names]) for part in (train, test)))
 
 
 def _views(train: list[Taken], test: list[Taken]) -> Views:
@@ -191,8 +238,8 @@ def load_dataset(
         path: the folder, or ``transforms.json`` itself.
         downscale: whole factor of the images' sides, 1 to 64. ``images_2/``, ``images_4/`` and so on are used
             where they exist; else each pixel is the mean of those that it covers.
-        test_every: views 0, n, 2n ... by name are held out, unless the data set has a split of its own; 0:
-            none.
+        test_every: views 0, n, 2n ... by name are held out, missing ones counted, unless the data set has a
+            split of its own; 0: none.
         background: RGB in [0, 1] over which ``View.image`` shows images with alpha. ``ViewImage.over`` takes
             another.
         cache_bytes: images are kept up to this many bytes after their first use; the others are read anew
@@ -208,13 +255,15 @@ def load_dataset(
 
     Raises:
         FileFormatError: a folder of no known layout, a broken file in it, a missing image, one whose shape
-            does not fit its camera, or a path that leaves the folder.
+            does not fit its camera, a list of test images that has none of them, or a path that leaves the
+            folder.
         FileNotFoundError: nothing at ``path``.
         ValueError: an option out of its range.
 
-    Warns with a DataWarning where masks are missing, which leaves all pixels of those views to count, and
-    where an image has another suffix than the file gives it, or is written in letters of another case: it is
-    taken if no other can be meant.
+    Warns with a DataWarning where masks are missing, which leaves all pixels of those views to count, where
+    an image has another suffix than the file gives it, or is written in letters of another case: it is taken
+    if no other can be meant, and where a split of the data set's own names what is not there, or images to
+    train with as test images, which are then not held out.
     """
     need_path(path=path)
     check_reading(downscale, test_every)

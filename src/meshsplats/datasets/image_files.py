@@ -171,7 +171,7 @@ def _stem_of(name: str) -> str:
 
 
 Taken = list[tuple[Camera, PhotoFile]]
-"""The views made from one photograph: one, or the six of a panorama."""
+"""The views made from one photograph: one, or the six of a panorama; none if it is missing."""
 
 
 @dataclass
@@ -195,7 +195,7 @@ class Album:
         self._shelf = Shelf(self.folder)
 
     def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
-        """Cameras and photographs of each frame whose image is there, in order."""
+        """Cameras and photographs of each frame, in order."""
         self.missing, self.no_mask, self.renamed = [], [], []
         result: list[Taken] = []
         frames = list(frames)
@@ -204,6 +204,7 @@ class Album:
         for frame, label, (full, small) in zip(frames, labels, self._files(frames, labels), strict=True):
             if frame.lens is None or (full is None and small is None):
                 self.missing.append(frame.file)
+                result.append([])
                 continue
             path = small or full
             assert path is not None
@@ -313,7 +314,7 @@ class Album:
         if self.missing and refused:
             raise FileFormatError(
                 f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
-                f" ({_first(self.missing)}){self._near()}; ``missing`` skip leaves them out"
+                f" ({first_names(self.missing)}){self._near()}; ``missing`` skip leaves them out"
             )
         near = self._near() if self.missing else ""
         for names, text in (
@@ -322,7 +323,9 @@ class Album:
             (self.no_mask, "images have no mask and count wholly"),
         ):
             if names:
-                warnings.warn(f"{where}: {len(names)} {text} ({_first(names)})", DataWarning, stacklevel=2)
+                warnings.warn(
+                    f"{where}: {len(names)} {text} ({first_names(names)})", DataWarning, stacklevel=2
+                )
 
     def _hint(self) -> str:
         name = self.missing[0]
@@ -358,7 +361,8 @@ def _folders(folder: Path) -> list[str]:
         return sorted(entry.name for entry in entries if entry.is_dir() and not is_hidden(entry.name))
 
 
-def _first(names: Sequence[str]) -> str:
+def first_names(names: Sequence[str]) -> str:
+    """The first of ``names``, and whether there are more."""
     return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
@@ -396,7 +400,8 @@ def _check_shape(lens: Lens, header: Header, path: Path) -> None:
 
 
 def split(taken: Sequence[Taken], test_every: int) -> tuple[list[Taken], list[Taken]]:
-    """Train and test: every n-th, which are sorted by name, is for testing, from the first on."""
+    """Train and test: every n-th, which are sorted by name, is for testing, from the first on. Missing ones
+    count: where a photograph is thrown away, the others stay on their side."""
     if not test_every:
         return list(taken), []
     test = [views for i, views in enumerate(taken) if i % test_every == 0]
