@@ -22,7 +22,14 @@ from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.evaluation.backgrounds import Background, choose_background
-from meshsplats.evaluation.benchmarks import BENCHMARKS, Candidates, convert_scene, run_benchmark
+from meshsplats.evaluation.benchmarks import (
+    BENCHMARKS,
+    Benchmark,
+    Candidates,
+    convert_scene,
+    find_input,
+    run_benchmark,
+)
 from meshsplats.evaluation.lpips import load_lpips
 from meshsplats.evaluation.report import Report, ScoredView, evaluate
 from meshsplats.evaluation.results import (
@@ -35,6 +42,7 @@ from meshsplats.evaluation.results import (
     save_report,
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names
+from meshsplats.evaluation.trained_views import TrainedOn, find_trained_on
 from meshsplats.file_options import ScoringOptions
 from meshsplats.finetuning.candidates import tuned_candidates
 from meshsplats.finetuning.targets import Targets
@@ -81,6 +89,10 @@ class Scoring:
         before = None if before is None else before.relative_to(origin)
         meshes = {name: mesh.relative_to(origin) for name, mesh in meshes.items()}
         dataset = self._dataset(splats, origin if known else None)
+        trained_on: dict[str, TrainedOn] = {}
+        if chosen.data is not None:
+            sources = [*files, *(path for path in (chosen.before, chosen.splats) if path is not None)]
+            trained_on = self._trained_on(sources, dataset, chosen.data, chosen.downscale, chosen.test_every)
         scenes = {"splats": splats, **meshes, "mesh before": before}
         background = choose_background(
             optional_color(chosen.background),
@@ -93,7 +105,7 @@ class Scoring:
             # Their images are the ground truth; a mesh can reach degree 0 of it.
             more = splats.sh_degree > 0 and chosen.sh_degree != 0
             splats = replace(splats, sh=splats.sh[:, :1]) if more else None
-        return self._score(dataset, background, meshes, splats, before)
+        return self._score(dataset, background, meshes, splats, before, trained_on)
 
     def run_benchmark(
         self,
@@ -109,17 +121,18 @@ class Scoring:
         if chosen.protocol is None or chosen.data is None:
             raise OptionsError("give ``protocol``, and ``data`` with its scenes")
         self.check_outputs(force)
+        benchmark = BENCHMARKS[chosen.protocol]
         with workers(self.threads) as found:
             task, prepare = replace(self, threads=found.threads), convert_scene
             if chosen.tune is not None:
                 prepare = partial(tuned_candidates, preset=chosen.tune, threads=found.threads)
             result = run_benchmark(
-                BENCHMARKS[chosen.protocol],
+                benchmark,
                 models,
                 chosen.data,
                 chosen.reading.load_scene,
                 prepare=prepare,
-                score=task.score_scene,
+                score=partial(task.score_scene, benchmark, models, chosen.data),
                 background=optional_color(chosen.background),
                 downscale=chosen.downscale,
                 workers=found,
@@ -133,13 +146,37 @@ class Scoring:
         check_outputs([self.folder / name for name in names], force, self.folder)
 
     def score_scene(
-        self, scene: str, dataset: Dataset, background: Background, candidates: Candidates
+        self,
+        benchmark: Benchmark,
+        models: Path,
+        data: Path,
+        scene: str,
+        dataset: Dataset,
+        background: Background,
+        candidates: Candidates,
     ) -> Report:
-        """Scores the ``candidates`` of a ``scene`` of a benchmark, with a folder of its own."""
+        """Scores the ``candidates`` of a ``scene`` of a ``benchmark``, made from what is in the folder
+        ``models``, against its ``dataset`` of the folder ``data``, with a folder of its own."""
         mesh, splats, before = candidates
+        source, downscale = find_input(models, scene), self.options.downscale or benchmark.scenes[scene]
+        sources = [source] if source is not None else []
+        trained_on = self._trained_on(sources, dataset, data / scene, downscale, benchmark.test_every)
         self.folder.mkdir(exist_ok=True)
         own = replace(self, folder=self.folder / scene)
-        return own._score(dataset, background, {"mesh": mesh}, splats, before)
+        return own._score(dataset, background, {"mesh": mesh}, splats, before, trained_on)
+
+    def _trained_on(
+        self, paths: Sequence[Path], dataset: Dataset, data: Path, downscale: int | None, test_every: int
+    ) -> dict[str, TrainedOn]:
+        """Those of ``paths`` that were trained on what is held out of ``data``, a ``dataset`` with the split
+        ``test_every``."""
+
+        def load(test_every: int) -> Dataset:
+            scale = 1 if downscale is None else downscale
+            return load_dataset(data, downscale=scale, test_every=test_every, missing=self.options.missing)
+
+        found = {str(path): find_trained_on(path, dataset, test_every, load) for path in paths}
+        return {path: views for path, views in found.items() if views is not None}
 
     def _load_mesh(self, path: Path) -> SplatMesh:
         found, order = self.options.reading.load_scene(path), self.options.order
@@ -183,8 +220,10 @@ class Scoring:
         meshes: Mapping[str, SplatMesh],
         splats: GaussianCloud | None,
         before: SplatMesh | None,
+        trained_on: Mapping[str, TrainedOn],
     ) -> Report:
-        """Evaluates one scene over ``background`` and writes its files."""
+        """Evaluates one scene over ``background`` and writes its files. ``trained_on``: by path, what was
+        trained on views that are held out."""
         chosen, dataset = self.options, dataset.over(background.color)
         views = dataset.test or dataset.views
         images = None if chosen.images is None else image_folder(chosen.images, [v.camera for v in views])
@@ -213,6 +252,9 @@ class Scoring:
         about: dict[str, Any] = {**background.to_dict(), "lpips_network": chosen.network if lpips else None}
         if chosen.cameras is not None:
             about["held_out"] = None  # it is unknown what a mesh was trained on
+        if trained_on:
+            about["held_out"] = False if any(views.sure for views in trained_on.values()) else None
+            about["trained_on"] = {path: views.in_words() for path, views in trained_on.items()}
         report = replace(report, about={**report.about, **about})
         save_report(report, self.folder)
         return report

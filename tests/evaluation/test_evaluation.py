@@ -198,7 +198,8 @@ def test_errors_say_what_is_missing():
 
 
 def test_views_are_all_scored_where_none_is_held_out():
-    report = evaluate(quad([0, 0, 0, 1]), Dataset((view([0.0, 0, 0]),)))
+    with pytest.warns(DataWarning, match="no view is held out, so all 1 training views are scored"):
+        report = evaluate(quad([0, 0, 0, 1]), Dataset((view([0.0, 0, 0]),)))
     assert (report.about["views"], report.about["held_out"]) == (1, False)
 
 

@@ -201,6 +201,14 @@ def model_background(path: str | os.PathLike[str]) -> tuple[float, float, float]
 
     It is ``white_background`` in the ``cfg_args`` of the 3DGS code. None if it is not there.
     """
+    found = model_settings(path)
+    setting = found and re.search(r"\bwhite_background\s*=\s*(True|False)\b", found[1])
+    return None if not setting else WHITE if setting[1] == "True" else BLACK
+
+
+def model_settings(path: str | os.PathLike[str]) -> tuple[Path, str] | None:
+    """The ``cfg_args`` of the 3DGS code and their text, for a model folder ``path`` or the one that the splat
+    file ``path`` is in. None if they are not there."""
     path = Path(path)
     folders = [path] if path.is_dir() else []
     if path.parent.name.startswith("iteration_") and path.parent.parent.name == "point_cloud":
@@ -208,12 +216,9 @@ def model_background(path: str | os.PathLike[str]) -> tuple[float, float, float]
     for folder in folders:
         try:
             with open(folder / "cfg_args", "rb") as file:
-                text = file.read(_MAX_BYTES).decode("utf-8", "replace")
+                return folder / "cfg_args", file.read(_MAX_BYTES).decode("utf-8", "replace")
         except OSError:
             continue
-        setting = re.search(r"\bwhite_background\s*=\s*(True|False)\b", text)
-        if setting:
-            return WHITE if setting[1] == "True" else BLACK
     return None
 
 

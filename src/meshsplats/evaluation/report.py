@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
@@ -16,6 +17,7 @@ from meshsplats.camera import Camera
 from meshsplats.choices import Look
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -171,7 +173,8 @@ def evaluate(
     threads: int | None = None,
     on_view: Callable[[ScoredView], None] | None = None,
 ) -> Report:
-    """Scores meshes, splats and images on the held-out views of ``dataset``, or on all views if it has none.
+    """Scores meshes, splats and images on the held-out views of ``dataset``, or on all views if it has none:
+    with a DataWarning if they are photographs.
 
     Images are clipped to [0, 1], and masked pixels do not count; held-out views without others are left out
     (``Dataset.scorable``). Ground truth with alpha is composited over ``View.background``, and everything is
@@ -231,6 +234,13 @@ def evaluate(
         raise ValueError("there is nothing to evaluate: give a mesh, splats or images")
     if not views:
         raise ValueError("the data set has no view to evaluate on")
+    if not dataset.test and not _targets_are_splats(dataset):
+        warnings.warn(
+            f"{dataset.name or 'the data set'}: no view is held out, so all {len(views)} training views are"
+            " scored: scores of what was trained on them are too high",
+            DataWarning,
+            stacklevel=2,
+        )
     found: dict[str, list[ViewScores]] = {name: [] for name in methods}
     measures = _Measures(lpips, fit_exposure, threads)
     for view in views:

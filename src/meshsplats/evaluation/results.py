@@ -8,6 +8,7 @@ from typing import Any
 
 from meshsplats._arrays import spread_indices
 from meshsplats._files.atomic import write_json, write_text
+from meshsplats._words import plural
 from meshsplats.evaluation.benchmarks import BenchmarkResult
 from meshsplats.evaluation.report import Report, ScoredView
 from meshsplats.evaluation.strips import markdown_table, view_crop, view_strip
@@ -48,10 +49,17 @@ def save_benchmark(result: BenchmarkResult, folder: Path, protocol: str) -> None
 
 
 def notes(reports: Sequence[Report]) -> list[str]:
-    """Notes under the table: the ground truth, the samples and the background of each scene."""
+    """Notes under the table: views that are not held out, the ground truth, the samples and the background of
+    each scene."""
     found = []
     for report in reports:
         about, scene = report.about, "" if len(reports) == 1 else f"{report.scene}: "
+        trained_on = about.get("trained_on", {})
+        if about["held_out"] is False and not trained_on:
+            found.append(f"{scene}Views: {plural(about['views'], 'training view')}, as none is held out.")
+        found += [
+            f"{scene}Not held out: {path} was trained on {views}." for path, views in trained_on.items()
+        ]
         samples = f"meshes with {about['samples']} x {about['samples']} samples per pixel"
         found.append(f"{scene}Ground truth: {about['ground_truth']}; {samples}.")
         if about["splats"] is not None and about["ground_truth"] not in GROUND_TRUTHS.values():

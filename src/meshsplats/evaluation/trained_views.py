@@ -1,0 +1,112 @@
+"""Whether meshes and splats were trained on the views that they are scored on, as records beside them say."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from meshsplats.datasets.views import Dataset
+from meshsplats.errors import DataWarning
+from meshsplats.evaluation.backgrounds import model_settings
+from meshsplats.formats.outputs import CONFIGURATION, recorded_options
+
+TRAINED_BY = {"train": "input", "finetune": "data", "prior": "data"}
+"""Commands that train on photographs, and the option of each that names them."""
+USUAL_SPLIT = 8
+"""Every such view is held out by the 3DGS code with ``--eval``."""
+_MOST_STEPS = 8
+"""A file that was made from another one is followed to that, at most so often."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training on photographs."""
+
+    record: Path
+    """The file that tells of it."""
+    setting: str
+    """What it says of the split."""
+    photographs: str
+    """The folder of the photographs, which may be on another machine."""
+    test_every: int | None
+    """Every n-th view was held out, or what the data set itself holds out; None: nothing at all."""
+
+
+@dataclass(frozen=True)
+class TrainedOn:
+    """Views that a scene is scored on, though it was trained on them."""
+
+    count: int
+    scored: int
+    training: Training
+    sure: bool
+    """Whether the photographs are of the same name as those of the training."""
+
+    def in_words(self) -> str:
+        """How many they are, and what says so."""
+        training = self.training
+        text = f"{self.count} of the {self.scored} views, as {training.record} says ({training.setting})"
+        return text if self.sure else f"{text}, if the photographs are those of {training.photographs[:200]}"
+
+
+def find_trained_on(
+    scene: Path, dataset: Dataset, test_every: int, load: Callable[[int], Dataset]
+) -> TrainedOn | None:
+    """The held-out views of ``dataset`` that the mesh or splats at ``scene``, or what these were made from,
+    were trained on; None if no record says so. A DataWarning tells of them.
+
+    ``test_every``: the split of ``dataset``, which ``load`` reads with another one.
+    """
+    scored = {view.name for view in dataset.test}
+    for training in _trainings(scene):
+        if training.test_every == test_every:
+            continue
+        learned = scored
+        if training.test_every is not None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # those of the first time
+                learned = scored.intersection(view.name for view in load(training.test_every).train)
+        if learned:
+            there = training.record.parent / training.photographs.replace("\\", "/")
+            sure = Path(os.path.abspath(there)).name == dataset.name
+            found = TrainedOn(len(learned), len(scored), training, sure)
+            warnings.warn(
+                f"{scene} is scored on views that it was trained on: {found.in_words()}",
+                DataWarning,
+                stacklevel=2,
+            )
+            return found
+    return None
+
+
+def _trainings(scene: Path) -> Iterator[Training]:
+    """The trainings of ``scene`` and of what it was made from, the last one first."""
+    for _ in range(_MOST_STEPS):
+        if (found := model_settings(scene)) is not None:
+            yield from _by_others(*found)
+        record = scene.parent / f"{scene.name}.{CONFIGURATION}"  # of a folder ".", which has no name, too
+        for command, option in TRAINED_BY.items():
+            options = recorded_options(record, command) or {}
+            photographs, held_out = options.get(option), options.get("test_every")
+            if isinstance(photographs, str) and type(held_out) is int and 0 <= held_out != 1:
+                yield Training(record, f"test_every = {held_out}", photographs, held_out)
+        source: Any = (recorded_options(record) or {}).get("input")
+        if isinstance(source, list) and len(source) == 1:
+            source = source[0]
+        if not isinstance(source, str):
+            return
+        scene = record.parent / source
+
+
+def _by_others(record: Path, text: str) -> Iterator[Training]:
+    """The training of the 3DGS code in a model folder with the ``cfg_args`` ``text``."""
+    evaluated = re.search(r"\beval\s*=\s*(True|False)\b", text)
+    photographs = re.search(r"\bsource_path\s*=\s*'([^']*)'", text)
+    if evaluated:
+        held_out = USUAL_SPLIT if evaluated[1] == "True" else None
+        yield Training(record, f"eval = {evaluated[1]}", photographs[1] if photographs else "", held_out)
