@@ -42,7 +42,7 @@ from meshsplats.evaluation.results import (
     save_report,
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names
-from meshsplats.evaluation.trained_views import TrainedOn, find_trained_on
+from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width
 from meshsplats.file_options import ScoringOptions
 from meshsplats.finetuning.candidates import tuned_candidates
 from meshsplats.finetuning.targets import Targets
@@ -89,10 +89,10 @@ class Scoring:
         before = None if before is None else before.relative_to(origin)
         meshes = {name: mesh.relative_to(origin) for name, mesh in meshes.items()}
         dataset = self._dataset(splats, origin if known else None)
-        trained_on: dict[str, TrainedOn] = {}
+        about: dict[str, Any] = {}
         if chosen.data is not None:
-            sources = [*files, *(path for path in (chosen.before, chosen.splats) if path is not None)]
-            trained_on = self._trained_on(sources, dataset, chosen.data, chosen.downscale, chosen.test_every)
+            made = [*files, *([] if chosen.before is None else [chosen.before])]
+            about = self._training(made, chosen.splats, dataset, chosen.data, 1, chosen.test_every)
         scenes = {"splats": splats, **meshes, "mesh before": before}
         background = choose_background(
             optional_color(chosen.background),
@@ -105,7 +105,7 @@ class Scoring:
             # Their images are the ground truth; a mesh can reach degree 0 of it.
             more = splats.sh_degree > 0 and chosen.sh_degree != 0
             splats = replace(splats, sh=splats.sh[:, :1]) if more else None
-        return self._score(dataset, background, meshes, splats, before, trained_on)
+        return self._score(dataset, background, meshes, splats, before, about)
 
     def run_benchmark(
         self,
@@ -158,25 +158,43 @@ class Scoring:
         """Scores the ``candidates`` of a ``scene`` of a ``benchmark``, made from what is in the folder
         ``models``, against its ``dataset`` of the folder ``data``, with a folder of its own."""
         mesh, splats, before = candidates
-        source, downscale = find_input(models, scene), self.options.downscale or benchmark.scenes[scene]
-        sources = [source] if source is not None else []
-        trained_on = self._trained_on(sources, dataset, data / scene, downscale, benchmark.test_every)
+        source = find_input(models, scene)
+        meshes = [source] if source is not None and splats is None else []
+        usual = benchmark.scenes[scene], benchmark.test_every
+        own_splats = None if splats is None else source
+        about = self._training(meshes, own_splats, dataset, data / scene, *usual)
         self.folder.mkdir(exist_ok=True)
         own = replace(self, folder=self.folder / scene)
-        return own._score(dataset, background, {"mesh": mesh}, splats, before, trained_on)
+        return own._score(dataset, background, {"mesh": mesh}, splats, before, about)
 
-    def _trained_on(
-        self, paths: Sequence[Path], dataset: Dataset, data: Path, downscale: int | None, test_every: int
-    ) -> dict[str, TrainedOn]:
-        """Those of ``paths`` that were trained on what is held out of ``data``, a ``dataset`` with the split
-        ``test_every``."""
+    def _training(
+        self,
+        meshes: Sequence[Path],
+        splats: Path | None,
+        dataset: Dataset,
+        data: Path,
+        downscale: int,
+        test_every: int,
+    ) -> dict[str, Any]:
+        """For the record, what ``meshes`` and ``splats`` were trained on, if that is not what ``dataset``
+        should be for them: the photographs in ``data``, made smaller by ``downscale`` unless the options say
+        otherwise, with the split ``test_every``."""
+        if self.options.downscale is not None:
+            downscale = self.options.downscale
 
         def load(test_every: int) -> Dataset:
-            scale = 1 if downscale is None else downscale
-            return load_dataset(data, downscale=scale, test_every=test_every, missing=self.options.missing)
+            missing = self.options.missing
+            return load_dataset(data, downscale=downscale, test_every=test_every, missing=missing)
 
+        about: dict[str, Any] = {}
+        paths = [*meshes, *([] if splats is None else [splats])]
         found = {str(path): find_trained_on(path, dataset, test_every, load) for path in paths}
-        return {path: views for path, views in found.items() if views is not None}
+        if trained_on := {path: views for path, views in found.items() if views is not None}:
+            about["held_out"] = False if any(views.sure for views in trained_on.values()) else None
+            about["trained_on"] = {path: views.in_words() for path, views in trained_on.items()}
+        if splats is not None and (width := find_trained_width(splats, dataset, downscale)) is not None:
+            about["splats_trained_width"] = width
+        return about
 
     def _load_mesh(self, path: Path) -> SplatMesh:
         found, order = self.options.reading.load_scene(path), self.options.order
@@ -220,10 +238,10 @@ class Scoring:
         meshes: Mapping[str, SplatMesh],
         splats: GaussianCloud | None,
         before: SplatMesh | None,
-        trained_on: Mapping[str, TrainedOn],
+        training: Mapping[str, Any],
     ) -> Report:
-        """Evaluates one scene over ``background`` and writes its files. ``trained_on``: by path, what was
-        trained on views that are held out."""
+        """Evaluates one scene over ``background`` and writes its files. ``training``: what ``_training``
+        says."""
         chosen, dataset = self.options, dataset.over(background.color)
         views = dataset.test or dataset.views
         images = None if chosen.images is None else image_folder(chosen.images, [v.camera for v in views])
@@ -252,9 +270,6 @@ class Scoring:
         about: dict[str, Any] = {**background.to_dict(), "lpips_network": chosen.network if lpips else None}
         if chosen.cameras is not None:
             about["held_out"] = None  # it is unknown what a mesh was trained on
-        if trained_on:
-            about["held_out"] = False if any(views.sure for views in trained_on.values()) else None
-            about["trained_on"] = {path: views.in_words() for path, views in trained_on.items()}
-        report = replace(report, about={**report.about, **about})
+        report = replace(report, about={**report.about, **about, **training})
         save_report(report, self.folder)
         return report

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -14,14 +15,16 @@ import pytest
 from _datasets import simple_colmap
 from _photographs import write_photographs
 
+from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cluster import Workers
 from meshsplats.conversion import convert
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
-from meshsplats.evaluation.trained_views import find_trained_on
+from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width
 from meshsplats.file_options import ScoringOptions
+from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.rendering import render_splats
 from meshsplats.scoring import Scoring
@@ -146,3 +149,43 @@ def test_scenes_of_a_benchmark_are_looked_up_too(scene, tmp_path):
         )
     assert report.about["held_out"] is False
     assert "was trained on 1 of the 1 views" in (tmp_path / "out" / "table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("settings", "scale", "width"),
+    [
+        ("images='images', resolution=-1", 1, None),
+        ("images='images', resolution=-1", 2, 12),  # the photographs are 12 pixels wide
+        ("images='images', resolution=2", 2, None),
+        ("images='images_2', resolution=-1", 2, None),
+        ("images='images_2', resolution=2", 1, 3),
+        ("images='images', resolution=6", 1, 6),  # other numbers are widths
+        ("images='images'", 2, None),
+    ],
+)
+def test_splats_are_no_baseline_at_another_size_than_that_of_their_training(tmp_path, settings, scale, width):
+    data = load_dataset(simple_colmap(tmp_path / "data", 3), downscale=scale)
+    (tmp_path / "cfg_args").write_text(f"Namespace({settings})")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert find_trained_width(tmp_path, data, scale) == width
+    assert [f"images {width} pixels wide, as" in str(one.message) for one in warned] == [True] * bool(width)
+
+
+def test_cameras_of_the_training_tell_its_size(tmp_path):
+    data = load_dataset(simple_colmap(tmp_path / "data", 3))
+    (tmp_path / "cfg_args").write_text("Namespace(resolution=-1)")
+    save_cameras([view.camera.scaled(200) for view in data.views], tmp_path / "cameras.json")
+    with pytest.warns(DataWarning, match="images 1600 pixels wide"):  # the most that the 3DGS code takes
+        assert find_trained_width(tmp_path, data, 1) == 1600
+
+
+def test_the_size_of_the_training_is_below_the_table(scene, tmp_path):
+    model = tmp_path / "model"
+    (model / "point_cloud" / "iteration_7").mkdir(parents=True)
+    save_gaussians(make_scene(200), model / "point_cloud" / "iteration_7" / "point_cloud.ply")
+    (model / "cfg_args").write_text("Namespace(eval=True, images='images', resolution=-1)")
+    with pytest.warns(DataWarning, match="images 24 pixels wide, .* of 12: splat viewers blur"):
+        about, table, saved = scored(scene, tmp_path / "out", test_every=8, splats=model, downscale=2)
+    assert about["splats_trained_width"] == saved["splats_trained_width"] == 24
+    assert "at this size, not at that of their training, 24 pixels wide." in table

@@ -63,7 +63,9 @@ def notes(reports: Sequence[Report]) -> list[str]:
         samples = f"meshes with {about['samples']} x {about['samples']} samples per pixel"
         found.append(f"{scene}Ground truth: {about['ground_truth']}; {samples}.")
         if about["splats"] is not None and about["ground_truth"] not in GROUND_TRUTHS.values():
-            found.append(f"{scene}Splats: {GROUND_TRUTHS['splats'].removeprefix('splats ')}.")
+            trained = about.get("splats_trained_width")
+            other = f", not at that of their training, {trained} pixels wide" if trained else ""
+            found.append(f"{scene}Splats: {GROUND_TRUTHS['splats'].removeprefix('splats ')}{other}.")
         found.append(f"{scene}Background: {about['background_description']}.")
     return found
 

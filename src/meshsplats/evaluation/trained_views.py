@@ -1,4 +1,5 @@
-"""Whether meshes and splats were trained on the views that they are scored on, as records beside them say."""
+"""What meshes and splats were trained on, as records beside them say: the views that they are scored on, or
+images of another size."""
 
 from __future__ import annotations
 
@@ -6,19 +7,27 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from meshsplats.cameras.files import load_cameras
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import model_settings
-from meshsplats.formats.outputs import CONFIGURATION, recorded_options
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, recorded_options
 
 TRAINED_BY = {"train": "input", "finetune": "data", "prior": "data"}
 """Commands that train on photographs, and the option of each that names them."""
 USUAL_SPLIT = 8
 """Every such view is held out by the 3DGS code with ``--eval``."""
+ALIKE = 1.25
+"""Images are of one size up to this ratio of their widths."""
+_WIDEST = 1600
+"""Pixels; the 3DGS code makes wider images smaller, unless it is told a size."""
 _MOST_STEPS = 8
 """A file that was made from another one is followed to that, at most so often."""
 
@@ -82,6 +91,35 @@ def find_trained_on(
             )
             return found
     return None
+
+
+def find_trained_width(scene: Path, dataset: Dataset, downscale: int) -> int | None:
+    """Width in pixels of the images that the splats at ``scene`` were trained on, if their model folder says
+    so and those of ``dataset``, photographs smaller by ``downscale``, are of another size. A DataWarning
+    tells of it."""
+    found = model_settings(scene)
+    resolution = found and re.search(r"\bresolution\s*=\s*(-?\d{1,6})\b", found[1])
+    if not found or not resolution:
+        return None
+    record, text = found
+    scored = float(np.median([view.camera.width for view in dataset.test or dataset.views]))
+    width = scored * downscale
+    with suppress(OSError, ValueError):
+        width = float(np.median([camera.width for camera in load_cameras(record.with_name(CAMERAS))]))
+    if smaller := re.search(r"\bimages\s*=\s*'images_([1-9]\d?)'", text):
+        width /= int(smaller[1])
+    factor = int(resolution[1])
+    trained = width / factor if factor in (1, 2, 4, 8) else factor if factor > 0 else min(width, _WIDEST)
+    if 1 / ALIKE <= trained / scored <= ALIKE:
+        return None
+    warnings.warn(
+        f"{scene}: trained on images {trained:.0f} pixels wide, as {record} says, and scored on images of"
+        f" {scored:.0f}: splat viewers blur by the same part of a pixel at any size, so these scores are not"
+        " those that the splats have at theirs, and no baseline for a mesh",
+        DataWarning,
+        stacklevel=2,
+    )
+    return round(trained)
 
 
 def _trainings(scene: Path) -> Iterator[Training]:
