@@ -105,7 +105,7 @@ class Converter:
         read = time.perf_counter()
         options = product.conversion
         if product.preset == "default" and not seen and not product.merges:
-            options = with_usual_look(cloud, options, self.threads)
+            options = with_usual_look(cloud, options, threads=self.threads, named=True)
         mesh = convert_within_limits(
             cloud,
             options,

@@ -41,7 +41,7 @@ def test_only_gaps_that_a_splat_viewer_closes_count():
 
 
 def test_the_look_is_widened_with_a_word_and_only_where_nobody_chose_it():
-    with pytest.warns(DataWarning, match=r"smaller than the gaps between them; .*look splats"):
+    with pytest.warns(DataWarning, match=r"smaller than the gaps between them; .*images of 1000 pixels$"):
         assert with_usual_look(wall(0.3)) == ConversionOptions(look="splats")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -59,11 +59,16 @@ def test_programs_that_make_a_first_image_take_it(tmp_path, monkeypatch, capsys)
         assert main(["convert", "fine.ply", "-o", f"{name}.npz", "--no-preview", *options]) == 0
         captured = capsys.readouterr()
         assert ("gaps between them" in captured.err) == (name == "fine")
+        assert ("(--look splats; --look area leaves" in captured.err) == (name == "fine")
         assert ("--look splats" in captured.out) == (name != "area")  # the next command scores that look
         with np.load(f"{name}.npz") as arrays:
             sizes[name] = arrays["vertices"].copy()
     np.testing.assert_array_equal(sizes["fine"], sizes["splats"])
     assert np.abs(sizes["fine"] - sizes["area"]).max() > 0.01
+    assert main(["render", "fine.ply", "-o", "fine.png", "--width", "80"]) == 0
+    err = capsys.readouterr().err
+    assert "gaps between them" in err
+    assert "--look" not in err  # render has no such option
     assert main(["convert", "plain.ply", "-o", "plain.npz", "--no-preview"]) == 0
     assert "gaps" not in capsys.readouterr().err
     with pytest.warns(DataWarning, match="gaps between them"):

@@ -171,7 +171,7 @@ class PictureOptions:
         mode: Literal["flat"] | None = "flat" if self.is_lit else None
         options = ConversionOptions(max_splats=self.most_splats, mode=mode)
         if not self.merges(scene):
-            options = with_usual_look(scene, options, self.threads)
+            options = with_usual_look(scene, options, threads=self.threads)
         # Merging by what is seen takes three times as long; of an object, it is worth 0.4 dB.
         if self.fast and self.merges(scene) and self._is_object(scene, source):
             return convert(scene, options, up=self.up, threads=self.threads)

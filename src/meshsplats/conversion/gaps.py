@@ -51,10 +51,14 @@ def gap_share(cloud: GaussianCloud, threads: int | None = None) -> float:
 
 
 def with_usual_look(
-    cloud: GaussianCloud, options: ConversionOptions | None = None, threads: int | None = None
+    cloud: GaussianCloud,
+    options: ConversionOptions | None = None,
+    *,
+    threads: int | None = None,
+    named: bool = False,
 ) -> ConversionOptions:
     """``options`` for all of ``cloud``, with the look 'splats' and a DataWarning where nothing says how wide
-    fans are and gaps would show (``gap_share``)."""
+    fans are and gaps would show (``gap_share``). ``named``: the user can choose the look, and is told how."""
     options = ConversionOptions() if options is None else options
     if options.look is not None or options.footprint is not None or options.footprint_px2 is not None:
         return options
@@ -62,7 +66,7 @@ def with_usual_look(
         return options
     warnings.warn(
         "the splats are smaller than the gaps between them; each becomes as large as a splat viewer shows it"
-        " in images of 1000 pixels (``look`` splats). ``look`` area leaves them as they are",
+        " in images of 1000 pixels" + (" (``look`` splats; ``look`` area leaves them as they are)" * named),
         DataWarning,
         stacklevel=2,
     )

@@ -62,7 +62,7 @@ class ConversionOptions:
     """How the mesh should look. area: each pixel is the mean over its area, for programs that take several
     samples a pixel: Blender, engines with MSAA, ray tracers. splats: as a 3DGS viewer shows the splats at the
     image size of the cameras or the framing; fans are then wider, and blur in larger images. Default: area;
-    convert, view and blender take splats where the splats are so small that gaps would show."""
+    convert, view, render and blender take splats where the splats are so small that gaps would show."""
     footprint: Annotated[Footprint | None, Advanced] = None
     """Source of the size of a pixel at each splat, for the low-pass filter that splats were trained with.
     cameras: the given cameras. framing: images of 1000 pixels from all sides that just hold the subject, with

@@ -156,8 +156,9 @@ class ImageRun:
         if isinstance(scene, SplatMesh) or self.options.as_splats:
             return scene
         from meshsplats.conversion import convert
+        from meshsplats.conversion.gaps import with_usual_look
 
-        return convert(scene)
+        return convert(scene, with_usual_look(scene, threads=self.options.draw.threads))
 
     def _background(
         self, scene: GaussianCloud | SplatMesh, photographs: Dataset | None
