@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -59,6 +60,23 @@ def files(tmp_path):
     ms.save_gaussians(few_splats(), tmp_path / "s.ply")
     ms.save_mesh(ms.convert(few_splats()), tmp_path / "m.npz")
     return tmp_path
+
+
+def test_large_splats_are_named_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("meshsplats.datasets.scene_files.LARGE_BYTES", 500)
+    told = []
+    monkeypatch.setattr(SceneReading, "tell", lambda self, text: told.append(text))
+    folder, broken = tmp_path / "sog", tmp_path / "broken.ply"
+    ms.save_gaussians(few_splats(), tmp_path / "s.sog")
+    with ZipFile(tmp_path / "s.sog") as archive:
+        archive.extractall(folder)
+    SceneReading().load(folder / "meta.json")
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    assert told == [f"reading {size / 1000:.1f} kB"]
+    broken.write_bytes(b"ply" + 600 * b" ")
+    with pytest.raises(ms.FileFormatError):
+        SceneReading().load(broken)
+    assert told[1:] == ["reading 603 bytes"]
 
 
 def test_errors_name_options_as_python_and_as_commands_do():

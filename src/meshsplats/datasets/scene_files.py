@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
+from meshsplats._files.atomic import in_words
 from meshsplats._options import Advanced, Help, changed
 from meshsplats._words import direction_in_words
 from meshsplats.errors import FileFormatError, OptionsError
@@ -27,6 +28,17 @@ _AXES = Help(
     f" {listed(y_up_suffixes(), 'and')}, else down. After reading, y points down. Some programs write SPZ"
     " with y down: if the image is upside down, give y-down."
 )
+
+
+LARGE_BYTES = 50_000_000
+"""Bytes of splats from which on reading takes seconds, and the rest minutes."""
+
+
+def _bytes_of(path: Path) -> int:
+    """Size of the file ``path``, or of all files of the SOG whose meta.json it is; 0 for a folder."""
+    if path.name.endswith("meta.json"):
+        return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+    return path.stat().st_size if path.is_file() else 0
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,8 @@ class SceneReading:
         from meshsplats.viewpoints.finding import unusual_up
         from meshsplats.viewpoints.standing import thinned
 
+        if (size := _bytes_of(path)) > LARGE_BYTES:
+            self.tell(f"reading {in_words(size)}")
         try:
             cloud = load_gaussians(path, origin=origin, **self.arguments)
         except FileFormatError:
