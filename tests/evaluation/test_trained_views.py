@@ -77,7 +77,7 @@ def test_the_split_of_the_training_tells_which_views_were_trained_on(tmp_path):
         with pytest.warns(DataWarning, match=r"1 of the 3 views, .*toml says \(test_every = 8\)"):
             seen(record(mesh, command, **given, test_every=8), data)  # 4 was not held out
     assert seen(record(mesh, "finetune", input="s.ply", test_every=0), data) is None  # on images of splats
-    for wrong in (1, -1, True, "0"):
+    for wrong in (1, -1, 10**12, True, "0"):
         assert seen(record(mesh, "train", input="data", test_every=wrong), data) is None
 
 
@@ -86,6 +86,9 @@ def test_photographs_of_another_name_may_be_others(tmp_path):
     mesh = record(tmp_path / "mesh.npz", "train", input="/server/garden", test_every=0)
     with pytest.warns(DataWarning, match="3 of the 3 views, .* if the photographs are those of /server/gard"):
         assert not seen(mesh, data).sure
+    (tmp_path / "cfg_args").write_text("Namespace(eval=False)")
+    with pytest.warns(DataWarning, match="if the photographs are those of its training"):
+        assert not seen(tmp_path, data).sure
 
 
 def test_a_split_of_the_data_sets_own_holds_out_whatever_was_chosen(tmp_path):
@@ -110,8 +113,9 @@ def test_what_a_mesh_was_made_from_counts(tmp_path):
         (model / "cfg_args").write_text("Namespace(eval=False, source_path='/x/data')")
         with pytest.warns(DataWarning, match=r"2 of the 2 views, as .*cfg_args says \(eval = False\)$"):
             seen(path, data, 8)
-    record(tmp_path / "mesh.npz", "convert", input="small.npz")  # a circle
-    assert seen(mesh, data) is None
+    for source in ("small.npz", "point_cloud/iteration_7/\0"):  # a circle, and no name of a file
+        record(tmp_path / "mesh.npz", "convert", input=source)
+        assert seen(mesh, data) is None
 
 
 def test_scores_on_training_views_say_so_everywhere(scene, tmp_path):

@@ -217,7 +217,7 @@ def model_settings(path: str | os.PathLike[str]) -> tuple[Path, str] | None:
         try:
             with open(folder / "cfg_args", "rb") as file:
                 return folder / "cfg_args", file.read(_MAX_BYTES).decode("utf-8", "replace")
-        except OSError:
+        except (OSError, ValueError):  # of a name that no file can have
             continue
     return None
 

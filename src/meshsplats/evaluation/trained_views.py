@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._words import legible
 from meshsplats.cameras.files import load_cameras
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import DataWarning
@@ -60,7 +61,8 @@ class TrainedOn:
         """How many they are, and what says so."""
         training = self.training
         text = f"{self.count} of the {self.scored} views, as {training.record} says ({training.setting})"
-        return text if self.sure else f"{text}, if the photographs are those of {training.photographs[:200]}"
+        others = legible(training.photographs[:200])
+        return text if self.sure else f"{text}, if the photographs are those of {others}"
 
 
 def find_trained_on(
@@ -131,7 +133,11 @@ def _trainings(scene: Path) -> Iterator[Training]:
         for command, option in TRAINED_BY.items():
             options = recorded_options(record, command) or {}
             photographs, held_out = options.get(option), options.get("test_every")
-            if isinstance(photographs, str) and type(held_out) is int and 0 <= held_out != 1:
+            if (
+                isinstance(photographs, str)
+                and type(held_out) is int
+                and (not held_out or 2 <= held_out <= 10**9)
+            ):
                 yield Training(record, f"test_every = {held_out}", photographs, held_out)
         source: Any = (recorded_options(record) or {}).get("input")
         if isinstance(source, list) and len(source) == 1:
@@ -147,4 +153,6 @@ def _by_others(record: Path, text: str) -> Iterator[Training]:
     photographs = re.search(r"\bsource_path\s*=\s*'([^']*)'", text)
     if evaluated:
         held_out = USUAL_SPLIT if evaluated[1] == "True" else None
-        yield Training(record, f"eval = {evaluated[1]}", photographs[1] if photographs else "", held_out)
+        yield Training(
+            record, f"eval = {evaluated[1]}", photographs[1] if photographs else "its training", held_out
+        )
