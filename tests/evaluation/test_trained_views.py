@@ -84,7 +84,9 @@ def test_the_split_of_the_training_tells_which_views_were_trained_on(tmp_path):
 def test_photographs_of_another_name_may_be_others(tmp_path):
     data = simple_colmap(tmp_path / "data", 12)
     mesh = record(tmp_path / "mesh.npz", "train", input="/server/garden", test_every=0)
-    with pytest.warns(DataWarning, match="3 of the 3 views, .* if the photographs are those of /server/gard"):
+    with pytest.warns(
+        DataWarning, match="3 of the 3 views, .* if the photographs are those of '/server/gard"
+    ):
         assert not seen(mesh, data).sure
     (tmp_path / "cfg_args").write_text("Namespace(eval=False)")
     with pytest.warns(DataWarning, match="if the photographs are those of its training"):

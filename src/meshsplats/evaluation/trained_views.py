@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._words import legible
 from meshsplats.cameras.files import load_cameras
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import DataWarning
@@ -42,7 +41,7 @@ class Training:
     setting: str
     """What it says of the split."""
     photographs: str
-    """The folder of the photographs, which may be on another machine."""
+    """The folder of the photographs, which may be on another machine; empty: unknown."""
     test_every: int | None
     """Every n-th view was held out, or what the data set itself holds out; None: nothing at all."""
 
@@ -61,7 +60,7 @@ class TrainedOn:
         """How many they are, and what says so."""
         training = self.training
         text = f"{self.count} of the {self.scored} views, as {training.record} says ({training.setting})"
-        others = legible(training.photographs[:200])
+        others = repr(training.photographs[:200]) if training.photographs else "its training"
         return text if self.sure else f"{text}, if the photographs are those of {others}"
 
 
@@ -84,7 +83,7 @@ def find_trained_on(
                 learned = scored.intersection(view.name for view in load(training.test_every).train)
         if learned:
             there = training.record.parent / training.photographs.replace("\\", "/")
-            sure = Path(os.path.abspath(there)).name == dataset.name
+            sure = bool(training.photographs) and Path(os.path.abspath(there)).name == dataset.name
             found = TrainedOn(len(learned), len(scored), training, sure)
             warnings.warn(
                 f"{scene} is scored on views that it was trained on: {found.in_words()}",
@@ -153,6 +152,4 @@ def _by_others(record: Path, text: str) -> Iterator[Training]:
     photographs = re.search(r"\bsource_path\s*=\s*'([^']*)'", text)
     if evaluated:
         held_out = USUAL_SPLIT if evaluated[1] == "True" else None
-        yield Training(
-            record, f"eval = {evaluated[1]}", photographs[1] if photographs else "its training", held_out
-        )
+        yield Training(record, f"eval = {evaluated[1]}", photographs[1] if photographs else "", held_out)
