@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -223,6 +224,15 @@ def test_special_files_are_not_opened(tmp_path):
     for read in (load_gaussians, load_mesh, identify):  # none of which waits for a writer
         with pytest.raises(FileFormatError, match=r"pipe\.ply: a pipe, not a file: .*give - as the input"):
             read(tmp_path / "pipe.ply")
+
+
+@pytest.mark.parametrize("address", ["https://example.com/a.ply", "s3://scans/a.glb"])
+def test_addresses_are_told_to_be_none_of_files(address):
+    for read in (load_gaussians, load_mesh, identify):
+        with pytest.raises(FileNotFoundError) as refusal:
+            read(Path(address))
+        assert refusal.value.filename == address
+        assert "an address, not a file: download what it names" in refusal.value.strerror
 
 
 def test_links_that_lead_nowhere_are_told(tmp_path):

@@ -30,14 +30,21 @@ _SIGNATURES: dict[Container, re.Pattern[bytes]] = {
     "html": re.compile(rb"\s*<(!doctype html|html)", re.IGNORECASE),
 }
 
+_ADDRESS = re.compile(r"([a-z][a-z0-9+]+):/+(.+)", re.IGNORECASE)
+"""Of the web, as a path has it: with one of the slashes."""
+
 
 def refuse_stream(path: Path) -> None:
     """FileFormatError if ``path`` is a pipe, a socket or a device: these can be read once, and readers open
-    their files several times."""
+    their files several times; FileNotFoundError if it is an address, of which nothing is downloaded."""
     try:
         mode = path.stat().st_mode
-    except OSError:  # opening it says what is wrong
-        return
+    except OSError:
+        if address := _ADDRESS.match(path.as_posix()):
+            said = f"{address[1]}://{address[2]}"
+            wanted = "an address, not a file: download what it names, and give the path of that"
+            raise FileNotFoundError(errno.ENOENT, wanted, said) from None
+        return  # opening it says what is wrong
     kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device"}
     for is_kind, what in kinds.items():
         if is_kind(mode):

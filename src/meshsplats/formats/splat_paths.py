@@ -46,14 +46,14 @@ def _model_file(folder: Path) -> Path | None:
 
 def splat_file(path: Path) -> Path:
     """The file to read for ``path``: itself, or the latest one in a model folder."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file():
         return path
     if not path.is_dir():
         from meshsplats.formats.content import refuse_stream
 
         refuse_stream(path)
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such file or folder")
         raise FileFormatError(f"{path}: neither a file nor a folder")
     for name in folder_files():
         if (path / name).is_file():
