@@ -75,11 +75,12 @@ def test_a_file_of_a_common_name_has_the_name_of_its_folder(folder, tmp_path):
 def test_options_reach_the_page(folder, tmp_path):
     page = tmp_path / "page.html"
     words = ["--title", "a vase", "--background", "#204060", "--up", "z", "--without-splats"]
-    words += ["--cameras", str(folder / "cameras.json")]
+    words += ["--cameras", str(folder / "cameras.json"), "--without-controls"]
     assert main(["view", str(folder / "scene.ply"), "-o", str(page), *words]) == 0
     found = settings(page)
     assert (found["title"], found["background"], found["up"]) == ("a vase", "#204060", [0, 0, 1])
     assert [camera["width"] for camera in found["cameras"]] == [60, 60]
+    assert '<body class="plain"' in page.read_text(encoding="utf-8")
     assert not has_splats(page)
 
 

@@ -52,7 +52,7 @@ def set_up(page: Page) -> None:
             element.style.fontFamily = "ours";
           document.getElementById("status").hidden = true;
           document.getElementById("statistics").style.color = "transparent";
-          document.getElementById("message").hidden = true;
+          document.getElementById("message").hidden = document.getElementById("notes").hidden = true;
         }})()"""
     )
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import re
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -17,6 +19,7 @@ from _pages import cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa:
 from test_page import HOSTILE, block
 
 import meshsplats as ms
+from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.demo_scene import make_scene
 from meshsplats.viewer.packing import pack_splats
@@ -136,6 +139,32 @@ def test_the_right_button_and_shift_pan(page):
         offset = after[0] - before[0]
         assert abs(offset @ before[1]) < 0.02 * np.linalg.norm(offset)  # across the line of sight
         assert np.linalg.norm(offset) > 0.05
+
+
+def test_a_pinch_on_a_trackpad_zooms_as_much_as_fingers(page):
+    """Browsers report one by the factor 2 as wheel events with Ctrl of 100 ln 2 pixels."""
+    places = [pose(page)[0]]
+    for _ in range(2):
+        page.run(
+            "for (let i = 0; i < 10; i++) document.querySelector('#stage').dispatchEvent("
+            "new WheelEvent('wheel', {deltaY: -6.93, ctrlKey: true, cancelable: true}))"
+        )
+        places.append(pose(page)[0])
+    near, nearer = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert nearer / near == pytest.approx(0.5, abs=0.02)
+
+
+def test_zooming_out_ends_where_the_scene_is_still_seen(page, mesh):
+    before, radius = pose(page), scene_bounds(mesh).radius
+    page.run(
+        "for (let i = 0; i < 40; i++) document.querySelector('#stage').dispatchEvent("
+        "new WheelEvent('wheel', {deltaY: 300, cancelable: true}))"
+    )
+    far = pose(page)
+    assert 10 * radius < moved(before, far) < 100 * radius
+    for _ in range(3):
+        page.key("+")
+    assert (pose(page)[0] - far[0]) @ far[1] > 0.3 * moved(before, far)
 
 
 def test_the_wheel_and_plus_and_minus_zoom(page):
@@ -345,7 +374,7 @@ def test_webgl_draws_meshes_in_the_order_of_their_splats(browser, write_page, ca
     assert np.abs(image - exact).max() > 20
     page = open_page(browser, write_page(mesh, "by splat", cameras=cameras[:1]))
     assert page.run("document.body.dataset.renderer") == "sorted"
-    assert "WebGL draws whole splats sorted by their centres" in page.text("#messageText")
+    assert "WebGL draws whole splats sorted by their centres" in page.text("#notes")
     page.run("document.body.classList.add('plain')")
     page.still(PATIENCE)
     assert np.abs(page.screenshot().astype(int) - image).max() <= 2
@@ -357,7 +386,8 @@ def test_sorted_triangles_are_close_to_the_exact_image(page, mesh, cameras):
     page.still(PATIENCE)
     image = page.screenshot().astype(int)
     assert ms.psnr(image / 255, ms.render(mesh, cameras[0], samples=2).color) > 26
-    assert "this browser has no WebGPU" in page.text("#messageText")
+    assert "this browser has no WebGPU" in page.text("#notes")
+    assert page.run("document.querySelector('#message').hidden")  # nothing over the subject
     assert page.run("document.querySelector('#renderer').value") == "sorted"
     assert page.run("document.querySelector('#renderer option').disabled")
     assert page.run("document.querySelector('#samples').disabled")
@@ -521,19 +551,39 @@ def test_the_panel_closes_and_everything_can_be_hidden(browser, url):
     assert page.run("document.activeElement.id") == "toggle"
     page.run("document.activeElement.blur()")
     page.key("h")
-    for name in ("bar", "panel", "message"):
+    for name in ("bar", "panel"):
         assert not page.run(shown.format(name))
     page.key("h")
     assert page.run(shown.format("bar"))
-    assert page.run(shown.format("message"))
-    page.click("#dismiss")
-    assert not page.run(shown.format("message"))
     page.click("#toggle")
     for summary in ("#crop", "#statistics", "#help"):
         page.click(f"{summary} summary")
         assert page.run(f"document.querySelector('{summary}').open")
     page.still(PATIENCE)
     assert page.problems() == []
+    page.close()
+
+
+def test_windows_that_the_settings_would_fill_begin_without_them(browser, url):
+    page = open_page(browser, url, 700, 500)
+    assert page.run("document.querySelector('#panel').classList.contains('closed')")
+    assert page.run("document.querySelector('#toggle').ariaExpanded") == "false"
+    page.close()
+
+
+def test_a_page_without_controls_shows_the_scene_alone_until_h(browser, write_page, mesh, tmp_path):
+    address = write_page(mesh, "without-controls", options=PageOptions(controls=False))
+    page = open_page(browser, address, 360, 240)
+    over = "['bar', 'panel', 'message'].filter(id => document.getElementById(id).offsetWidth)"
+    assert page.run(over) == []
+    page.run("document.querySelector('#stage').focus()")
+    page.key("h")
+    assert page.run(over) == ["bar"]
+    page.close()
+    damaged = damage(address, "mesh", tmp_path)
+    page = browser.page(damaged, 360, 240)
+    page.wait("document.body.dataset.state === 'failed'", PATIENCE)
+    assert page.run(over) == ["message"]
     page.close()
 
 
@@ -630,17 +680,43 @@ def test_hostile_names_are_shown_and_do_nothing(browser, write_page, mesh, camer
     page.close()
 
 
+def text_of(address: str) -> str:
+    """The page at an address on the disk."""
+    return Path(unquote(urlparse(address).path)).read_text(encoding="utf-8")
+
+
+def damage(address: str, name: str, folder: Path) -> str:
+    """The address of that page with some other data in the block ``name``."""
+    whole = text_of(address)
+    data = block(whole, name)
+    file = folder / "damaged.html"
+    file.write_text(whole.replace(data, data[:400] + "AAAA" + data[404:]), encoding="utf-8")
+    return file.as_uri()
+
+
 def test_a_damaged_page_says_so(browser, write_page, mesh, tmp_path):
-    address = write_page(mesh, "whole")
-    whole = Path(unquote(urlparse(address).path)).read_text(encoding="utf-8")
-    data = block(whole, "mesh")
-    (tmp_path / "damaged.html").write_text(
-        whole.replace(data, data[:400] + "AAAA" + data[404:]), encoding="utf-8"
-    )
-    page = browser.page((tmp_path / "damaged.html").as_uri(), WIDTH, HEIGHT)
+    page = browser.page(damage(write_page(mesh, "whole"), "mesh", tmp_path), WIDTH, HEIGHT)
     page.wait("document.body.dataset.state === 'failed'", PATIENCE)
     assert len(page.text("#messageText")) > 10
     page.close()
+
+
+@contextmanager
+def served(send: Callable[[BaseHTTPRequestHandler], None]) -> Iterator[str]:
+    """The address of a server that answers with ``send``: headers, their end and text."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            send(self)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
 
 
 def test_a_page_whose_script_does_not_run_says_so(browser, write_page, mesh):
@@ -651,29 +727,65 @@ def test_a_page_whose_script_does_not_run_says_so(browser, write_page, mesh):
         return words
 
     address = write_page(mesh, "without-script")
-    text = Path(unquote(urlparse(address).path)).read_text(encoding="utf-8")
+    text = text_of(address)
 
-    class Strict(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Security-Policy", "script-src 'self'")
-            self.end_headers()
-            self.wfile.write(text.encode())
+    def send(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_header("Content-Security-Policy", "script-src 'self'")
+        handler.end_headers()
+        handler.wfile.write(text.encode())
 
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Strict) as server:
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
-        page = browser.page(f"http://127.0.0.1:{server.server_port}", WIDTH, HEIGHT)
+    with served(send) as there:
+        page = browser.page(there, WIDTH, HEIGHT)
         assert page.run("getComputedStyle(document.querySelector('#blocked')).opacity") == "0"  # not at once
         assert "the server forbids scripts" in spoken(page)
-        server.shutdown()
     page = browser.page("about:blank#off", WIDTH, HEIGHT)
     page.send("Emulation.setScriptExecutionDisabled", value=True)
     page.send("Page.navigate", url=address)
     page.wait("location.protocol === 'file:' && document.readyState === 'complete'")
     assert spoken(page) == "This page draws its scene with JavaScript, which is switched off."
+
+
+def test_a_page_that_comes_slowly_says_that_it_is_loading(browser, write_page, mesh):
+    text, rest = text_of(write_page(mesh, "slow")), threading.Event()
+    half = text.index(block(text, "mesh")) + 1000
+
+    def send(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_header("Content-Type", "text/html; charset=utf-8")
+        handler.end_headers()
+        handler.wfile.write(text[:half].encode())
+        rest.wait(PATIENCE)
+        handler.wfile.write(text[half:].encode())
+
+    with served(send) as there:
+        page = browser.page("about:blank#slow", WIDTH, HEIGHT, before=NO_WEBGPU)
+        page.send("Page.navigate", url=there)
+        page.wait("document.querySelector('#mesh')")
+        assert page.run("document.readyState") == "loading"
+        words = page.run("document.querySelector('#loading').innerText")
+        rest.set()
+        page.still(PATIENCE)
+        page.close()
+    assert words == "Loading the scene"
+
+
+def test_a_lost_graphics_device_is_waited_for(page):
+    image = page.screenshot()
+    page.run(
+        "window.loss = document.querySelector('#sorted').getContext('webgl2')"
+        ".getExtension('WEBGL_lose_context'); loss.loseContext()"
+    )
+    page.wait("document.body.dataset.state === 'lost'")
+    page.drag(100, 20, 40, 0)
+    page.wait("document.body.dataset.state === 'lost'")
+    assert page.run("document.querySelector('#message').offsetWidth > 0")
+    assert "The graphics device was lost" in page.text("#messageText")
+    page.run("loss.restoreContext()")
+    page.still(PATIENCE)
+    assert page.run("document.querySelector('#message').hidden")
+    assert not np.array_equal(page.screenshot(), image)  # as the view was turned meanwhile
+    page.run("document.querySelector('#home').click()")
+    page.still(PATIENCE)
+    assert np.array_equal(page.screenshot(), image)
 
 
 def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):
@@ -906,12 +1018,17 @@ def test_a_page_without_a_coarse_level_has_no_choice_of_levels(browser, url):
     page.close()
 
 
+SHORT_MOMENTS = """
+const later = window.setTimeout;
+window.setTimeout = (call, time, ...words) => later(call, time > 5000 ? 500 : time, ...words);
+"""
+
+
 @pytest.mark.slow
 def test_a_damaged_fine_level_leaves_the_coarse_one(browser, two_levels, tmp_path):
-    whole = Path(unquote(urlparse(two_levels[0]).path)).read_text(encoding="utf-8")
-    data = block(whole, "mesh")
-    file = tmp_path / "damaged.html"
-    file.write_text(whole.replace(data, data[:400] + "AAAA" + data[404:]), encoding="utf-8")
-    page = open_page(browser, file.as_uri())
+    page = open_page(browser, damage(two_levels[0], "mesh", tmp_path), before=SHORT_MOMENTS)
     assert page.run("document.body.dataset.level") == "coarse"
+    assert "Only the coarse mesh is shown" in page.text("#messageText")
+    page.wait("document.querySelector('#message').hidden")  # over the scene for a moment
+    assert "Only the coarse mesh is shown" in page.text("#notes")
     page.close()

@@ -37,12 +37,13 @@ def site(tmp_path, mesh, cloud):
 
 @pytest.mark.slow
 def test_the_scene_is_drawn_within_the_site(browser, site):
-    page = browser.page(site, 640, 560, before=NO_WEBGPU)  # whose shaders take long to compile
+    page = browser.page(site, 1200, 560, before=NO_WEBGPU)  # whose shaders take long to compile
     inside = "document.querySelector('iframe').contentDocument.body"
     page.wait(f"{inside}?.dataset.state === 'still'", 400)
+    assert page.run(f"{inside}.querySelector('#panel').classList.contains('closed')")
     page.run(f"{inside}.classList.add('plain')")  # without words over it
     page.wait(f"{inside}.dataset.state === 'still'", 400)
-    drawn = page.screenshot()[120:500, 100:540]
+    drawn = page.screenshot()[120:500, 300:900]
     assert page.run(f"{inside}.dataset.renderer") == "sorted"
     assert np.unique(drawn.reshape(-1, 3), axis=0).shape[0] > 100  # a scene, not a message
     page.close()

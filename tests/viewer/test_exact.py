@@ -34,7 +34,7 @@ def open_page(device: SharedDevice, name: str, before: str = "") -> Page:
     page.choose("#samples", "1")
     page.still(PATIENCE)
     if page.run("document.body.dataset.renderer") != "exact":
-        reason = page.text("#messageText")
+        reason = page.text("#notes")
         page.close()
         if "no graphics device" in reason or "no WebGPU" in reason:
             lacking("browser", f"Chromium draws without WebGPU here: {reason}")

@@ -137,6 +137,22 @@ def test_a_page_begins_before_the_subject_and_upright(mesh):
     assert abs(center[0]) < 0.5 * center[2]
 
 
+def test_the_first_view_is_as_wide_as_the_subject_while_it_turns():
+    rng = np.random.default_rng(0)
+    for size, least, most in (((0.3, 2, 0.1), 100, 300), ((0.1, 2, 2), 900, 1000)):
+        points = (rng.random((3000, 3)) - 0.5) * size
+        mesh = ms.SplatMesh(points, np.arange(3000).reshape(-1, 3), np.ones((3000, 4)))
+        page = make_page(mesh, options=PageOptions(up=(0, 1, 0)))
+        (view,) = json.loads(block(page.html, "settings"))["cameras"]
+        assert least < view["width"] <= most
+        assert (view["height"], view["cx"]) == (1000, view["width"] / 2)
+        matrix = np.array(view["matrix"]).reshape(3, 4)
+        for turn in np.radians(range(0, 360, 30)):
+            c, s = np.cos(turn), np.sin(turn)
+            seen = points @ [[c, 0, s], [0, 1, 0], [-s, 0, c]] @ matrix[:, :3].T + matrix[:, 3]
+            assert (np.abs(view["fx"] * seen[:, 0] / seen[:, 2]) < view["width"] / 2).mean() > 0.99
+
+
 def test_what_has_another_origin_is_at_its_place_in_the_page(mesh, cloud):
     part, far = mesh.take(slice(60)), (10.0, -20.0, 30.0)
     page = make_page(mesh, coarse=part.relative_to(far), splats=cloud.relative_to(far)).html

@@ -69,6 +69,8 @@ class ViewingOptions:
     the model folder or of the photographs."""
     title: str | None = None
     """Name of the scene in the page. Default: that of the file."""
+    without_controls: bool = False
+    """Nothing over the scene, for a page within another: no title, no settings, until H is pressed."""
     reading: SceneReading = field(default_factory=SceneReading)
     part: PartOfScene = field(default_factory=PartOfScene)
 
@@ -117,6 +119,7 @@ class ShownFile:
                 background=background.color,
                 up=optional_up(options.up),
                 merged_from=content.merged_from,
+                controls=not options.without_controls,
             ),
         )
         return made, measured(content, made, self.cameras, self.threads)

@@ -11,6 +11,7 @@ import base64
 import hashlib
 import html
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,15 @@ from meshsplats._kinds import need, need_all
 from meshsplats._words import legible
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
+from meshsplats.cameras.framing import (
+    COVERED,
+    MARGIN,
+    Bounds,
+    guess_up,
+    scene_bounds,
+    unit_up,
+    weighted_quantile,
+)
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
 from meshsplats.gaussians import GaussianCloud
@@ -37,7 +46,7 @@ from meshsplats.webgpu import device, frames, kernels
 
 MODULES = (
     *("scene.js", "camera.js", "controls.js", "crop.js", "order.js", "shaders.js", "sorted.js"),
-    *("arrays.js", "exact.js", "status.js", "contents.js", "app.js"),
+    *("arrays.js", "exact.js", "status.js", "contents.js", "app.js", "main.js"),
 )
 """The scripts of the page, in the order in which they are joined."""
 
@@ -65,6 +74,9 @@ class PageOptions:
     """(3,) direction that points up. None: by the cameras, else by the mesh."""
     merged_from: int | None = None
     """How many splats there were, if only some are in the page, merged."""
+    controls: bool = True
+    """Title, state and settings over the scene. False: nothing over it, for a page within another, until H is
+    pressed."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +110,7 @@ def make_page(
         surface: shown beside the mesh or in its place, with its texture as it is, without lights.
         cameras: viewpoints to choose from. The first is where the page begins; without any, it begins before
             the subject.
-        options: title, background, up.
+        options: title, background, up, whether there are controls.
 
     ``splats``, ``coarse`` and ``surface`` may have other origins than ``mesh``; ``cameras`` have its own.
 
@@ -134,11 +146,12 @@ def make_page(
         blocks["splats"] = ("text/plain", _base64(pack_splats(splats.relative_to(mesh.origin))))
     views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
+    bounds = scene_bounds(mesh)
     if not views:
         colored = mesh if alone is None else texture_to_vertex_colors(alone, OPENING_TRIANGLES)
         azimuth = opening_azimuth(splats or colored, up=up, threads=1)
-        views = orbit(mesh, 1, azimuth=azimuth, elevation=15, width=1000, height=1000, up=up)
-    bounds = scene_bounds(mesh)
+        (view,) = orbit(mesh, 1, azimuth=azimuth, elevation=15, width=1000, height=1000, up=up)
+        views = [_narrowed(view, bounds, up)]
     settings = {
         "title": legible(options.title[:LONGEST_NAME]),
         "background": "#" + "".join(f"{round(255 * min(max(c, 0), 1)):02x}" for c in options.background),
@@ -157,9 +170,8 @@ def make_page(
         },
     }
     blocks = {"settings": ("application/json", _json(settings)), **blocks}
-    return Page(
-        _assembled(settings["title"], blocks), packed, 0 if textured is None else len(textured.picture)
-    )
+    text = _assembled(settings["title"], blocks, "" if options.controls else "plain")
+    return Page(text, packed, 0 if textured is None else len(textured.picture))
 
 
 def _mesh_blocks(
@@ -240,7 +252,8 @@ def script() -> str:
     return '"use strict";\n{\n' + "\n".join(parts) + "}\n"
 
 
-def _assembled(title: str, blocks: Mapping[str, tuple[str, str]]) -> str:
+def _assembled(title: str, blocks: Mapping[str, tuple[str, str]], look: str) -> str:
+    """``look``: class of the page's body."""
     import meshsplats
 
     code, style = script(), _read("style.css")
@@ -264,11 +277,28 @@ def _assembled(title: str, blocks: Mapping[str, tuple[str, str]]) -> str:
         "policy": policy,
         "generator": f"meshsplats {meshsplats.__version__}",
         "title": title,
+        "look": look,
     }
     replaced = {name: html.escape(text, quote=True) for name, text in values.items()}
     replaced |= {"style": style, "script": code, "data": data}
     # In one pass, so that nothing in a title is taken for a place to fill.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: replaced[match[1]], _read("index.html"))
+
+
+def _narrowed(camera: Camera, bounds: Bounds, up: np.ndarray) -> Camera:
+    """``camera`` with an image no wider than the subject while it turns around ``up``: a slender one fills an
+    upright window, too."""
+    sight = camera.world_to_camera[2, :3]
+    away = ((bounds.center - camera.center) @ sight) * sight
+    offsets = bounds.points - (camera.center + away)
+    heights = offsets @ up
+    aside = np.linalg.norm(offsets - heights[:, None] * up, axis=1) + bounds.sizes
+    # At a turn by t, a point is aside * sin(t) beside the line of sight, and reach * cos(t) before the axis.
+    depths, reach = np.linalg.norm(away) + heights * (sight @ up), aside * np.linalg.norm(np.cross(sight, up))
+    slopes = aside / np.sqrt(np.maximum(depths**2 - reach**2, 1e-12 * depths**2))
+    needed = 2 * MARGIN * camera.fx * weighted_quantile(slopes, bounds.weights, COVERED)
+    width = min(camera.width, math.ceil(needed))
+    return replace(camera, width=width, cx=camera.cx - (camera.width - width) / 2)
 
 
 def _described(camera: Camera) -> dict[str, object]:

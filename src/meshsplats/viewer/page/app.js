@@ -5,9 +5,8 @@ import { Contents } from "./contents.js";
 import { connect, connectPanel, fillCameras } from "./controls.js";
 import { CropBox } from "./crop.js";
 import { ExactRenderer } from "./exact.js";
-import { decodeMesh, decodeSplats, decodeSurface, unpack } from "./scene.js";
 import { SortedRenderer } from "./sorted.js";
-import { element, number, report } from "./status.js";
+import { element, note, number, report, say } from "./status.js";
 
 const QUIET = 180; // milliseconds without a change, after which the image is still
 const DRAFTS = [1 / 4, 1 / 3, 1 / 2, 1]; // sizes of the image while it moves
@@ -16,11 +15,12 @@ const SLOW = 50, QUICK = 16, HOPELESS = 150;
 const PICK = 8; // CSS pixels around a double click
 const MOST_PIXELS = 3.9e6; // of the canvas: the exact renderer draws an image in one piece
 const FLIGHT = 450; // milliseconds from one camera to the next
+const LOST = "The graphics device was lost. If it does not come back by itself, load the page again.";
 
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 const PHONE = 600; // CSS pixels of the shorter side of a screen, below which a device with touch is a phone
 
-class App {
+export class App {
   // levels: the meshes that are unpacked, "coarse" and "fine", and the "surface"; unpackFine() gives the
   // fine one, once, where it is not.
   constructor(settings, levels, splats, unpackFine) {
@@ -75,9 +75,10 @@ class App {
     } else if (!kernels) {
       this.#fall(); // a surface alone, which is drawn by WebGL anywhere
     } else {
-      this.#fall(`The image is not exact here: ${problems.join("; ")}.` +
+      this.#fall();
+      note(`The image is not exact here: ${problems.join("; ")}.` +
         ` WebGL draws ${this.mesh.order === "splat" ? "whole splats" : "triangles"} sorted by` +
-        " their centres. Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
+        " their centres. Current Chrome, Edge, Safari and Firefox have WebGPU, but not on all systems.");
     }
     if (!this.sorted) {
       for (const input of document.querySelectorAll("[name=content], [name=style]")) input.disabled = true;
@@ -119,7 +120,7 @@ class App {
       if (this.exact) this.#give(this.exact, "fine");
     } catch (error) {
       delete this.levels.fine;
-      this.say(`Only the coarse mesh is shown: ${error.message}`);
+      say(`Only the coarse mesh is shown: ${error.message}`);
     }
     this.preparing = false;
     this.changed();
@@ -129,7 +130,7 @@ class App {
     exact.kept = this.kept;
     const left = exact.add(level, this.levels[level]);
     if (left) {
-      this.say(`WebGPU takes buffers of ${Math.round(exact.most / 2 ** 20)} MiB here:` +
+      say(`WebGPU takes buffers of ${Math.round(exact.most / 2 ** 20)} MiB here:` +
         ` the exact image lacks the ${(100 * left).toFixed(left < 0.1 ? 1 : 0)} % of the triangles` +
         " that show least.");
     }
@@ -141,13 +142,8 @@ class App {
     this.options.renderer = "sorted";
     element("renderer").value = "sorted";
     element("renderer").options[0].disabled = true;
-    if (message) this.say(message);
+    if (message) say(message);
     this.changed();
-  }
-
-  say(text) {
-    element("message").hidden = false;
-    element("messageText").textContent = text;
   }
 
   // ---- Views
@@ -269,11 +265,21 @@ class App {
     element("crop").addEventListener("toggle", () => this.changed());
     connectPanel(element("panel"), element("toggle"));
     element("dismiss").addEventListener("click", () => { element("message").hidden = true; });
-    this.canvases.sorted.addEventListener("webglcontextlost",
-      () => this.say("The graphics device was lost: load the page again."));
-    connect(this.stage, this, settings.radius * 1e-3);
+    this.canvases.sorted.addEventListener("webglcontextlost", event => {
+      event.preventDefault(); // else it never comes back
+      this.changed();
+    });
+    this.canvases.sorted.addEventListener("webglcontextrestored", () => this.#regain());
+    connect(this.stage, this, settings.radius);
     new ResizeObserver(() => this.changed()).observe(this.stage);
     this.#measure();
+  }
+
+  #regain() {
+    this.sorted = new SortedRenderer(this.canvases.sorted, this.levels, this.splats);
+    this.sorted.crop(this.kept ?? null);
+    element("message").hidden = true;
+    this.changed();
   }
 
   // ---- Drawing
@@ -281,7 +287,15 @@ class App {
   async #loop() {
     let before = performance.now();
     for (;;) {
-      if (!this.#busy()) await new Promise(resolve => { this.wake = resolve; });
+      const waits = this.#waits();
+      if (waits) {
+        say(LOST, true);
+        document.body.dataset.state = "lost";
+      }
+      if (waits || !this.#busy()) {
+        await new Promise(resolve => { this.wake = resolve; });
+        continue;
+      }
       const now = await new Promise(requestAnimationFrame);
       this.#advance(performance.now(), Math.min(100, now - before) / 1000);
       before = now;
@@ -289,8 +303,9 @@ class App {
       try {
         await this.#frame(now);
       } catch (error) {
+        if (this.#waits()) continue;
         if (!wasExact || !this.sorted) {
-          this.say(`Drawing failed: ${error.message}`);
+          say(`Drawing failed: ${error.message}`, true);
           document.body.dataset.state = "failed";
           return;
         }
@@ -300,6 +315,9 @@ class App {
   }
 
   #busy() { return this.dirty || this.#moves() || !this.finished; }
+
+  // Whether a part of the image has to wait for WebGL's device.
+  #waits() { return this.sorted?.lost && !(this.exactly && this.contents.parts.length === 1); }
 
   #moves() { return Boolean(this.flight) || Boolean(this.spinning) || this.thrust.some(Boolean); }
 
@@ -391,7 +409,7 @@ class App {
   async #drawSorted(level, scale, still, exact) {
     const parts = this.contents.parts.filter(({ what }) => !(exact && what === "mesh"));
     const { style, background, gain } = this.options, stop = () => this.dirty;
-    if (parts.length && this.sorted) {
+    if (parts.length && this.sorted && !this.sorted.lost) {
       const drawn = await this.sorted.draw(
         { view: this.view, level, parts, style, still, scale, background, gain, stop });
       if (!drawn) return;
@@ -416,32 +434,3 @@ class App {
     this.crop.show(element("box"), element("crop").open, pinhole);
   }
 }
-
-async function main() {
-  element("blocked").remove();
-  const text = id => element(id)?.textContent.trim();
-  const settings = JSON.parse(text("settings"));
-  const paint = () => new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)));
-  await paint();
-  const take = id => {
-    const found = text(id);
-    element(id)?.remove();
-    return found;
-  };
-  const unpackFine = async () => decodeMesh(await unpack(take("mesh")));
-  const taken = async id => text(id) ? unpack(take(id)) : null, levels = {};
-  if (text("coarse")) levels.coarse = decodeMesh(await taken("coarse"));
-  else if (text("mesh")) levels.fine = await unpackFine();
-  if (text("surface"))
-    levels.surface = await decodeSurface(await taken("surface"), await taken("coordinates"), take("picture"));
-  const splats = text("splats") ? decodeSplats(await taken("splats")) : null;
-  const app = new App(settings, levels, splats, text("mesh") ? unpackFine : null);
-  await app.start(JSON.parse(text("kernels") ?? "null"));
-}
-
-main().catch(error => {
-  document.body.dataset.state = "failed";
-  element("loading").remove();
-  element("message").hidden = false;
-  element("messageText").textContent = error.message;
-});

@@ -13,6 +13,8 @@ export function turned(v, axis, angle) {
     c * v[2] + s * w[2] + d * axis[2]];
 }
 
+const NEAREST = 1e-3, FARTHEST = 50; // distances of the pivot that zooming reaches, in radii of the scene
+
 export class View {
   // camera: {matrix: 12 numbers, the rows of world to camera; fx, fy, cx, cy, width, height, near}; up: unit
   // vector; distance: of the pivot before the camera.
@@ -73,17 +75,20 @@ export class View {
 
   look(yaw, pitch) { this.#rotate(yaw, pitch); }
 
-  // Moves by shares of the image's shorter side, at the depth of the pivot.
-  pan(x, y) {
-    const scale = this.distance * this.side / this.lens.fx;
-    this.position = add(add(this.position, this.right, -x * scale), this.down, -y * scale);
+  // Pixels of a window of w x h to one of the lens: its whole image fits in it.
+  scale(w, h) { return Math.min(w / this.lens.width, h / this.lens.height); }
+
+  // Moves what is at the depth of the pivot by pixels of such a window.
+  pan(x, y, w, h) {
+    const length = this.distance / (this.lens.fx * this.scale(w, h));
+    this.position = add(add(this.position, this.right, -x * length), this.down, -y * length);
   }
 
-  get side() { return Math.min(this.lens.width, this.lens.height); }
-
-  zoom(factor, least) {
-    const pivot = this.pivot;
-    this.distance = Math.max(this.distance * factor, least);
+  // radius: of the scene. A long lens reaches farther, and no camera is too far away where it stands.
+  zoom(factor, radius) {
+    const pivot = this.pivot, { fx, width, height } = this.lens;
+    const most = Math.max(this.distance, FARTHEST * radius * fx / Math.max(width, height));
+    this.distance = Math.min(most, Math.max(this.distance * factor, NEAREST * radius));
     this.position = add(pivot, this.forward, -this.distance);
   }
 
@@ -92,10 +97,9 @@ export class View {
     this.position = add(add(add(this.position, this.right, x), this.down, y), this.forward, z);
   }
 
-  // The pinhole of an image of w x h pixels: the lens' whole image fits in it. dx, dy: offset of the samples
-  // from the pixels' centres.
+  // The pinhole of an image of w x h pixels. dx, dy: offset of the samples from the pixels' centres.
   pinhole(w, h, dx = 0, dy = 0) {
-    const lens = this.lens, s = Math.min(w / lens.width, h / lens.height), p = this.position;
+    const lens = this.lens, s = this.scale(w, h), p = this.position;
     const rows = [this.right, this.down, this.forward].map(axis => [...axis, -dot(axis, p)]);
     return {
       rows, center: p, fx: lens.fx * s, fy: lens.fy * s, near: lens.near, width: w, height: h,

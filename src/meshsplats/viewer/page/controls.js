@@ -2,12 +2,17 @@
 
 const STEP = 0.05; // radians of an arrow key
 const ZOOM = 0.85; // of a press of +
+// powers of e that zoom: a pixel of the wheel; one of a pinch on a trackpad, which browsers report as a wheel
+// with Ctrl; the most of an event
+const WHEEL = 0.0015, PINCH = 0.01, MOST = 0.45;
 // controls that arrows and Home move
 const WITH_ARROWS = "[type=radio], [type=range], [role=slider]", MOVES = /^(Arrow|Home)/;
 
-export function connect(stage, pilot, least) {
+// radius: of the scene.
+export function connect(stage, pilot, radius) {
   const touches = new Map(), keys = new Set();
   const shorter = () => Math.min(stage.clientWidth, stage.clientHeight);
+  const pan = (x, y) => pilot.view.pan(x, y, stage.clientWidth, stage.clientHeight);
 
   stage.addEventListener("pointerdown", event => {
     if (event.target.closest("#divider")) return;
@@ -32,10 +37,10 @@ export function connect(stage, pilot, least) {
     const { view } = pilot, side = shorter();
     if (touches.size >= 2) {
       const after = pair(touches);
-      view.pan((after.x - before.x) / side, (after.y - before.y) / side);
-      if (after.apart > 10 && before.apart > 10) view.zoom(before.apart / after.apart, least);
+      pan(after.x - before.x, after.y - before.y);
+      if (after.apart > 10 && before.apart > 10) view.zoom(before.apart / after.apart, radius);
     } else if (touch.pans) {
-      view.pan(x / side, y / side);
+      pan(x, y);
     } else if (pilot.flying) {
       view.look(x / side * 1.2, -y / side * 1.2);
     } else {
@@ -45,8 +50,9 @@ export function connect(stage, pilot, least) {
   });
   stage.addEventListener("wheel", event => {
     event.preventDefault();
-    const lines = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
-    pilot.view.zoom(Math.exp(Math.max(-300, Math.min(300, lines)) * 0.0015), least);
+    const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
+    const power = pixels * (event.ctrlKey ? PINCH : WHEEL);
+    pilot.view.zoom(Math.exp(Math.max(-MOST, Math.min(MOST, power))), radius);
     pilot.changed();
   }, { passive: false });
   stage.addEventListener("contextmenu", event => event.preventDefault());
@@ -80,12 +86,12 @@ export function connect(stage, pilot, least) {
     } else if (key.startsWith("Arrow")) {
       const x = Number(key === "ArrowRight") - Number(key === "ArrowLeft");
       const y = Number(key === "ArrowDown") - Number(key === "ArrowUp");
-      if (event.shiftKey) view.pan(-x * STEP, -y * STEP);
+      if (event.shiftKey) pan(-x * STEP * shorter(), -y * STEP * shorter());
       else if (pilot.flying) view.look(-x * STEP, y * STEP);
       else view.orbit(x * STEP * 2, -y * STEP * 2);
       pilot.changed();
     } else if (key === "+" || key === "=" || key === "-") {
-      view.zoom(key === "-" ? 1 / ZOOM : ZOOM, least);
+      view.zoom(key === "-" ? 1 / ZOOM : ZOOM, radius);
       pilot.changed();
     } else {
       return;
@@ -135,7 +141,8 @@ export function connectDivider(divider, stage, moved) {
   });
 }
 
-// The panel of the settings: `toggle` opens and closes it, Escape closes it. It begins open on wide screens.
+// The panel of the settings: `toggle` opens and closes it, Escape closes it. It begins open where it leaves
+// the subject free: in wide windows, not within another page.
 export function connectPanel(panel, toggle) {
   const open = shown => {
     panel.classList.toggle("closed", !shown);
@@ -147,7 +154,7 @@ export function connectPanel(panel, toggle) {
     open(false);
     toggle.focus();
   });
-  open(!matchMedia("(max-width: 640px)").matches);
+  open(matchMedia("(min-width: 1000px)").matches && window === window.parent);
 }
 
 export function fillCameras(list, cameras) {

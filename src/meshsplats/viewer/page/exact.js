@@ -57,7 +57,8 @@ fn pixel(p: vec2i) -> vec4f {
 export class ExactRenderer {
   // lost(reason) is called when the device goes. Throws where there is no WebGPU.
   static async create(canvas, kernels, lost) {
-    if (!navigator.gpu) throw new Error("this browser has no WebGPU");
+    if (!navigator.gpu) throw new Error(
+      isSecureContext ? "this browser has no WebGPU" : "browsers offer WebGPU to pages by https only");
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter) throw new Error("WebGPU finds no graphics device");
     const { maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;

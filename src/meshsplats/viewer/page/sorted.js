@@ -25,6 +25,9 @@ export class SortedRenderer {
     this.cloud = null;
   }
 
+  // Whether the device has taken everything with it.
+  get lost() { return this.gl.isContextLost(); }
+
   #needMesh(level) {
     if (this.triangles[level]) return this.triangles[level];
     const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3,

@@ -1,9 +1,31 @@
-// The line of the state of the image, and statistics.
+// The line of the state of the image, notes about it, and statistics.
 
 import { inWorld } from "./camera.js";
 
 export const element = id => document.getElementById(id);
 export const number = value => Math.round(value).toLocaleString("en");
+
+const MOMENT = 8000; // milliseconds of a note over the image
+let hiding;
+
+// In the settings, and where the mouse rests on the line of the state.
+export function note(text) {
+  const line = document.createElement("p");
+  element("notes").append(line);
+  element("status").title = line.textContent = text;
+}
+
+// Over the image, for a moment, and a note; for good (`lasting`) where there is no image.
+export function say(text, lasting = false) {
+  const message = element("message");
+  message.hidden = false;
+  message.classList.toggle("lasting", lasting);
+  element("messageText").textContent = text;
+  clearTimeout(hiding);
+  if (lasting) return;
+  note(text);
+  hiding = setTimeout(() => { message.hidden = true; }, MOMENT);
+}
 
 // state: of the image; exact: whether the exact renderer drew it, in so many passes; scale: of the canvas.
 export function report(app, state, exact, passes, scale, level) {
