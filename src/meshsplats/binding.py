@@ -13,6 +13,11 @@ from meshsplats._arrays import checked_array
 from meshsplats._geometry import vertex_normals
 
 _ROWS = 1 << 15
+_MOST_STRETCH = 8.0
+"""Largest factor by which a face sets layers apart, beyond that of most of the base, or 1: a vertex that
+flies off in a simulation must not take the layers around it along."""
+_EVEN = 1e-4
+"""Largest difference between the stretches of a base that counts as scaled as a whole."""
 SUM_TOLERANCE = 1e-6
 """Largest error of the sum of a vertex's weights, 1: a few roundings of float32."""
 
@@ -42,8 +47,9 @@ class Binding:
     """V vertices on the faces of a base mesh of n vertices and m triangles (a mesh prior).
 
     Concretely, vertex i stands at ``sum_k weights[i, k] * c_k``, where c_k is corner k of face
-    ``vertex_face[i]``: ``base_vertices[base_faces[vertex_face[i], k]]``, moved by ``layers[i] * lift`` along
-    the base's normal at that corner. The constructor checks and converts the arrays (C-contiguous).
+    ``vertex_face[i]``: ``base_vertices[base_faces[vertex_face[i], k]]``, moved by ``layers[i] * lift``, times
+    the ``stretch`` there, along the base's normal at that corner. The constructor checks and converts the
+    arrays (C-contiguous).
     """
 
     base_vertices: np.ndarray
@@ -58,6 +64,8 @@ class Binding:
     """(v,) int32 layer of each vertex; layer 0 lies on the base."""
     lift: float = 0.0
     """Scene units from one layer to the next along the normals, negative inwards; 0: all lie in the base."""
+    stretch: np.ndarray | None = None
+    """(n,) float32 factors, >= 0, of ``lift`` at the vertices of the base; None: 1 everywhere."""
 
     FIELDS: ClassVar[tuple[ArrayField, ...]] = (
         ArrayField("base_vertices", np.float32, "base vertex", 3),
@@ -65,6 +73,7 @@ class Binding:
         ArrayField("vertex_face", np.int32, "vertex"),
         ArrayField("weights", np.float32, "vertex", 3),
         ArrayField("layers", np.int32, "vertex"),
+        ArrayField("stretch", np.float32, "base vertex", optional=True),
     )
     _OF_VERTICES: ClassVar[tuple[str, ...]] = tuple(f.name for f in FIELDS if f.per == "vertex")
 
@@ -80,24 +89,28 @@ class Binding:
                 raise ValueError(f"the weights of a vertex must have the sum 1, one misses it by {off:.3g}")
             if self.layers.min() < 0:
                 raise ValueError(f"layers must be >= 0, got {self.layers.min()}")
+        if self.stretch is not None and len(self.stretch) and self.stretch.min() < 0:
+            raise ValueError(f"stretch must not be negative, got {self.stretch.min():.4g}")
         if not np.isfinite(self.lift):
             raise ValueError(f"lift must be a finite length, got {self.lift}")
         object.__setattr__(self, "lift", float(self.lift))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All arrays by name, and ``lift`` as an array without dimensions."""
-        return {f.name: getattr(self, f.name) for f in self.FIELDS} | {"lift": np.array(self.lift)}
+        """All arrays by name but those that are None, and ``lift`` as an array without dimensions."""
+        values = {f.name: getattr(self, f.name) for f in self.FIELDS} | {"lift": np.array(self.lift)}
+        return {name: value for name, value in values.items() if value is not None}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Binding:
-        """The inverse of ``arrays``.
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], prefix: str = "") -> Binding:
+        """The inverse of ``arrays``, whose names have a ``prefix`` now; other names are ignored.
 
         Raises:
             KeyError: an array is missing.
             ValueError: the arrays do not make a binding.
         """
-        parts = {f.name: arrays[f.name] for f in cls.FIELDS}
-        lift = float(arrays["lift"])
+        fields = [f.name for f in cls.FIELDS if not f.optional or prefix + f.name in arrays]
+        parts = {name: arrays[prefix + name] for name in fields}
+        lift = float(arrays[prefix + "lift"])
         try:
             return cls(**parts, lift=lift)
         except (ValueError, TypeError) as error:
@@ -118,7 +131,8 @@ class Binding:
         indices = self.base_faces[self.vertex_face[rows]]
         result = self.base_vertices[indices].astype(np.float64)
         if self.lift:
-            result += (self.layers[rows] * self.lift)[:, None, None] * self.base_normals[indices]
+            out = (self.layers[rows] * self.lift)[:, None, None] * self.base_normals[indices]
+            result += out if self.stretch is None else out * self.stretch[indices][:, :, None]
         return result
 
     def normals(self) -> np.ndarray:
@@ -145,11 +159,10 @@ class Binding:
         vertices = self.base_vertices.astype(np.float64)
         return vertex_normals(vertices, self.base_faces, same_place=self._same_place)
 
-    @property
-    def area(self) -> float:
-        """Area of the base, square scene units."""
+    def _face_sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """Two sides of each of the base's faces, (m, 3) float64 vectors from its first corner."""
         a, b, c = (self.base_vertices[self.base_faces[:, k]].astype(np.float64) for k in range(3))
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        return b - a, c - a
 
     def _parts(self) -> Iterator[slice]:
         """Slices of the vertices that fit the processor's cache."""
@@ -168,11 +181,42 @@ class Binding:
         place[order[1:]] = np.cumsum(new)
         return place
 
-    def moved(self, base_vertices: np.ndarray, lift: float) -> Binding:
-        """The binding to the base with its vertices at (n, 3) ``base_vertices``. Seams stay as they were."""
-        made = replace(self, base_vertices=base_vertices, lift=lift)
+    def moved(self, base_vertices: np.ndarray, lift: float, stretch: np.ndarray | None = None) -> Binding:
+        """The binding to the base with its vertices at (n, 3) ``base_vertices``. Seams stay as they were, and
+        ``stretch`` (n,), unless given."""
+        stretch = self.stretch if stretch is None else stretch
+        made = replace(self, base_vertices=base_vertices, lift=lift, stretch=stretch)
         made.__dict__["_same_place"] = self._same_place
         return made
+
+    def posed(self, base_vertices: np.ndarray) -> Binding:
+        """The binding to the base bent so that its vertices are at (n, 3) ``base_vertices``.
+
+        The distance between layers follows the base: at each of its vertices, it is multiplied by the mean,
+        weighted by area, of what the faces around it are stretched by: the square root of the product of
+        their two principal stretches, of which the larger counts as twice the smaller at most. Where nothing
+        is stretched the distance stays. A base that is scaled as a whole changes ``lift`` alone.
+        """
+        made = self.moved(base_vertices, self.lift)
+        old, new = self._face_sides(), made._face_sides()
+        before, after = (np.linalg.norm(np.cross(*sides), axis=1) for sides in (old, new))
+        whole = before.sum()
+        if not self.lift or not whole:
+            return made
+        factors = _stretches(old, new, before, after)
+        order = np.argsort(factors)
+        usual = factors[order[np.searchsorted(np.cumsum(before[order]), whole / 2)]]
+        factors = np.minimum(factors, _MOST_STRETCH * max(usual, 1))
+        corners, count = self._same_place[self.base_faces].ravel(), len(self.base_vertices)
+        area, stretched = (
+            np.bincount(corners, np.repeat(values, 3), minlength=count)
+            for values in (before, before * factors)
+        )
+        local = np.divide(stretched, area, out=np.full(count, usual), where=area > 0)[self._same_place]
+        if np.abs(local - usual).max() <= _EVEN * usual:
+            return self.moved(base_vertices, self.lift * float((before * factors).sum() / whole))
+        stretch = local if self.stretch is None else local * self.stretch
+        return self.moved(base_vertices, self.lift, stretch.astype(np.float32))
 
     def take(self, rows: np.ndarray) -> Binding:
         """The binding of the vertices ``rows``, indices or a (v,) mask; the base stays whole."""
@@ -196,6 +240,27 @@ class Binding:
         for name in self._OF_VERTICES:
             rows[name] = np.concatenate([getattr(one, name) for one in every])
         return replace(self, **rows)
+
+
+def _stretches(
+    old: tuple[np.ndarray, np.ndarray],
+    new: tuple[np.ndarray, np.ndarray],
+    before: np.ndarray,
+    after: np.ndarray,
+) -> np.ndarray:
+    """(m,) what each of the triangles is stretched by whose two sides (m, 3) were ``old`` and are ``new``,
+    with twice the areas ``before`` and ``after`` (m,): 1 for those that had no area."""
+
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.einsum("ij,ij->i", a, b)
+
+    product = np.divide(after, before, out=np.ones_like(before), where=before > 0)
+    squares = dot(new[0], new[0]) * dot(old[1], old[1]) + dot(new[1], new[1]) * dot(old[0], old[0])
+    squares -= 2 * dot(*new) * dot(*old)
+    half = np.divide(squares, 2 * before**2, out=np.ones_like(before), where=before > 0)
+    larger = np.sqrt(half + np.sqrt(np.maximum(half**2 - product**2, 0)))
+    smaller = np.divide(product, larger, out=np.zeros_like(larger), where=larger > 0)
+    return np.minimum(np.sqrt(product), 2**0.5 * smaller)
 
 
 def check_fields(owner: Any) -> dict[str, int]:

@@ -251,7 +251,6 @@ class SplatMesh:
             ValueError, TypeError: as the constructor.
         """
         bound = any(name.startswith("binding.") for name in arrays)
-        names = [*(f.name for f in Binding.FIELDS), "lift"] if bound else []
         prefix = "attribute."
         return cls(
             **{f.name: arrays[f.name] for f in cls.FIELDS if f.name in arrays or not f.optional},
@@ -260,7 +259,7 @@ class SplatMesh:
             order=str(arrays.get("order", "fragment")),  # type: ignore[arg-type]
             origin=arrays.get("origin", zero_origin()),
             attributes={name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)},
-            binding=Binding.from_arrays({n: arrays[f"binding.{n}"] for n in names}) if bound else None,
+            binding=Binding.from_arrays(arrays, "binding.") if bound else None,
         )
 
     @property

@@ -10,6 +10,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
+import bmesh
+
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender.inside import objects, priors
 from meshsplats.mesh import SplatMesh
@@ -49,8 +51,13 @@ def places(obj) -> np.ndarray:
     return found.reshape(-1, 3)
 
 
+def in_blender(prior: MeshPrior) -> MeshPrior:
+    """``prior`` with its layers set apart, as splats are placed."""
+    return MeshPrior(prior.pose(lift=prior.export_lift))
+
+
 def wanted(prior: MeshPrior, vertices) -> np.ndarray:
-    return prior.pose(vertices, lift=prior.export_lift).vertices
+    return in_blender(prior).pose(vertices).vertices
 
 
 def assert_follows(obj, prior, vertices) -> None:
@@ -77,8 +84,31 @@ def test_an_edited_base(placed):
     base.data.vertices.foreach_set("co", moved.ravel())
     base.data.update()
     assert priors.follow([obj], bpy.context.evaluated_depsgraph_get()) == 1
-    lift = prior.export_lift
-    np.testing.assert_allclose(places(obj), prior.pose(moved, lift=lift).vertices, atol=2e-6)
+    assert_follows(obj, prior, moved)
+
+
+def test_shells_follow_the_stretch_around_them():
+    """Also while the base is edited, and in the file afterwards."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    prior = bind(sheet(), triangles=4, layers=3, spacing=-0.05)
+    obj = objects.add(objects.prepare(prior.mesh, False), "prior", bpy.context.collection)
+    base = priors.base_of(obj)
+    moved = prior.base_vertices.copy()
+    moved[moved[:, 0] > 0.5] *= np.float32([2, 3, 1])
+    wanted = prior.pose(moved)
+    bpy.context.view_layer.objects.active = base
+    bpy.ops.object.mode_set(mode="EDIT")
+    edited = bmesh.from_edit_mesh(base.data)
+    for vertex, place in zip(edited.verts, moved.tolist(), strict=True):
+        vertex.co = place
+    for mode in ("EDIT", "OBJECT"):
+        bpy.ops.object.mode_set(mode=mode)
+        assert priors.follow([obj], bpy.context.evaluated_depsgraph_get()) == 1
+        np.testing.assert_allclose(places(obj), wanted.vertices, atol=1e-6)
+    np.testing.assert_allclose(priors.binding_of(obj).stretch, wanted.binding.stretch, atol=1e-6)
+    again = objects.add(objects.prepare(wanted, False), "again", bpy.context.collection)
+    priors.follow([again], bpy.context.evaluated_depsgraph_get())
+    np.testing.assert_allclose(places(again), wanted.vertices, atol=1e-6)
 
 
 def test_handlers_follow_shape_keys_and_armatures(placed):
@@ -330,7 +360,7 @@ def test_images_are_those_of_the_posed_mesh(tmp_path, placed):
     base.data.vertices.foreach_set("co", moved.ravel())
     base.data.update()
     priors.follow([obj], bpy.context.evaluated_depsgraph_get())
-    lifted = replace(prior.pose(moved, lift=prior.export_lift), binding=None)
+    lifted = replace(in_blender(prior).pose(moved), binding=None)
     # With its origin where the base has it: rays that meet edges exactly must be rounded the same way.
     prepared = objects.prepare(lifted, False) | {"origin": np.zeros(3)}
     other = objects.add(prepared, "posed", bpy.context.collection)

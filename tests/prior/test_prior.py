@@ -433,6 +433,51 @@ def test_shells_lie_at_their_distance_and_grow_with_the_base():
         bind(base, layers=2, spacing=float("nan"))
 
 
+def two_cubes() -> BaseMesh:
+    return BaseMesh(np.concatenate([CUBE, CUBE + 5]), np.concatenate([CUBE_FACES, CUBE_FACES + 8]))
+
+
+def test_shells_follow_the_stretch_around_them():
+    base = two_cubes()
+    prior = bind(base, triangles=4, layers=3, spacing=-0.05)
+    moved = base.vertices.copy()
+    moved[8:] = (moved[8:] - 5) * 3 + 5
+    posed = prior.pose(moved)
+    far = prior.mesh.binding.vertex_face >= len(CUBE_FACES)
+    np.testing.assert_array_equal(posed.vertices[~far], prior.mesh.vertices[~far])
+    np.testing.assert_allclose(posed.vertices[far], (prior.mesh.vertices[far] - 5) * 3 + 5, atol=1e-5)
+    # Posed again, and as a whole.
+    back = MeshPrior(posed).pose(base.vertices)
+    np.testing.assert_allclose(back.vertices, prior.mesh.vertices, atol=1e-5)
+    turn = rotation(np.random.default_rng(5)) * 10
+    turned = moved @ turn.T
+    whole = MeshPrior(posed).pose(turned).vertices
+    np.testing.assert_allclose(whole, posed.vertices @ turn.T, atol=1e-4)
+    np.testing.assert_allclose(prior.pose(turned).vertices, whole, atol=1e-4)
+    # A posed prior in its own pose.
+    np.testing.assert_allclose(
+        MeshPrior(posed).pose(lift=posed.binding.lift).vertices, posed.vertices, atol=1e-6
+    )
+
+
+def test_a_vertex_that_flies_off_leaves_the_shells_of_others():
+    base = bumpy(8)
+    prior = bind(base, triangles=1, layers=6)
+    moved = base.vertices.copy()
+    moved[40] = 1e6
+    posed = prior.pose(moved)
+    touched = (base.faces == 40).any(axis=1)
+    around = np.isin(base.faces, base.faces[touched]).any(axis=1)[prior.mesh.binding.vertex_face]
+    np.testing.assert_array_equal(posed.vertices[~around], prior.mesh.vertices[~around])
+    unmoved = ~touched[prior.mesh.binding.vertex_face]
+    depth = 5 * abs(prior.lift)
+    assert np.linalg.norm(posed.vertices - prior.mesh.vertices, axis=1)[unmoved].max() < 2.5 * depth
+    # Stretched along one direction, layers are set apart by what two directions would.
+    flat = BaseMesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    long = bind(flat, layers=2, spacing=-0.1).pose(flat.vertices * (10, 1, 1))
+    assert np.ptp(long.vertices[:, 2]) == pytest.approx(0.1 * 2**0.5, rel=1e-5)
+
+
 @pytest.mark.parametrize("lift", [None, -0.05])
 def test_shells_of_a_mirrored_base_stay_on_their_side(lift):
     base, mirror = cube(), np.array([-1, 1, 1], np.float32)
@@ -492,6 +537,8 @@ def test_dropping_faces_keeps_the_binding_of_the_others():
         ({"base_faces": [[0, 1, 3]]}, "base_faces must be indices of the 3 vertices"),
         ({"layers": [0, 0, -1]}, "layers must be"),
         ({"lift": float("nan")}, "lift must be"),
+        ({"stretch": [1, -1, 1]}, "stretch must not be negative"),
+        ({"stretch": [1, 1]}, "stretch"),
         ({"base_vertices": [[np.inf, 0, 0]] * 3}, "finite"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 import zipfile
 from dataclasses import replace
 
@@ -42,6 +43,12 @@ def test_a_binding_comes_back_to_the_bit(tmp_path, suffix, spacing):
     moved = mesh.binding.base_vertices * (1, 2, 0.5) + 1
     posed = load_prior(path).pose(moved)
     np.testing.assert_array_equal(posed.vertices, MeshPrior(mesh).pose(moved).vertices)
+    save_mesh(posed, path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = load_mesh(path)
+    np.testing.assert_array_equal(again.binding.positions(), posed.binding.positions())
+    assert (again.binding.stretch is None) == (spacing == 0)
 
 
 def test_vertices_recomputed_from_the_archive_alone(tmp_path):

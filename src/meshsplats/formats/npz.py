@@ -6,8 +6,8 @@ where the mesh has them ``normals``, ``face_splat``, ``depth_group``, ``harmonic
 if they are not 0, ``filter_px2`` and the float64 ``origin`` (3,) that positions are relative to; ``order`` (a
 text), if it is that by the splat; for a mesh prior its ``binding_base_vertices`` (n, 3),
 ``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,), ``binding_weights`` (v, 3), ``binding_layers``
-(v,) and ``binding_lift``, as ``Binding`` names them. The first three names are those of the published
-MeshSplats code, whose files are read as well.
+(v,), ``binding_lift`` and, where it has one, ``binding_stretch`` (n,), as ``Binding`` names them. The first
+three names are those of the published MeshSplats code, whose files are read as well.
 """
 
 from __future__ import annotations

@@ -83,10 +83,10 @@ class MeshPrior:
         Args:
             vertices: (n, 3) posed positions of the base's vertices, relative to the origin of the mesh; the
                 stored ones by default.
-            lift: distance between layers in scene units, negative inwards. By default that of the prior,
-                scaled with the base: by the square root of the ratio of its areas. With 0 the layers are
-                coplanar, and this project's renderer blends them in their order (``depth_group``); for other
-                programs use ``export_lift``.
+            lift: distance between layers in scene units, negative inwards. By default that of the prior, and
+                where the base is stretched, that times what the faces around are stretched by
+                (``Binding.posed``). With 0 the layers are coplanar, and this project's renderer blends them
+                in their order (``depth_group``); for other programs use ``export_lift``.
 
         Returns:
             The mesh with the posed base's shading normals, and a binding to the posed base.
@@ -104,9 +104,9 @@ class MeshPrior:
                 raise ValueError(f"the base has {count:,} vertices, got positions of {len(positions):,}")
         mirror = None if vertices is None else _mirror(binding.base_vertices, positions)
         side = 1 if mirror is None else -1
-        posed = binding.moved(positions, side * (binding.lift if lift is None else lift))
-        if lift is None and binding.lift and binding.area > 0:
-            posed = binding.moved(positions, posed.lift * (posed.area / binding.area) ** 0.5)
+        posed = binding.posed(positions) if lift is None else binding.moved(positions, lift)
+        if mirror is not None:
+            posed = posed.moved(positions, -posed.lift)
         normals = side * posed.normals()
         if mirror is None:
             return self.mesh.moved(posed.positions(), normals=normals, binding=posed)

@@ -25,6 +25,10 @@ TIE = "Follows base"
 evaluates the splats. Bases are hidden in images, and hidden objects are left as they are at rest."""
 LIFT = "meshsplats_lift"
 """Property of the mesh data: distance between layers."""
+REST = "meshsplats_rest"
+"""Property of the mesh data: positions of the base that the distance between layers is meant for."""
+STRETCH = "meshsplats_stretch"
+"""Property of the mesh data: what that distance is multiplied by at the base's vertices, if not by 1."""
 ATTRIBUTES = {"vertex_face": "splat_base_face", "weights": "splat_base_weights", "layers": "splat_layer"}
 """Attributes of the vertices: the arrays of the binding."""
 FACE = ATTRIBUTES["vertex_face"]
@@ -37,11 +41,15 @@ _FIELDS = [
 
 
 def store(data: Any, binding: Binding) -> None:
-    """Stores ``binding`` with the bpy mesh ``data`` of its splats, except the base, which is an object."""
+    """Stores ``binding`` with the bpy mesh ``data`` of its splats, except the base, which is an object, but
+    for its positions: that object may be edited."""
     for field, name, kind, key in _FIELDS:
         attribute = data.attributes.new(name, kind, "POINT")
         attribute.data.foreach_set(key, getattr(binding, field.name).ravel())
     data[LIFT] = binding.lift
+    data[REST] = binding.base_vertices.ravel()
+    if binding.stretch is not None:
+        data[STRETCH] = binding.stretch
 
 
 def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
@@ -106,6 +114,11 @@ def binding_of(obj: Any) -> Binding:
     Raises:
         ValueError: the base does not have the vertices or faces that the splats were bound to.
     """
+    return _made_binding(obj).posed(versions.positions(base_of(obj).data))
+
+
+def _made_binding(obj: Any) -> Binding:
+    """The binding of ``obj`` to its base as it was when they were made. Raises what ``binding_of`` raises."""
     base = base_of(obj)
     if base is None:
         raise ValueError("the object is bound to no base")
@@ -117,7 +130,17 @@ def binding_of(obj: Any) -> Binding:
     corners = versions.corners(base.data)
     if len(corners) != 3 * len(base.data.polygons):
         raise ValueError("the base has faces that are not triangles: undo that, or bind the splats anew")
-    return Binding(versions.positions(base.data), corners.reshape(-1, 3), **arrays, lift=data[LIFT])
+    now = versions.positions(base.data)
+    rest, stretch = (np.array(data.get(name, ()), np.float32) for name in (REST, STRETCH))
+    if len(rest) != now.size:  # of an earlier release, or vertices were added
+        rest, stretch = now, np.empty(0)
+    return Binding(
+        rest.reshape(-1, 3),
+        corners.reshape(-1, 3),
+        **arrays,
+        lift=data[LIFT],
+        stretch=stretch if len(stretch) else None,
+    )
 
 
 def follow(objs: Iterable[Any], depsgraph: Any) -> int:
@@ -157,7 +180,7 @@ def _move(obj: Any, depsgraph: Any) -> bool:
     """Whether ``depsgraph`` evaluates the base of ``obj``, whose splats were moved then."""
     if obj.data.library is not None:
         raise ValueError(f"its mesh is linked from {obj.data.library.name}: Follow Base Now makes it local")
-    binding, base = binding_of(obj), base_of(obj)
+    binding, base = _made_binding(obj), base_of(obj)
     vertices = _evaluated(base, depsgraph, {base, obj} if is_tied(obj) else {base})
     if vertices is None:
         return False
@@ -168,7 +191,7 @@ def _move(obj: Any, depsgraph: Any) -> bool:
         )
     if not np.isfinite(vertices).all():
         raise ValueError("the base has vertices that are not finite")
-    moved = binding.moved(vertices, binding.lift)
+    moved = binding.posed(vertices)
     data = obj.data
     versions.set_positions(data, moved.positions())
     if meshes.NORMAL in data.attributes:

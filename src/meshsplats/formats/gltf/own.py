@@ -125,6 +125,8 @@ def _binding(document: GltfDocument, entry: dict[str, Any], v: int) -> Binding |
     }
     parts = {"lift": document.numbers([entry.get("lift")], 1, "lift of a binding")[0]}
     for field in Binding.FIELDS:
+        if field.optional and camel_case(field.name) not in entry:
+            continue
         stored = dict_or_empty(entry.get(camel_case(field.name)))
         values = _raw(document, stored, field.dtype, field.shape(counts))
         if values is None:

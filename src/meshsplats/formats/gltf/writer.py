@@ -348,7 +348,8 @@ def _binding(buffer: BinaryChunk, binding: Binding) -> dict[str, Any]:
         "baseVertexCount": len(binding.base_vertices),
         "baseFaceCount": len(binding.base_faces),
     }
-    return entry | {camel_case(f.name): _raw(buffer, getattr(binding, f.name)) for f in binding.FIELDS}
+    arrays = {n: values for n, values in binding.arrays().items() if n != "lift"}
+    return entry | {camel_case(name): _raw(buffer, values) for name, values in arrays.items()}
 
 
 def camel_case(name: str) -> str:
