@@ -143,6 +143,7 @@ class Converter:
             "splats": source.count,
             "converted": converted,
             "merged": False,
+            "look": product.look,
             "triangles": triangles,
             "vertices": vertices,
             "seconds": {"convert": round(time.perf_counter() - start, 4)},
