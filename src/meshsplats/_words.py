@@ -94,6 +94,11 @@ def legible(text: str) -> str:
     return _NO_CHARACTER.sub("\ufffd", text)
 
 
+def natural_key(name: str) -> list[int | str]:
+    """What names are sorted by for their natural order: ``view_2`` before ``view_10``."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
 def plural(count: int, noun: str, several: str = "") -> str:
     """``1 view``, ``1,200 views``; ``several``: the plural of a noun that has another one."""
     return f"{count:,} {noun if count == 1 else several or f'{noun}s'}"

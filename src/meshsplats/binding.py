@@ -157,7 +157,7 @@ class Binding:
     def base_normals(self) -> np.ndarray:
         """(n, 3) float64 unit normals of the base at its vertices, continuous across seams."""
         vertices = self.base_vertices.astype(np.float64)
-        return vertex_normals(vertices, self.base_faces, same_place=self._same_place)
+        return vertex_normals(vertices, self.base_faces, same_place=self.places)
 
     def _face_sides(self) -> tuple[np.ndarray, np.ndarray]:
         """Two sides of each of the base's faces, (m, 3) float64 vectors from its first corner."""
@@ -169,7 +169,7 @@ class Binding:
         return (slice(start, start + _ROWS) for start in range(0, len(self.weights), _ROWS))
 
     @cached_property
-    def _same_place(self) -> np.ndarray:
+    def places(self) -> np.ndarray:
         """(n,) index of a place for each vertex of the base: vertices that a seam has split share one.
 
         Found in the stored base, as vertices of a moved one may coincide by chance.
@@ -186,7 +186,7 @@ class Binding:
         ``stretch`` (n,), unless given."""
         stretch = self.stretch if stretch is None else stretch
         made = replace(self, base_vertices=base_vertices, lift=lift, stretch=stretch)
-        made.__dict__["_same_place"] = self._same_place
+        made.__dict__["places"] = self.places
         return made
 
     def posed(self, base_vertices: np.ndarray) -> Binding:
@@ -207,12 +207,12 @@ class Binding:
         order = np.argsort(factors)
         usual = factors[order[np.searchsorted(np.cumsum(before[order]), whole / 2)]]
         factors = np.minimum(factors, _MOST_STRETCH * max(usual, 1))
-        corners, count = self._same_place[self.base_faces].ravel(), len(self.base_vertices)
+        corners, count = self.places[self.base_faces].ravel(), len(self.base_vertices)
         area, stretched = (
             np.bincount(corners, np.repeat(values, 3), minlength=count)
             for values in (before, before * factors)
         )
-        local = np.divide(stretched, area, out=np.full(count, usual), where=area > 0)[self._same_place]
+        local = np.divide(stretched, area, out=np.full(count, usual), where=area > 0)[self.places]
         if np.abs(local - usual).max() <= _EVEN * usual:
             return self.moved(base_vertices, self.lift * float((before * factors).sum() / whole))
         stretch = local if self.stretch is None else local * self.stretch

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -127,6 +130,37 @@ def test_a_sequence_of_bases(scene, trained, tmp_path, capsys):
     assert heights[0] < heights[1] < heights[2]
     assert run("deform", trained, "--base", *bases, "-o", tmp_path / "walk.glb") == 3
     assert "walk_0001.glb" in capsys.readouterr().err
+
+
+def test_frames_are_in_the_order_of_their_numbers(scene, trained, tmp_path, capsys):
+    bases = [tmp_path / f"walk_{number}.obj" for number in (1, 10, 2)]
+    for source, path in zip((0, 2, 1), bases, strict=True):
+        shutil.copy(scene / f"moved{source}.obj", path)
+    assert run("deform", trained, "--base", *bases, "-o", tmp_path / "walk.npz", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [Path(base).name for base in printed["bases"]] == ["walk_1.obj", "walk_2.obj", "walk_10.obj"]
+    heights = [load_mesh(path).vertices[:, 2].max() for path in printed["files"]]
+    assert heights[0] < heights[1] < heights[2]
+    assert run("deform", trained, "--base", bases[1], bases[0], "-o", tmp_path / "w.npz", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["bases"] == [str(bases[1]), str(bases[0])]
+
+
+def test_axes_of_another_program(scene, trained, tmp_path, capsys):
+    prior, base = load_prior(trained), load_mesh(scene / "moved0.obj")
+    turned = replace(base, vertices=base.vertices[:, [0, 2, 1]] * np.float32([1, -1, 1]))
+    turned = replace(turned, up=prior.mesh.up[[0, 2, 1]] * np.float32([1, -1, 1]))
+    other = (tmp_path / "stated.ply", turned), (tmp_path / "bare.ply", replace(turned, up=prior.mesh.up))
+    for path, mesh in other:
+        save_mesh(mesh, path)
+        assert run("deform", trained, "--base", path, "-o", path.with_suffix(".npz")) == 0
+    said = capsys.readouterr().err
+    assert "its x, y, z are x, -z, y of the base" in said
+    assert "it is turned back" in said
+    assert "export it with the axes and units of its import" in said
+    found = load_mesh(tmp_path / "stated.npz")
+    np.testing.assert_allclose(found.vertices, prior.mesh.vertices, atol=1e-6)
+    kept = load_mesh(tmp_path / "bare.npz").vertices
+    np.testing.assert_allclose(kept[:, [0, 2, 1]] * (1, 1, -1), prior.mesh.vertices, atol=1e-6)
 
 
 def test_another_topology_writes_nothing(scene, trained, tmp_path, capsys):

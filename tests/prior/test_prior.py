@@ -19,6 +19,7 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
 from meshsplats.prior.laying import SHELLS_DEPTH
+from meshsplats.prior.matching import exchanged_axes, in_words
 from meshsplats.prior.options import LAYERS
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 
@@ -505,14 +506,47 @@ def test_another_topology_is_refused():
     with pytest.raises(ValueError, match="must be finite"):
         prior.pose(np.full((8, 3), np.nan))
     prior.check_topology(BaseMesh(CUBE * 3, CUBE_FACES))
-    with pytest.raises(ValueError, match=r"9 vertices and 12 triangles.*of 8 and 12.*move its vertices only"):
-        prior.check_topology(BaseMesh(np.concatenate([CUBE, CUBE[:1]]), CUBE_FACES))
+    with pytest.raises(ValueError, match=r"8 vertices and 11 triangles.*of 8 and 12.*move its vertices only"):
+        prior.check_topology(BaseMesh(CUBE, CUBE_FACES[1:]))
+    with pytest.raises(ValueError, match=r"9 vertices.*in another order"):
+        prior.check_topology(BaseMesh(np.concatenate([CUBE, CUBE[:1]]), CUBE_FACES[::-1]))
     changed = CUBE_FACES.copy()
-    changed[5] = changed[5, [1, 2, 0]]
+    changed[5] = changed[5, [1, 0, 2]]
     with pytest.raises(ValueError, match="1 of 12; the first is number 5"):
         prior.check_topology(BaseMesh(CUBE, changed))
     with pytest.raises(ValueError, match="bound to no base"):
         MeshPrior(replace(prior.mesh, binding=None))
+
+
+def test_exported_bases_are_matched():
+    base, prior = bumpy(4), bind(bumpy(4))
+    moved = base.vertices * (1, 2, 3)
+    split = BaseMesh(moved[base.faces].reshape(-1, 3), np.arange(base.faces.size).reshape(-1, 3))
+    turned = BaseMesh(moved, np.roll(base.faces[::-1], 1, axis=1))
+    for edited in (split, turned, BaseMesh(moved, base.faces)):
+        np.testing.assert_array_equal(prior.vertices_of(edited), moved.astype(np.float32))
+    # Split where the prior's base is, and whole again.
+    of_split = bind(BaseMesh(base.vertices[base.faces].reshape(-1, 3), split.faces))
+    np.testing.assert_array_equal(of_split.vertices_of(BaseMesh(moved, base.faces)), split.vertices)
+    other = BaseMesh(split.vertices, split.faces[::-1])
+    with pytest.raises(ValueError, match="in another order"):
+        prior.vertices_of(other)
+
+
+def test_exchanged_axes_are_found():
+    base = bumpy(4)
+    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    bent = base.vertices + 0.05 * np.sin(3 * base.vertices[:, [1, 2, 0]])
+    same, scale = exchanged_axes(base.vertices, bent)
+    assert (same == np.eye(3)).all()
+    assert scale == 1
+    found, scale = exchanged_axes(base.vertices, 100 * bent @ turn.T)
+    np.testing.assert_array_equal(found, turn)
+    assert in_words(found, scale) == (
+        "its x, y, z are x, -z, y of the base that the splats are bound to and it is 100 times as large"
+    )
+    for pose in (base.vertices * 2, base.vertices + 3, base.vertices * 0, base.vertices * (-1, 1, 1)):
+        assert in_words(*exchanged_axes(base.vertices, pose)) == ""
 
 
 def test_dropping_faces_keeps_the_binding_of_the_others():

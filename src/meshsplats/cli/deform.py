@@ -30,7 +30,7 @@ class Deform(Command):
     input: tyro.conf.Positional[Path]
     """The result of 'meshsplats prior': .npz or .glb."""
     base: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE...")]
-    """The edited base, or several: the same vertices and faces in the same order, at other positions."""
+    """The edited base, or several, by their numbers if in alphabetical order: its vertices, moved."""
     output: option.Output
     """The moved splats: .glb, .npz (both can be moved again), .ply, .usdc, .obj. With several bases, files
     are numbered: edited.glb becomes edited_0001.glb, edited_0002.glb ..."""
@@ -44,9 +44,9 @@ class Deform(Command):
 
     def execute(self) -> None:
         from meshsplats.formats.outputs import placed
-        from meshsplats.prior.planning import save_poses
+        from meshsplats.prior.planning import by_number, save_poses
 
-        start, count = time.perf_counter(), len(self.base)
+        start, count, bases = time.perf_counter(), len(self.base), by_number(self.base)
         if not self.base:
             raise UsageError("give the edited base with --base")
         triangles = 0
@@ -60,12 +60,13 @@ class Deform(Command):
 
         how: dict[str, Any] = {"lift": self.lift, "place": place, "force": self.force}
         shown = partial(track, label="moving")
-        files = save_poses(self.input, self.base, self.output, progress=shown, **how)
+        files = save_poses(self.input, bases, self.output, progress=shown, **how)
         seconds = time.perf_counter() - start
         more = f" to {files[-1]}" if count > 1 else ""
         made = f"{files[0]}{more} ({plural(triangles, 'triangle')}, {size_of(files[0])}):"
+        names = {"files": list(map(str, files)), "bases": list(map(str, bases))}
         self.finish(
-            {"files": list(map(str, files)), "triangles": triangles, "seconds": round(seconds, 3)},
+            names | {"triangles": triangles, "seconds": round(seconds, 3)},
             f"{made} {plural(count, 'pose')} in {seconds:.2f} s",
             indent=None,
         )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from meshsplats._words import natural_key
 from meshsplats.camera import Camera
 from meshsplats.datasets.image_files import is_hidden
 from meshsplats.evaluation.report import ImageAt, Report, ScoredView
@@ -77,7 +77,7 @@ def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> I
     if all(stem in by_name for stem in stems):
         chosen = [by_name[stem] for stem in stems]
     elif len(files) == len(cameras) and not any(stem in by_name for stem in stems):
-        chosen = sorted(files, key=_natural)
+        chosen = sorted(files, key=lambda path: natural_key(path.name))
     else:
         missing = [stem for stem in stems if stem not in by_name]
         raise FileNotFoundError(
@@ -172,7 +172,3 @@ def score_table(
         [scene, method, *("" if (v := values[i]) is None else f"{v:.{digits[i]}f}" for i in shown)]
         for scene, method, values in rows
     ]
-
-
-def _natural(path: Path) -> list[int | str]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

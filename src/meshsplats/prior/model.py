@@ -12,6 +12,7 @@ from meshsplats._arrays import checked_array
 from meshsplats._kinds import need, need_path
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.mesh import SplatMesh
+from meshsplats.prior.matching import matched_vertices
 
 LIFT = 2e-5
 """Distance between two layers of exported meshes, relative to the diagonal of the base's bounding box: enough
@@ -125,22 +126,18 @@ class MeshPrior:
         return self.mesh if Path(path).suffix.lower() == ".npz" else self.pose(lift=self.export_lift)
 
     def check_topology(self, base: BaseMesh) -> None:
-        """Raises ValueError unless ``base`` has the number of vertices and the triangles of this base."""
-        expected, found = self.base_faces, base.faces
-        counts = (len(self.base_vertices), len(expected)), (len(base.vertices), len(found))
-        advice = "move its vertices only, and export them in their order, as .obj and .ply do"
-        if counts[0] != counts[1]:
-            raise ValueError(
-                f"the edited base has {counts[1][0]:,} vertices and {counts[1][1]:,} triangles, the splats"
-                f" are bound to one of {counts[0][0]:,} and {counts[0][1]:,}: {advice}"
-            )
-        differ = (expected != found).any(axis=1)
-        if differ.any():
-            first = int(differ.argmax())
-            raise ValueError(
-                f"the edited base has other triangles ({int(differ.sum()):,} of {len(found):,}; the first is"
-                f" number {first}, {found[first].tolist()} instead of {expected[first].tolist()}): {advice}"
-            )
+        """Raises what ``vertices_of`` raises."""
+        self.vertices_of(base)
+
+    def vertices_of(self, base: BaseMesh) -> np.ndarray:
+        """(n, 3) float32 positions of this base's vertices in ``base``, an edited one as ``load_base`` reads
+        it: with the same vertices in the same order and the same triangles, or with the same triangles in the
+        same order, whose vertices an exporter has split at seams of a texture.
+
+        Raises ValueError for another base.
+        """
+        assert self.mesh.binding is not None
+        return matched_vertices(self.mesh.binding, base)
 
 
 def _mirror(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:

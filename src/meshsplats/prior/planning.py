@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from meshsplats._kinds import as_path
+from meshsplats._words import natural_key
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.views import Dataset
-from meshsplats.errors import OptionsError
+from meshsplats.errors import DataWarning, OptionsError
 from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
 from meshsplats.finetuning.config import FinetuneConfig, worthwhile_views
 from meshsplats.finetuning.plans import Plan, Trained, over_background
@@ -28,7 +30,8 @@ from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.laying import bind
-from meshsplats.prior.model import load_prior
+from meshsplats.prior.matching import exchanged_axes, in_words
+from meshsplats.prior.model import MeshPrior, load_prior
 from meshsplats.prior.options import LayingOptions
 from meshsplats.prior.training import train_prior
 
@@ -115,6 +118,14 @@ def pose_files(output: Path, count: int) -> list[Path]:
     return [output.with_name(f"{output.stem}_{i:0{width}d}{output.suffix}") for i in range(1, count + 1)]
 
 
+def by_number(bases: Sequence[Path]) -> list[Path]:
+    """The frames ``bases`` in natural order (2 before 10) where a shell has sorted them by their letters; any
+    other order stays."""
+    return (
+        sorted(bases, key=lambda path: natural_key(str(path))) if list(bases) == sorted(bases) else [*bases]
+    )
+
+
 def save_poses(
     source: str | os.PathLike[str],
     bases: Sequence[str | os.PathLike[str]],
@@ -135,8 +146,11 @@ def save_poses(
         force: replace files that are there.
         progress: shows the progress of poses, of which there are so many, and passes them on.
 
-    Raises, before anything is written, what ``check_outputs`` raises, and ValueError for a base with another
-    number of vertices or other triangles.
+    Where the first of the bases is that of the prior with other axes or units, a DataWarning says so. Axes
+    that bring the prior's ``up`` to what the file states are exchanged again.
+
+    Raises, before anything is written, what ``check_outputs`` raises, and ValueError for a base whose
+    vertices are not those of the prior (``MeshPrior.vertices_of``).
     """
     source, output = as_path("source", source), as_path("output", output)
     edited = [as_path(f"bases[{i}]", base) for i, base in enumerate(bases)]
@@ -145,15 +159,36 @@ def save_poses(
     check_outputs(targets, force, inputs=[source, *edited])
     prior = load_prior(source)
     loaded = [load_base(path, textures=False, origin=prior.mesh.origin) for path in edited]
+    poses = []
     for path, base in zip(edited, loaded, strict=True):
         try:
-            prior.check_topology(base)
+            poses.append(prior.vertices_of(base))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+    poses = _upright(prior, edited, loaded, poses)
     if lift is None and output.suffix.lower() != ".npz" and not prior.lift:
         lift = prior.export_lift
-    for base, target in progress(zip(loaded, targets, strict=True), len(targets)):
-        mesh = place(prior.pose(base.vertices, lift=lift))
+    for pose, target in progress(zip(poses, targets, strict=True), len(targets)):
+        mesh = place(prior.pose(pose, lift=lift))
         # Formats without a place for the binding would warn of it.
         save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)
     return targets
+
+
+def _upright(
+    prior: MeshPrior, paths: Sequence[Path], bases: Sequence[BaseMesh], poses: list[np.ndarray]
+) -> list[np.ndarray]:
+    """``poses``, (n, 3) each, of the ``bases`` in the files ``paths``, with their axes as in the prior."""
+    if not poses:
+        return poses
+    turn, scale = exchanged_axes(prior.base_vertices, poses[0])
+    stated = bases[0].up
+    # Poses move what is up, files do not: together with the stated one, the turn cannot be meant.
+    undone = bool(np.abs(turn @ prior.mesh.up - stated).max() < 1e-3) and not np.allclose(turn, np.eye(3))
+    advice = "unless you have turned or scaled it so, export it with the axes and units of its import"
+    if undone:
+        poses = [p @ turn if np.array_equal(b.up, stated) else p for p, b in zip(poses, bases, strict=True)]
+        advice = "as another axis points up in the file, too, it is turned back"
+    if said := in_words(turn, scale):
+        warnings.warn(f"{paths[0]}: {said}: {advice}", DataWarning, stacklevel=3)
+    return poses

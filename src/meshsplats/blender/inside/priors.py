@@ -133,7 +133,7 @@ def _made_binding(obj: Any) -> Binding:
     now = versions.positions(base.data)
     rest, stretch = (np.array(data.get(name, ()), np.float32) for name in (REST, STRETCH))
     if len(rest) != now.size:  # of an earlier release, or vertices were added
-        rest, stretch = now, np.empty(0)
+        rest, stretch = now, stretch[:0]
     return Binding(
         rest.reshape(-1, 3),
         corners.reshape(-1, 3),
