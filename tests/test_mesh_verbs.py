@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -12,7 +13,9 @@ from _rendering import splats
 
 from meshsplats import Camera, SplatMesh, convert, look_at, render
 from meshsplats.binding import ArrayField, Binding
+from meshsplats.errors import DataWarning
 from meshsplats.prior.laying import bind
+from meshsplats.prior.model import MeshPrior
 
 LENGTHS = (2, 3, 1, 4)
 """Triangles of four splats."""
@@ -216,7 +219,7 @@ def test_joined_meshes_far_apart_keep_their_detail():
         ({"blending": "linear"}, "the same blending: 'display' first, 'linear' in parts.1."),
         ({"filter_px2": 0.0}, "the same filter_px2: 0.3 first, 0.0 in parts.1."),
         ({"order": "splat"}, "the same order: 'fragment' first, 'splat' in parts.1."),
-        ({"up": (0, 0, 1)}, r"the same up: .* in parts.1."),
+        ({"up": (0, 0, 1)}, r"about the same up: .* in parts.1."),
         ({"normals": None}, "normals is 3 numbers wide first, missing in parts.1."),
         ({"attributes": {}}, "attribute 'flow' is 2 numbers wide first, missing in parts.1."),
         ({"shine": None}, "shine is 2 numbers wide first, missing in parts.1."),
@@ -225,6 +228,20 @@ def test_joined_meshes_far_apart_keep_their_detail():
 def test_meshes_that_differ_are_not_joined(changed, message):
     with pytest.raises(ValueError, match=message):
         SplatMesh.joined([fans(), fans(**changed)])
+
+
+def test_joined_meshes_may_be_tilted_and_of_other_degrees():
+    tilted = fans(up=(np.sin(0.3), -np.cos(0.3), 0))
+    np.testing.assert_array_equal(SplatMesh.joined([fans(), tilted]).up, fans().up)
+    harmonics = np.random.default_rng(0).random((len(fans().splats), 8, 3), np.float32)
+    parts = fans(), fans(harmonics=harmonics[:, :3]), fans(harmonics=harmonics)
+    joined = SplatMesh.joined(parts).harmonics
+    n = len(harmonics)
+    assert joined.shape == (3 * n, 8, 3)
+    assert not joined[:n].any()
+    np.testing.assert_array_equal(joined[n : 2 * n, :3], harmonics[:, :3])
+    assert not joined[n : 2 * n, 3:].any()
+    np.testing.assert_array_equal(joined[2 * n :], harmonics)
 
 
 def test_nothing_cannot_be_joined_and_one_mesh_is_itself():
@@ -359,7 +376,12 @@ def test_normals_base_and_corners_of_a_mirrored_mesh_stay_outside():
         return unit(np.cross(b - a, c - a))
 
     np.testing.assert_allclose(across(moved), across(mesh) * (-1, 1, 1), atol=1e-4)
-    assert mesh.transformed(np.diag([1.0, 2, 1])).binding is None
+    with pytest.warns(DataWarning, match=r"binding to a base is left out.*pose\(\)"):
+        assert mesh.transformed(np.diag([1.0, 2, 1])).binding is None
+    flattened = mesh.binding.base_vertices * np.float32([-1, 2, 1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert MeshPrior(mesh).pose(flattened).binding is not None
 
 
 @pytest.mark.parametrize(

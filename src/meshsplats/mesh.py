@@ -365,9 +365,10 @@ class SplatMesh:
     def joined(parts: Sequence[SplatMesh], *, same_splats: bool = False) -> SplatMesh:
         """One mesh of all ``parts``, at least one, vertices and triangles one part behind the other.
 
-        The parts must agree in ``blending``, ``filter_px2``, ``order``, ``up``, in their base, and in which
-        optional arrays and attributes they have; only ``depth_group`` and ``plain_colors`` may be missing in
-        some. Positions are relative to the first ``origin`` that is not zero. Depth groups stay apart.
+        The parts must agree in ``blending``, ``filter_px2``, ``order``, their base, and in which optional
+        arrays and attributes they have; only ``depth_group`` and ``plain_colors`` may be missing in some, and
+        harmonics, which are 0 then. ``up`` is the first's, from which others differ by less than 45 degrees.
+        Positions are relative to the first ``origin`` that is not zero. Depth groups stay apart.
 
         Args:
             parts: the meshes.
@@ -404,7 +405,7 @@ class SplatMesh:
         Concretely, a vertex v goes to A v + t, ``origin`` to A times it. Colours seen from direction d become
         those seen from U^T d, where U is the orthogonal factor of A, and ``up`` turns by U. A mirror reverses
         the order of the corners, so that normals stay outside. A binding to a base stays, but for one with
-        layers above it and a map that is no similarity.
+        layers above it and a map that is no similarity, of which a DataWarning says so.
 
         Args:
             matrix: (4, 4) [[A, t], [0, 1]], (3, 4) [A, t], or (3, 3) A.

@@ -10,9 +10,12 @@ import numpy as np
 
 from meshsplats._arrays import joined_rows
 from meshsplats._origin import shared_origin
+from meshsplats.spherical_harmonics import TERMS
 
 MAY_MISS = ("depth_group", "plain_colors")
 """Optional arrays that only some of the parts may have."""
+_TILT = 0.5**0.5
+"""Least cosine between what is up in meshes that are joined: other axes differ by 90 degrees or more."""
 Mesh = TypeVar("Mesh", bound=Any)
 """``SplatMesh``, which imports this module."""
 
@@ -21,6 +24,8 @@ def joined_meshes(parts: Sequence[Mesh], *, same_splats: bool = False) -> Mesh:
     """``SplatMesh.joined``."""
     if not parts:
         raise ValueError("there must be at least one mesh to join")
+    degree = max((part.sh_degree for part in parts), default=0)
+    parts = [_with_degree(part, degree) for part in parts]
     for number, part in enumerate(parts[1:], 1):
         check_alike(parts[0], part, f"parts[{number}]")
     origin = shared_origin(part.origin for part in parts)
@@ -63,10 +68,10 @@ def check_alike(mesh: Mesh, other: Mesh, name: str) -> None:
             raise ValueError(
                 f"meshes to be joined must have the same {what}: {own!r} first, {theirs!r} in {name}"
             )
-    if np.abs(mesh.up - other.up).max() > 1e-6:
+    if mesh.up @ other.up < _TILT:
         raise ValueError(
-            f"meshes to be joined must have the same up: {mesh.up.tolist()} first, {other.up.tolist()} in"
-            f" {name}; turn one, or give it the other's with replace(mesh, up=...)"
+            f"meshes to be joined must have about the same up: {mesh.up.tolist()} first,"
+            f" {other.up.tolist()} in {name}; turn one, or give it the other's with replace(mesh, up=...)"
         )
     one, two = ({part: tuple(shape) for part, shape in _optional(m).items()} for m in (mesh, other))
     for part in sorted(one.keys() | two.keys()):
@@ -76,6 +81,16 @@ def check_alike(mesh: Mesh, other: Mesh, name: str) -> None:
                 f" first, {_in_words(two.get(part))} in {name}; add it, or take it out, by"
                 " replace(mesh, ...)"
             )
+
+
+def _with_degree(mesh: Mesh, degree: int) -> Mesh:
+    """The mesh with harmonics of ``degree``, zeros where it has none; itself where there are no splats."""
+    if mesh.sh_degree == degree or mesh.face_splat is None:
+        return mesh
+    harmonics = np.zeros((mesh.splat_count, TERMS[degree - 1], 3), np.float32)
+    if mesh.harmonics is not None:
+        harmonics[:, : mesh.harmonics.shape[1]] = mesh.harmonics
+    return replace(mesh, harmonics=harmonics)
 
 
 def _optional(mesh: Mesh) -> dict[str, tuple[int, ...]]:

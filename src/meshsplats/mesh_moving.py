@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._geometry import affine_parts
+from meshsplats.errors import DataWarning
 from meshsplats.spherical_harmonics import moved_harmonics, turned_harmonics
 
 _ALIKE = 1e-6
@@ -48,6 +50,13 @@ def transformed_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
         similar = stretch[0] <= stretch[2] * (1 + _ALIKE)
         lift = binding.lift * float(stretch.mean()) * (-1 if mirrors else 1)
         kept = similar or not binding.lift
+        if not kept:
+            warnings.warn(
+                "the binding to a base is left out: its layers do not stay at right angles to a base that is"
+                " stretched; pose() poses them on one",
+                DataWarning,
+                stacklevel=3,
+            )
         binding = binding.moved(mapped(binding.base_vertices), lift) if kept else None
     return replace(
         mesh,

@@ -112,7 +112,7 @@ class MeshPrior:
         if mirror is None:
             return self.mesh.moved(posed.positions(), normals=normals, binding=posed)
         return replace(
-            self.mesh.transformed(mirror),
+            replace(self.mesh, binding=None).transformed(mirror),
             vertices=posed.positions(),
             normals=normals,
             binding=posed,
