@@ -72,7 +72,13 @@ def test_large_splats_are_named_before_they_are_read(tmp_path, monkeypatch):
         archive.extractall(folder)
     SceneReading().load(folder / "meta.json")
     size = sum(file.stat().st_size for file in folder.iterdir())
+    size -= (folder / "meta.json").stat().st_size
     assert told == [f"reading {size / 1000:.1f} kB"]
+    (folder / "holiday.mp4").write_bytes(bytes(5000))
+    (folder / "holiday").mkdir()
+    (folder / "holiday" / "beach.webp").write_bytes(bytes(5000))
+    SceneReading().load(folder / "meta.json")
+    assert told.pop() == told[0]
     broken.write_bytes(b"ply" + 600 * b" ")
     with pytest.raises(ms.FileFormatError):
         SceneReading().load(broken)

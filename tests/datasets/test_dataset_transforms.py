@@ -116,7 +116,7 @@ def test_images_to_train_with_are_not_held_out(tmp_path):
     own = json.loads((tmp_path / "transforms_test.json").read_text())
     train = json.loads((tmp_path / "transforms_train.json").read_text())
     write_json(tmp_path / "transforms_test.json", own | {"frames": own["frames"] + train["frames"]})
-    with pytest.warns(DataWarning, match=r"2 images are both .* not held out \(train/r_0, train/r_1\)"):
+    with pytest.warns(DataWarning, match=r"2 images listed both .* not held out \(train/r_0, train/r_1\)"):
         dataset = load_dataset(tmp_path)
     assert [view.name for view in dataset.train] == ["train/r_0", "train/r_1"]
     assert [view.name for view in dataset.test] == ["test/r_0"]
@@ -193,7 +193,7 @@ def test_lists_of_the_file_that_do_not_match_are_named_or_refused(tmp_path):
     lists["test_filenames"] = ["f3.png", *names[2:]]
     with (
         pytest.warns(DataWarning, match="1 of 4 names in 'test_filenames' are of no image"),
-        pytest.warns(DataWarning, match=r"1 images are both .* not held out \(images/f2\.png\)"),
+        pytest.warns(DataWarning, match=r"1 image listed both .* not held out \(images/f2\.png\)"),
     ):
         dataset = load_dataset(studio(tmp_path, 5, **lists))
     assert [view.name for view in dataset.train] == names[:3]

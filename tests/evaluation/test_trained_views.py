@@ -115,7 +115,8 @@ def test_what_a_mesh_was_made_from_counts(tmp_path):
         (model / "cfg_args").write_text("Namespace(eval=False, source_path='/x/data')")
         with pytest.warns(DataWarning, match=r"2 of the 2 views, as .*cfg_args says \(eval = False\)$"):
             seen(path, data, 8)
-    for source in ("small.npz", "point_cloud/iteration_7/\0"):  # a circle, and no name of a file
+    # A circle, and no names of a file.
+    for source in ("small.npz", "point_cloud/iteration_7/\0", 300 * "a", 2000 * "a/"):
         record(tmp_path / "mesh.npz", "convert", input=source)
         assert seen(mesh, data) is None
 
@@ -184,6 +185,16 @@ def test_cameras_of_the_training_tell_its_size(tmp_path):
     save_cameras([view.camera.scaled(200) for view in data.views], tmp_path / "cameras.json")
     with pytest.warns(DataWarning, match="images 1600 pixels wide"):  # the most that the 3DGS code takes
         assert find_trained_width(tmp_path, data, 1) == 1600
+
+
+def test_upright_photographs_among_others_are_of_no_other_size(tmp_path):
+    data = load_dataset(simple_colmap(tmp_path / "data", 3))
+    (tmp_path / "cfg_args").write_text("Namespace(resolution=-1)")
+    cameras = [replace(view.camera, width=8 + 4 * (view in data.train)) for view in data.views]
+    views = [replace(view, camera=camera) for view, camera in zip(data.views, cameras, strict=True)]
+    mixed = replace(data, train=tuple(views[:2]), test=tuple(views[2:]))
+    save_cameras(cameras, tmp_path / "cameras.json")
+    assert find_trained_width(tmp_path, mixed, 1) is None
 
 
 def test_the_size_of_the_training_is_below_the_table(scene, tmp_path):

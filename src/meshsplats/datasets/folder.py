@@ -14,6 +14,7 @@ import numpy as np
 from meshsplats._foreign import what_it_is
 from meshsplats._kinds import need_path
 from meshsplats._origin import choose_origin
+from meshsplats._words import plural
 from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.colmap import read_model
 from meshsplats.datasets.image_files import Album, Frame, Taken, first_names, split
@@ -115,7 +116,7 @@ def _apart(where: Path, train: list[Taken], test: list[Taken]) -> Views:
     if any(learned):
         both = [views[0][1].name for views in _members(test, learned)]
         warnings.warn(
-            f"{where}: {len(both)} images are both to train and to test with: they are trained on, and not"
+            f"{where}: {plural(len(both), 'image')} listed both to train and to test with: trained on, not"
             f" held out ({first_names(both)})",
             DataWarning,
             stacklevel=2,

@@ -35,9 +35,10 @@ LARGE_BYTES = 50_000_000
 
 
 def _bytes_of(path: Path) -> int:
-    """Size of the file ``path``, or of all files of the SOG whose meta.json it is; 0 for a folder."""
-    if path.name.endswith("meta.json"):
-        return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+    """Size of the file ``path``, or of the images of the SOG whose meta.json it is; 0 for a folder."""
+    # By pattern: what else is in the folder, such as a user's downloads, does not count.
+    if images := {"meta.json": "*.webp", "lod-meta.json": "*/*.webp"}.get(path.name):
+        return sum(file.stat().st_size for file in path.parent.glob(images) if file.is_file())
     return path.stat().st_size if path.is_file() else 0
 
 

@@ -210,14 +210,14 @@ def model_settings(path: str | os.PathLike[str]) -> tuple[Path, str] | None:
     """The ``cfg_args`` of the 3DGS code and their text, for a model folder ``path`` or the one that the splat
     file ``path`` is in. None if they are not there."""
     path = Path(path)
-    folders = [path] if path.is_dir() else []
+    folders = [path]
     if path.parent.name.startswith("iteration_") and path.parent.parent.name == "point_cloud":
         folders.append(path.parent.parent.parent)
     for folder in folders:
         try:
             with open(folder / "cfg_args", "rb") as file:
                 return folder / "cfg_args", file.read(_MAX_BYTES).decode("utf-8", "replace")
-        except (OSError, ValueError):  # of a name that no file can have
+        except (OSError, ValueError):  # none there, or a name that no file can have
             continue
     return None
 

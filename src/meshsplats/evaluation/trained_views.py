@@ -103,7 +103,8 @@ def find_trained_width(scene: Path, dataset: Dataset, downscale: int) -> int | N
     if not found or not resolution:
         return None
     record, text = found
-    scored = float(np.median([view.camera.width for view in dataset.test or dataset.views]))
+    # Of all views, as in the model folder: some may be upright, and the held-out ones chance to be.
+    scored = float(np.median([view.camera.width for view in dataset.views]))
     width = scored * downscale
     with suppress(OSError, ValueError):
         width = float(np.median([camera.width for camera in load_cameras(record.with_name(CAMERAS))]))
