@@ -788,6 +788,30 @@ def test_a_lost_graphics_device_is_waited_for(page):
     assert np.array_equal(page.screenshot(), image)
 
 
+def test_a_device_that_is_lost_before_the_first_image_is_waited_for(browser, url):
+    """And one that is lost again as soon as it is back."""
+    losing = """
+    const get = HTMLCanvasElement.prototype.getContext;
+    HTMLCanvasElement.prototype.getContext = function (...words) {
+      const context = get.apply(this, words);
+      window.times = (window.times ?? 0) + 1;
+      window.loss ??= context.getExtension("WEBGL_lose_context");
+      if (times <= 2) loss.loseContext();
+      return context;
+    };
+    """
+    page = browser.page(url, WIDTH, HEIGHT, before=NO_WEBGPU + losing)
+    for times in (1, 2):
+        page.wait(f"window.times === {times} && document.body.dataset.state === 'lost'", PATIENCE)
+        page.run("new Promise(done => setTimeout(done, 100)).then(() => loss.restoreContext())")
+    page.wait("window.times === 3")
+    page.still(PATIENCE)
+    assert page.run("document.querySelector('#message').hidden")
+    assert np.ptp(page.screenshot()[:, : WIDTH // 2]) > 100  # a scene
+    assert page.problems() == []
+    page.close()
+
+
 def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):
     """Meshes bit for bit, with and without fans; splats nearly."""
     page = browser.page("about:blank#decoding", WIDTH, HEIGHT)

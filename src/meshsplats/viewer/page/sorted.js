@@ -287,7 +287,7 @@ function program(gl, vertex, fragment) {
     gl.attachShader(id, shader);
   }
   gl.linkProgram(id);
-  if (!gl.getProgramParameter(id, gl.LINK_STATUS)) {
+  if (!gl.getProgramParameter(id, gl.LINK_STATUS) && !gl.isContextLost()) { // else there is nothing to tell
     const logs = gl.getAttachedShaders(id).map(shader => gl.getShaderInfoLog(shader));
     throw new Error(`a shader does not compile: ${[...logs, gl.getProgramInfoLog(id)].join(" ")}`);
   }
