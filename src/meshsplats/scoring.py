@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ from meshsplats.evaluation.results import (
     save_report,
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names
-from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width
+from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width, warn_of_trained_on
 from meshsplats.file_options import ScoringOptions
 from meshsplats.finetuning.candidates import tuned_candidates
 from meshsplats.finetuning.targets import Targets
@@ -182,6 +182,7 @@ class Scoring:
         if self.options.downscale is not None:
             downscale = self.options.downscale
 
+        @cache
         def load(test_every: int) -> Dataset:
             missing = self.options.missing
             return load_dataset(data, downscale=downscale, test_every=test_every, missing=missing)
@@ -190,6 +191,7 @@ class Scoring:
         paths = [*meshes, *([] if splats is None else [splats])]
         found = {str(path): find_trained_on(path, dataset, test_every, load) for path in paths}
         if trained_on := {path: views for path, views in found.items() if views is not None}:
+            warn_of_trained_on(trained_on)
             about["held_out"] = False if any(views.sure for views in trained_on.values()) else None
             about["trained_on"] = {path: views.in_words() for path, views in trained_on.items()}
         if splats is not None and (width := find_trained_width(splats, dataset, downscale)) is not None:

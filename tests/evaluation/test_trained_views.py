@@ -22,7 +22,7 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
-from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width
+from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width, warn_of_trained_on
 from meshsplats.file_options import ScoringOptions
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
@@ -42,7 +42,10 @@ def record(path: Path, command: str, **options: object) -> Path:
 
 def seen(scene: Path, data: Path, test_every: int = 4):
     load = partial(load_dataset, data)
-    return find_trained_on(scene, load(test_every=test_every), test_every, lambda n: load(test_every=n))
+    found = find_trained_on(scene, load(test_every=test_every), test_every, lambda n: load(test_every=n))
+    if found is not None:
+        warn_of_trained_on({scene.name: found})
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +145,22 @@ def test_scores_of_a_mesh_that_was_trained_on_the_views_say_so_everywhere(scene,
     (text,) = saved["trained_on"].values()
     assert text.startswith("3 of the 3 views, as ")
     assert f"Not held out: {files / 'mesh.npz'} was trained on {text}." in table
+
+
+def test_one_warning_names_all_that_one_training_made(scene, tmp_path):
+    """The splats of a model folder, and the mesh that was converted from them."""
+    files = shutil.copytree(scene, tmp_path / "files")
+    splats = files / "model" / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    splats.parent.mkdir(parents=True)
+    save_gaussians(make_scene(200), splats)
+    (files / "model" / "cfg_args").write_text("Namespace(eval=False, source_path='/x/train')")
+    record(files / "mesh.npz", "convert", input=[str(splats)])
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        _, table, saved = scored(files, tmp_path / "out", splats=files / "model")
+    (said,) = [str(one.message) for one in warned if "trained on" in str(one.message)]
+    assert f"mesh.npz, {files / 'model'} are scored on views that they were trained on: 1 of the 1" in said
+    assert len(saved["trained_on"]) == table.count("Not held out: ") == 2
 
 
 @pytest.mark.filterwarnings("ignore:Tanks and Temples. scene truck is left out")

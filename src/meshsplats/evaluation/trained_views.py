@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +68,7 @@ def find_trained_on(
     scene: Path, dataset: Dataset, test_every: int, load: Callable[[int], Dataset]
 ) -> TrainedOn | None:
     """The held-out views of ``dataset`` that the mesh or splats at ``scene``, or what these were made from,
-    were trained on; None if no record says so. A DataWarning tells of them.
+    were trained on; None if no record says so.
 
     ``test_every``: the split of ``dataset``, which ``load`` reads with another one.
     """
@@ -84,14 +84,18 @@ def find_trained_on(
         if learned:
             there = training.record.parent / training.photographs.replace("\\", "/")
             sure = bool(training.photographs) and Path(os.path.abspath(there)).name == dataset.name
-            found = TrainedOn(len(learned), len(scored), training, sure)
-            warnings.warn(
-                f"{scene} is scored on views that it was trained on: {found.in_words()}",
-                DataWarning,
-                stacklevel=2,
-            )
-            return found
+            return TrainedOn(len(learned), len(scored), training, sure)
     return None
+
+
+def warn_of_trained_on(found: Mapping[str, TrainedOn]) -> None:
+    """A DataWarning of the views that scenes, by name, were trained on: one for all of the same training."""
+    scenes: dict[str, list[str]] = {}
+    for name, views in found.items():
+        scenes.setdefault(views.in_words(), []).append(name)
+    for text, names in scenes.items():
+        what = "is scored on views that it was" if len(names) == 1 else "are scored on views that they were"
+        warnings.warn(f"{', '.join(names)} {what} trained on: {text}", DataWarning, stacklevel=2)
 
 
 def find_trained_width(scene: Path, dataset: Dataset, downscale: int) -> int | None:
