@@ -57,6 +57,16 @@ def test_a_list_of_test_images_is_followed(tmp_path):
     assert [view.name for view in dataset.train] == ["p00.png", "p02.png", "p04.png"]
 
 
+@pytest.mark.parametrize("listed", ["p03.small", "p03.small.png", "p03.small.JPG"])
+def test_names_in_a_list_of_test_images_may_have_dots(tmp_path, listed):
+    folder = simple_colmap(tmp_path, 5, text=True)
+    (folder / "images/p03.png").rename(folder / "images/p03.small.png")
+    images = folder / "sparse/0/images.txt"
+    images.write_text(images.read_text().replace("p03.png", "p03.small.png"))
+    (folder / "sparse/0/test.txt").write_text(f"{listed}\n")
+    assert [view.name for view in load_dataset(folder).test] == ["p03.small.png"]
+
+
 def test_a_list_of_test_images_that_does_not_match_is_named_or_refused(tmp_path):
     folder = simple_colmap(tmp_path, 5)
     listed = folder / "sparse/0/test.txt"

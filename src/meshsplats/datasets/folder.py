@@ -69,7 +69,9 @@ def _colmap(layout: Layout, album: Album, test_every: int) -> Views:
     if chosen is None:
         return _views(*split(_taken(frames, model, album), test_every))
     stems = [_stem(frame.name) for frame in frames]
-    chosen = {_stem(name) for name in chosen}
+    known = set(stems)
+    # The 3DGS code lists names without suffixes, which may have dots.
+    chosen = {name if name in known else _stem(name) for name in chosen}
     _check_names(model, "test.txt", chosen, stems)
     taken = _taken(frames, model, album)
     train, test = (_members(taken, [(stem in chosen) is held for stem in stems]) for held in (False, True))
