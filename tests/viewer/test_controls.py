@@ -745,6 +745,17 @@ def test_a_page_whose_script_does_not_run_says_so(browser, write_page, mesh):
     assert spoken(page) == "This page draws its scene with JavaScript, which is switched off."
 
 
+@pytest.mark.parametrize("name", ["settings", "mesh", "splats"])
+def test_a_page_of_which_the_end_is_missing_says_so(browser, url, tmp_path, name):
+    text = text_of(url)
+    file = tmp_path / "cut.html"
+    file.write_text(text[: text.index(block(text, name)) + 100], encoding="utf-8")
+    page = browser.page(file.as_uri(), WIDTH, HEIGHT)
+    page.wait("document.body.dataset.state === 'failed'", PATIENCE)
+    assert page.text("#messageText") == "This page is incomplete: its download was cut off. Load it again."
+    page.close()
+
+
 def test_a_page_that_comes_slowly_says_that_it_is_loading(browser, write_page, mesh):
     text, rest = text_of(write_page(mesh, "slow")), threading.Event()
     half = text.index(block(text, "mesh")) + 1000

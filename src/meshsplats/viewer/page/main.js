@@ -5,6 +5,7 @@ import { decodeMesh, decodeSplats, decodeSurface, unpack } from "./scene.js";
 import { element, say } from "./status.js";
 
 async function main() {
+  if (!element("end")) throw new Error("This page is incomplete: its download was cut off. Load it again.");
   element("doing").textContent = "Unpacking the scene";
   const text = id => element(id)?.textContent.trim();
   const settings = JSON.parse(text("settings"));
