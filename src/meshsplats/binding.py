@@ -159,9 +159,9 @@ class Binding:
         vertices = self.base_vertices.astype(np.float64)
         return vertex_normals(vertices, self.base_faces, same_place=self.places)
 
-    def _face_sides(self) -> tuple[np.ndarray, np.ndarray]:
+    def _face_sides(self, base_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Two sides of each of the base's faces, (m, 3) float64 vectors from its first corner."""
-        a, b, c = (self.base_vertices[self.base_faces[:, k]].astype(np.float64) for k in range(3))
+        a, b, c = (base_vertices[self.base_faces[:, k]].astype(np.float64) for k in range(3))
         return b - a, c - a
 
     def _parts(self) -> Iterator[slice]:
@@ -197,12 +197,13 @@ class Binding:
         their two principal stretches, of which the larger counts as twice the smaller at most. Where nothing
         is stretched the distance stays. A base that is scaled as a whole changes ``lift`` alone.
         """
-        made = self.moved(base_vertices, self.lift)
-        old, new = self._face_sides(), made._face_sides()
+        if not self.lift:
+            return self.moved(base_vertices, self.lift)
+        old, new = self._face_sides(self.base_vertices), self._face_sides(base_vertices)
         before, after = (np.linalg.norm(np.cross(*sides), axis=1) for sides in (old, new))
         whole = before.sum()
-        if not self.lift or not whole:
-            return made
+        if not whole:
+            return self.moved(base_vertices, self.lift)
         factors = _stretches(old, new, before, after)
         order = np.argsort(factors)
         usual = factors[order[np.searchsorted(np.cumsum(before[order]), whole / 2)]]
@@ -254,11 +255,16 @@ def _stretches(
     def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.einsum("ij,ij->i", a, b)
 
-    product = np.divide(after, before, out=np.ones_like(before), where=before > 0)
-    squares = dot(new[0], new[0]) * dot(old[1], old[1]) + dot(new[1], new[1]) * dot(old[0], old[0])
-    squares -= 2 * dot(*new) * dot(*old)
-    half = np.divide(squares, 2 * before**2, out=np.ones_like(before), where=before > 0)
-    larger = np.sqrt(half + np.sqrt(np.maximum(half**2 - product**2, 0)))
+    def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.divide(a, b, out=np.ones_like(b), where=before > 0)
+
+    # Along the first side and across it, not by the metrics of both: these cancel out in slivers.
+    first = dot(old[0], old[0])
+    across = new[1] - ratio(dot(*old), first)[:, None] * new[0]
+    product = ratio(after, before)
+    squares = ratio(dot(new[0], new[0]), first), ratio(ratio(dot(across, across), before) * first, before)
+    half = np.maximum(sum(squares) / 2, product)  # it is, up to rounding
+    larger = np.sqrt(half + np.sqrt((half - product) * (half + product)))
     smaller = np.divide(product, larger, out=np.zeros_like(larger), where=larger > 0)
     return np.minimum(np.sqrt(product), 2**0.5 * smaller)
 

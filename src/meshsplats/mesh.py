@@ -405,7 +405,7 @@ class SplatMesh:
         Concretely, a vertex v goes to A v + t, ``origin`` to A times it. Colours seen from direction d become
         those seen from U^T d, where U is the orthogonal factor of A, and ``up`` turns by U. A mirror reverses
         the order of the corners, so that normals stay outside. A binding to a base stays, but for one with
-        layers above it and a map that is no similarity, of which a DataWarning says so.
+        layers above it and a map that is no similarity; a DataWarning says so.
 
         Args:
             matrix: (4, 4) [[A, t], [0, 1]], (3, 4) [A, t], or (3, 3) A.

@@ -351,6 +351,20 @@ def test_shading_can_be_changed_and_it_still_follows(placed):
         assert_follows(obj, prior, moved)
 
 
+def test_a_stretch_ends_with_the_splats_that_had_it():
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    prior = bind(sheet(), triangles=4, layers=2, spacing=-0.05)
+    moved = prior.base_vertices.copy()
+    moved[moved[:, 0] > 0.5] *= np.float32([2, 3, 1])
+    stretched = objects.prepare(prior.pose(moved), False)
+    obj = objects.add(stretched, "prior", bpy.context.collection)
+    priors.base_of(obj).data.vertices.foreach_set("co", prior.base_vertices.ravel())
+    objects.replace_mesh(obj, objects.prepare(prior.mesh, False))
+    assert priors.binding_of(obj).stretch is None
+    priors.follow([obj], bpy.context.evaluated_depsgraph_get())
+    np.testing.assert_allclose(places(obj), prior.mesh.vertices, atol=1e-6)
+
+
 def test_images_are_those_of_the_posed_mesh(tmp_path, placed):
     """Cycles draws the followed splats as it draws the mesh that ``pose`` makes."""
     obj, base, prior = placed

@@ -479,6 +479,24 @@ def test_a_vertex_that_flies_off_leaves_the_shells_of_others():
     assert np.ptp(long.vertices[:, 2]) == pytest.approx(0.1 * 2**0.5, rel=1e-5)
 
 
+def test_slivers_keep_the_shells_around_them():
+    """However thin, and however large they become."""
+    rng = np.random.default_rng(7)
+    for _ in range(300):
+        start, along = rng.normal(size=(2, 3)).astype(np.float32)
+        line = start + along * np.float32([[0], [1], [0.37], [1.7]])
+        binding = Binding(line, [[0, 1, 2], [1, 2, 3]], [0] * 3, np.eye(3), [1] * 3, 0.01)
+        same = binding.posed(line)
+        assert same.stretch is None
+        assert same.lift == pytest.approx(0.01, rel=1e-6)
+    flat = np.float32([[0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0], [0, 1, 0]])
+    binding = Binding(flat, [[0, 1, 2], [0, 2, 3]], [0] * 3, np.eye(3), [1] * 3, 0.01)
+    np.testing.assert_array_equal(binding.posed(flat).positions(), binding.positions())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isfinite(replace(binding, base_vertices=flat * 1e-20).posed(flat * 1e20).lift)
+
+
 @pytest.mark.parametrize("lift", [None, -0.05])
 def test_shells_of_a_mirrored_base_stay_on_their_side(lift):
     base, mirror = cube(), np.array([-1, 1, 1], np.float32)

@@ -50,6 +50,8 @@ def store(data: Any, binding: Binding) -> None:
     data[REST] = binding.base_vertices.ravel()
     if binding.stretch is not None:
         data[STRETCH] = binding.stretch
+    elif STRETCH in data:  # of splats that these are made onto
+        del data[STRETCH]
 
 
 def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
