@@ -157,6 +157,10 @@ def test_axes_of_another_program(scene, trained, tmp_path, capsys):
     assert "its x, y, z are x, -z, y of the base" in said
     assert "it is turned back" in said
     assert "export it with the axes and units of its import" in said
+    assert "scaled:" not in said
+    save_mesh(replace(turned, vertices=100 * turned.vertices), tmp_path / "large.ply")
+    assert run("deform", trained, "--base", tmp_path / "large.ply", "-o", tmp_path / "large.npz") == 0
+    assert "it is turned back, but not scaled: export it with the units" in capsys.readouterr().err
     found = load_mesh(tmp_path / "stated.npz")
     np.testing.assert_allclose(found.vertices, prior.mesh.vertices, atol=1e-6)
     kept = load_mesh(tmp_path / "bare.npz").vertices

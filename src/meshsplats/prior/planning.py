@@ -189,6 +189,7 @@ def _upright(
     if undone:
         poses = [p @ turn if np.array_equal(b.up, stated) else p for p, b in zip(poses, bases, strict=True)]
         advice = "as another axis points up in the file, too, it is turned back"
+        advice += ", but not scaled: export it with the units of its import" if scale != 1 else ""
     if said := in_words(turn, scale):
         warnings.warn(f"{paths[0]}: {said}: {advice}", DataWarning, stacklevel=3)
     return poses
