@@ -249,8 +249,9 @@ def test_info_on_data_sets(tmp_path, capsys):
     assert printed(colmap)["points"] == 3
     (model / "points3D.bin").write_bytes((1 << 60).to_bytes(8, "little"))
     assert "points" not in printed(colmap)
-    (model / "test.txt").write_text("nothing\n")
-    assert printed(colmap)["split"] == "the data set's own"
+    (model / "test.txt").write_text("p00\n")
+    found = printed(colmap)
+    assert (found["held_out_views"], found["split"]) == (1, "the data set's own")
 
     cameras = orbit(make_scene(200), 3, width=16, height=16)
     images = [np.concatenate([np.zeros((16, 16, 3)), np.full((16, 16, 1), 0.5)], axis=2)] * 3
