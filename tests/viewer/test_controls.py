@@ -564,6 +564,7 @@ def test_the_panel_closes_and_everything_can_be_hidden(browser, url):
     page.close()
 
 
+@pytest.mark.slow
 def test_windows_that_the_settings_would_fill_begin_without_them(browser, url):
     page = open_page(browser, url, 700, 500)
     assert page.run("document.querySelector('#panel').classList.contains('closed')")
@@ -571,6 +572,7 @@ def test_windows_that_the_settings_would_fill_begin_without_them(browser, url):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_page_without_controls_shows_the_scene_alone_until_h(browser, write_page, mesh, tmp_path):
     address = write_page(mesh, "without-controls", options=PageOptions(controls=False))
     page = open_page(browser, address, 360, 240)
@@ -756,6 +758,7 @@ def test_a_page_of_which_the_end_is_missing_says_so(browser, url, tmp_path, name
     page.close()
 
 
+@pytest.mark.slow
 def test_a_page_that_comes_slowly_says_that_it_is_loading(browser, write_page, mesh):
     text, rest = text_of(write_page(mesh, "slow")), threading.Event()
     half = text.index(block(text, "mesh")) + 1000
@@ -799,6 +802,7 @@ def test_a_lost_graphics_device_is_waited_for(page):
     assert np.array_equal(page.screenshot(), image)
 
 
+@pytest.mark.slow
 def test_a_device_that_is_lost_before_the_first_image_is_waited_for(browser, url):
     """And one that is lost again as soon as it is back."""
     losing = """
