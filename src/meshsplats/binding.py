@@ -96,8 +96,12 @@ class Binding:
         object.__setattr__(self, "lift", float(self.lift))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All arrays by name but those that are None, and ``lift`` as an array without dimensions."""
-        values = {f.name: getattr(self, f.name) for f in self.FIELDS} | {"lift": np.array(self.lift)}
+        """``given_fields``, and ``lift`` as an array without dimensions."""
+        return self.given_fields() | {"lift": np.array(self.lift)}
+
+    def given_fields(self) -> dict[str, np.ndarray]:
+        """The arrays ``FIELDS`` by name, but those that are None."""
+        values = {f.name: getattr(self, f.name) for f in self.FIELDS}
         return {name: value for name, value in values.items() if value is not None}
 
     @classmethod

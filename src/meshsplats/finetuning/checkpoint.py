@@ -189,7 +189,7 @@ def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
         digest.update(mesh.origin.tobytes())
     arrays = [mesh.vertices, mesh.faces, mesh.colors]
     if mesh.binding is not None:
-        arrays += [values for name, values in mesh.binding.arrays().items() if name != "lift"]
+        arrays += mesh.binding.given_fields().values()
     if mesh.harmonics is not None:
         arrays.append(mesh.harmonics)
     if frozen is not None:

@@ -348,8 +348,8 @@ def _binding(buffer: BinaryChunk, binding: Binding) -> dict[str, Any]:
         "baseVertexCount": len(binding.base_vertices),
         "baseFaceCount": len(binding.base_faces),
     }
-    arrays = {n: values for n, values in binding.arrays().items() if n != "lift"}
-    return entry | {camel_case(name): _raw(buffer, values) for name, values in arrays.items()}
+    arrays = binding.given_fields().items()
+    return entry | {camel_case(name): _raw(buffer, values) for name, values in arrays}
 
 
 def camel_case(name: str) -> str:
