@@ -14,6 +14,7 @@ from typing import Any
 
 from meshsplats._files.atomic import replace_folder, write_json
 from meshsplats._kinds import as_path
+from meshsplats.conversion.gaps import without_gaps
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.level_tables import TABLE, load_table
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
@@ -107,7 +108,7 @@ def make_chain(
     Returns the table of ``levels.json``.
 
     Args:
-        cloud: the splats.
+        cloud: the splats, which become larger if gaps would show between them (DataWarning).
         folder: where the chain appears when all its levels are done.
         options: of the meshes and files.
         config: of the fine-tuning of each level; None: converted only.
@@ -122,6 +123,7 @@ def make_chain(
     _older_levels(folder)  # an error before the work
     chosen, unfinished = options or ChainOptions(), partial_folder(folder)
     chain = planned(chosen, len(cloud))
+    cloud = without_gaps(cloud, chosen.threads)
     unfinished.mkdir(exist_ok=True)
     rows, records = [], []
     splats, waiting = cloud, list[Level]()  # splats that are merged further, and for which levels

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshsplats.cli import main
-from meshsplats.conversion.gaps import gap_share, with_usual_look
+from meshsplats.conversion.gaps import gap_share, with_usual_look, without_gaps
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
@@ -74,3 +74,27 @@ def test_programs_that_make_a_first_image_take_it(tmp_path, monkeypatch, capsys)
     with pytest.warns(DataWarning, match="gaps between them"):
         content = content_of_splats(wall(0.3))
     np.testing.assert_allclose(content.mesh.vertices, sizes["fine"], atol=1e-4)
+
+
+def test_splats_that_are_optimised_close_their_gaps():
+    with pytest.warns(DataWarning, match=r"images of 1000 pixels, hint$"):
+        closed = without_gaps(wall(0.3), hint=", hint")
+    added = closed.scales.astype(np.float64) ** 2 - 0.3**2
+    assert added.min() > 0
+    np.testing.assert_allclose(added, np.broadcast_to(added[:, :1], added.shape), rtol=1e-4)
+    plain = wall(0.6)
+    assert without_gaps(plain) is plain
+
+
+def test_fine_tuning_begins_without_gaps_unless_a_look_is_chosen(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_gaussians(wall(0.3, 20), "fine.ply")
+    monkeypatch.setattr("meshsplats.conversion.gaps.SIDE", 40)
+    brief = ["finetune", "fine.ply", "--steps", "1", "--views", "2", "--held-out", "1", "--width", "32"]
+    for name, options in (("closed.npz", []), ("area.npz", ["--look", "area"])):
+        assert main([*brief, "-o", name, *options]) == 0
+        assert ("(--look area leaves them as they are)" in capsys.readouterr().err) == (not options)
+    extents = [np.ptp(np.load(name)["vertices"], axis=0).max() for name in ("closed.npz", "area.npz")]
+    assert extents[0] > extents[1]
+    assert main(["levels", "fine.ply", "-o", "chain", "--no-tune", "--levels", "1", "--width", "40"]) == 0
+    assert "gaps between them" in capsys.readouterr().err

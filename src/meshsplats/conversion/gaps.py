@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2
+from meshsplats.cameras.framing import guess_up
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, SceneSample, SceneViews, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
@@ -64,10 +65,26 @@ def with_usual_look(
         return options
     if gap_share(cloud, threads) < _SHARE:
         return options
+    _warn(" (``look`` splats; ``look`` area leaves them as they are)" * named)
+    return replace(options, look="splats")
+
+
+def without_gaps(cloud: GaussianCloud, threads: int | None = None, hint: str = "") -> GaussianCloud:
+    """``cloud``, with a DataWarning that ends in ``hint`` and each splat as large as a splat viewer shows it
+    where gaps would show (``gap_share``): what a mesh that is optimised on their images begins from."""
+    if gap_share(cloud, threads) < _SHARE:
+        return cloud
+    _warn(hint)
+    framing = ConversionOptions(footprint="framing")
+    views = SceneViews(SceneSample.of(cloud), framing, None, guess_up(cloud), whole=True)
+    pixel = views.pixel_sizes(cloud.means)
+    return replace(cloud, scales=widen(cloud.scales, pixel, DRAWN_PX2, "3dgs"))
+
+
+def _warn(hint: str) -> None:
     warnings.warn(
         "the splats are smaller than the gaps between them; each becomes as large as a splat viewer shows it"
-        " in images of 1000 pixels" + (" (``look`` splats; ``look`` area leaves them as they are)" * named),
+        f" in images of 1000 pixels{hint}",
         DataWarning,
-        stacklevel=2,
+        stacklevel=3,
     )
-    return replace(options, look="splats")

@@ -13,6 +13,7 @@ from meshsplats._words import plural
 from meshsplats.choices import Device
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.gaps import without_gaps
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.views import Dataset, ViewImage
@@ -110,7 +111,17 @@ class FileTuning:
         if isinstance(scene, GaussianCloud) and crop is not None:
             # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
             scene = choose_splats(scene, crop=crop)
+        if isinstance(scene, GaussianCloud) and self._as_it_looks():
+            scene = without_gaps(scene, self.threads, " (``look`` area leaves them as they are)")
         return scene
+
+    def _as_it_looks(self) -> bool:
+        """Whether nothing says how wide the splats are."""
+        target, conversion = self.target, self.begin.conversion
+        if target.data is not None or target.cameras is not None or self.begin.cell_splats is not None:
+            return False
+        by_default = target.look is None and target.look_for(self.begin.preset) == "area"
+        return by_default and conversion.footprint is None and conversion.footprint_px2 is None
 
     def targets(
         self,
