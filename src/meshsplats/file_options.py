@@ -154,9 +154,10 @@ class ScoringOptions:
     """Images by other programs to score, such as Blender: a file for each view, by its name or in order."""
     cameras: Path | None = None
     """Without ``data``: cameras. Default: those that finetune holds out."""
-    look: Look = "area"
+    look: Look | None = None
     """Without ``data``: kind of ground truth. area: means over each pixel's area, as in programs that take
-    several samples per pixel. splats: images of a 3DGS viewer at this size."""
+    several samples per pixel. splats: images of a 3DGS viewer at this size. Default: area, without the gaps
+    between splats that are smaller than these."""
     sh_degree: int | None = None
     """Without ``data``: SH degree of the ground truth. Default: all that are stored."""
     lpips: tuple[Path, ...] = ()
@@ -221,7 +222,7 @@ class ScoringOptions:
             raise OptionsError("nothing to compare with: give ``data``, or ``splats``")
         of_splats = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
         for name, value in of_splats.items():
-            if self.data is not None and value not in (None, "area"):
+            if self.data is not None and value is not None:
                 raise OptionsError(f"``{name}`` has no effect with ``data``")
         if self.data is None and self.downscale is not None:
             raise OptionsError("``downscale`` has no effect without ``data``")

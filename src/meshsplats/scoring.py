@@ -17,6 +17,7 @@ from meshsplats._origin import shared_origin
 from meshsplats._words import optional_color
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Workers
+from meshsplats.conversion.gaps import without_gaps
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
@@ -83,6 +84,8 @@ class Scoring:
         splats = None
         if chosen.splats is not None:
             splats = chosen.reading.load(chosen.splats, threads=self.threads)
+            if chosen.data is None and chosen.look is None:
+                splats = without_gaps(splats, self.threads)
         known = [each for each in (splats, *meshes.values(), before) if each is not None]
         origin = shared_origin(each.origin for each in known)
         splats = None if splats is None else splats.relative_to(origin)
@@ -217,20 +220,20 @@ class Scoring:
                 masks=chosen.masks,
                 origin=origin,
             )
-        background = optional_color(chosen.background) or WHITE
+        background, look = optional_color(chosen.background) or WHITE, chosen.look or "area"
         assert splats is not None
         assert chosen.splats is not None
         if chosen.cameras is not None:
             views = splat_views(
                 splats,
                 load_cameras(chosen.cameras, origin=splats.origin),
-                look=chosen.look,
+                look=look,
                 sh_degree=chosen.sh_degree,
                 background=background,
                 threads=self.threads,
             )
-            return Dataset((), views, "splats", chosen.look, splats.origin)
-        targets = Targets(look=chosen.look, sh_degree=chosen.sh_degree)
+            return Dataset((), views, "splats", look, splats.origin)
+        targets = Targets(look=look, sh_degree=chosen.sh_degree)
         return replace(targets.make(splats, chosen.splats, background, self.threads), train=())
 
     def _score(

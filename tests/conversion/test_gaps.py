@@ -1,5 +1,6 @@
 """Laws of the look that files get whose splats are smaller than the gaps between them."""
 
+import json
 import warnings
 
 import numpy as np
@@ -98,3 +99,25 @@ def test_fine_tuning_begins_without_gaps_unless_a_look_is_chosen(tmp_path, monke
     assert extents[0] > extents[1]
     assert main(["levels", "fine.ply", "-o", "chain", "--no-tune", "--levels", "1", "--width", "40"]) == 0
     assert "gaps between them" in capsys.readouterr().err
+
+
+def test_scores_have_no_gaps_either_unless_a_look_is_chosen(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_gaussians(wall(0.3, 20), "fine.ply")
+    monkeypatch.setattr("meshsplats.conversion.gaps.SIDE", 40)
+    monkeypatch.setattr("meshsplats.conversion.footprint.FRAMING_PIXELS", 40)
+    assert main(["convert", "fine.ply", "-o", "fine.npz", "--no-preview"]) == 0
+    capsys.readouterr()
+    compared = {}
+    for name, options in (("closed", []), ("area", ["--look", "area"])):
+        words = ["compare", "fine.ply", "fine.npz", "-o", name, "--orbit", "1", "--width", "60", *options]
+        assert main([*words, "--json"]) == 0
+        captured = capsys.readouterr()
+        assert ("gaps between them" in captured.err) == (not options)
+        compared[name] = json.loads(captured.out)["mean"]["psnr"]
+    assert compared["closed"] > compared["area"] + 3
+    cameras = ["--cameras", "closed/cameras.json"]
+    for name, options in (("scores", []), ("scores-area", ["--look", "area"])):
+        words = ["evaluate", "fine.npz", "--splats", "fine.ply", *cameras, "-o", name, "--samples", "2"]
+        assert main([*words, *options]) == 0
+        assert ("gaps between them" in capsys.readouterr().err) == (not options)

@@ -71,7 +71,7 @@ class Compare(Command):
             print_table(("view", "PSNR dB", "SSIM"), rows)
         self.finish(
             result,
-            comparison_in_words(self.how.look, result["samples"]),
+            comparison_in_words(result["look"], result["samples"]),
             f"{result['splats']:,} splats against {result['triangles']:,} triangles,"
             f" {result['seconds']:.1f} s",
             f"background: {made.background.describe()}",

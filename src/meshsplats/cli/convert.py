@@ -264,7 +264,7 @@ class Convert(Command):
             if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
-                    lines.append(f"better there: {self._for_depth_buffers(result['look'])}")
+                    lines.append(f"better there: {self._for_depth_buffers()}")
                     lines.append(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
         if result["preview"]:
             as_sorted = ", sorted" if result.get("alpha") else ""
@@ -298,10 +298,10 @@ class Convert(Command):
             words += ["--cameras", source if product.cameras is None else product.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
 
-    def _for_depth_buffers(self, look: str) -> str:
+    def _for_depth_buffers(self) -> str:
         """The command that makes a mesh for viewers that do not sort, and what is gained by it."""
         words: list[object] = ["meshsplats", "finetune", shown_path(self.input[0])]
-        words += [*again(self.product, "data", missing="few"), *(["--look", look] if look != "area" else [])]
+        words += again(self.product, "data", missing="few") + again(self.product.conversion, "look")
         words += self.reading.again()
         words += ["-o", self.output.with_suffix(".solid.glb"), "--opacity", "cutoff", "--soft-share", "0.05"]
         return f"{command_line(words)} ({ENGINE_GAIN})"

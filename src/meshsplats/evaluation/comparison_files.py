@@ -15,6 +15,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import convert
 from meshsplats.conversion.cleaning import cropped
+from meshsplats.conversion.gaps import without_gaps
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.evaluation.comparison import Comparison, compare_views
@@ -64,7 +65,9 @@ def save_comparison(
     splats, folder = as_path("splats", splats), as_path("folder", folder)
     options.check()
     cloud = options.reading.load(splats, up=options.views.up, threads=options.draw.threads)
-    cloud = cropped(cloud, options.part.crop)
+    cloud, look = cropped(cloud, options.part.crop), options.look or "area"
+    if options.look is None:
+        cloud = without_gaps(cloud, options.draw.threads)
     photographs = options.views.photographs(cloud.origin)
     cameras = options.views.make(cloud, splats, count=8, side=400, photographs=photographs, say=say)
     strips = view_names(len(cameras))
@@ -72,12 +75,12 @@ def save_comparison(
     made = _mesh(None if mesh is None else as_path("mesh", mesh), cloud, cameras, options)
     start, draw = time.perf_counter(), options.draw
     background = choose_background(draw.color, photographs, {"splats": cloud}, splats, draw.threads)
-    samples = draw.samples or mesh_samples(options.look, made, cameras)
+    samples = draw.samples or mesh_samples(look, made, cameras)
     views: Iterable[Any] = compare_views(
         cloud,
         made,
         cameras,
-        look=options.look,
+        look=look,
         sh_degree=draw.sh_degree,
         background=background.color,
         samples=samples,
@@ -96,7 +99,7 @@ def save_comparison(
     result = {
         "splats": len(cloud),
         "triangles": len(made.faces),
-        "look": options.look,
+        "look": look,
         "samples": samples,
         "ssim_convention": "3dgs",
         "error_amplified": options.amplify,
@@ -113,7 +116,7 @@ def _mesh(
     path: Path | None, cloud: GaussianCloud, cameras: Sequence[Camera], options: ComparisonOptions
 ) -> SplatMesh:
     if path is None:
-        mesh = convert(cloud, preset=options.preset, cameras=cameras, look=options.look)
+        mesh = convert(cloud, preset=options.preset, cameras=cameras, look=options.look or "area")
     elif identify(path) != "mesh":
         raise FileFormatError(f"{path}: not a mesh; give splats first, then the mesh")
     else:

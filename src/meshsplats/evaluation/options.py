@@ -19,9 +19,10 @@ class ComparisonOptions:
 
     preset: Preset = "default"
     """Preset of the conversion, without a mesh."""
-    look: Look = "area"
+    look: Look | None = None
     """Ground truth. area: the mean over each pixel's area, as in photographs, Blender, MSAA and ray tracers.
-    splats: the image of a 3DGS viewer at this size."""
+    splats: the image of a 3DGS viewer at this size. Default: area, without the gaps between splats that are
+    smaller than these."""
     views: SceneViews = field(default_factory=SceneViews)
     """Default: 8 views of an orbit, 400 pixels wide."""
     draw: DrawingOptions = field(default_factory=DrawingOptions)

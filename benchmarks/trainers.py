@@ -1,0 +1,185 @@
+"""Training on a processor beside OpenSplat: the same photographs, at the same time, one core each.
+
+    python benchmarks/trainers.py --data ../shared/data --opensplat build/opensplat --minutes 10
+
+OpenSplat is not a part of this project: --opensplat is its program, built with -DGPU_RUNTIME=CPU, from
+github.com/pierotofy/OpenSplat. It has no limit of time, so its number of steps is estimated from short runs
+at each size of its images; adding splats makes it take longer than that. Both get the training photographs
+and the known points, where there are none (lego) random ones for OpenSplat, as 3DGS has them. PSNR on
+held-out photographs of the whole size over black; of OpenSplat's splats also over the colour that it trains
+on, the better one counts. Splats are drawn as splat viewers draw them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from _common import Report, arguments
+
+import meshsplats as ms
+
+SCENES = ("bonsai", "lego", "saharov")
+BACKGROUNDS = ((0.0, 0.0, 0.0), (0.6130, 0.0101, 0.3984))
+"""Black, and what OpenSplat draws behind its splats."""
+PILOT_STEPS = 12
+RANDOM_POINTS, RANDOM_SIDE = 50_000, 2.6
+"""Points, and the side of the cube about zero that they fill."""
+
+
+def main() -> None:
+    parser = arguments(__doc__, data=True)
+    parser.add_argument("--opensplat", type=Path, required=True, help="its program")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    options = parser.parse_args()
+    with Report(options) as report, tempfile.TemporaryDirectory() as folder:
+        report.table("scene", "trainer", "steps", "seconds", "splats", "PSNR (median)", "SSIM")
+        for name in options.scenes:
+            for row in rows(name, Path(folder) / name, options):
+                report.row(name, *row)
+
+
+def rows(name: str, folder: Path, options: argparse.Namespace) -> list[tuple[str, ...]]:
+    photographs = options.data / "photos" / name
+    data = ms.load_dataset(photographs)
+    data = data.over(BACKGROUNDS[0])
+    project = as_nerfstudio(data, photographs, folder / "project")
+    steps = affordable_steps(options.opensplat, project, 60 * options.minutes)
+    theirs = start_opensplat(options.opensplat, project, folder / "theirs.ply", steps)
+    mesh, ours = folder / "ours.npz", folder / "ours.ply"
+    words = ["train", str(photographs), "-o", str(mesh), "--as-splats", str(ours), "--threads", "1"]
+    start = time.perf_counter()
+    command = [sys.executable, "-m", "meshsplats", *words, "--minutes", str(options.minutes)]
+    subprocess.run(command, check=True, preexec_fn=on_core(1), stdout=subprocess.DEVNULL)
+    seconds = time.perf_counter() - start
+    theirs.wait()
+    spent = time.perf_counter() - start
+    if theirs.returncode:
+        raise SystemExit(f"OpenSplat ended with {theirs.returncode}")
+    record = (folder / "ours.npz.run" / "metrics.jsonl").read_text()
+    taken = max(json.loads(line)["step"] for line in record.splitlines())
+    made = ms.load_mesh(mesh)
+
+    def drawn(cloud: ms.GaussianCloud, background: tuple[float, ...]) -> Drawn:
+        return lambda camera: ms.render_splats(cloud, camera, background=background).color
+
+    own, other = ms.load_gaussians(ours), ms.load_gaussians(folder / "theirs.ply")
+    both = [scores(drawn(other, color), data) for color in BACKGROUNDS]
+    return [
+        ("OpenSplat", f"{steps:,}", f"{spent:.0f}", f"{len(other):,}", *max(both)),
+        (
+            "`train`, its mesh",
+            f"{taken:,}",
+            f"{seconds:.0f}",
+            f"{made.splat_count:,}",
+            *scores(lambda camera: ms.render(made, camera, background=BACKGROUNDS[0], samples=2).color, data),
+        ),
+        (
+            "`train --as-splats`",
+            f"{taken:,}",
+            f"{seconds:.0f}",
+            f"{len(own):,}",
+            *scores(drawn(own, BACKGROUNDS[0]), data),
+        ),
+    ]
+
+
+Drawn = Callable[[ms.Camera], np.ndarray]
+
+
+def scores(drawn: Drawn, data: ms.Dataset) -> tuple[str, str]:
+    """PSNR, with its median, and SSIM of the held-out photographs."""
+    pairs = [(drawn(view.camera), view.load().color) for view in data.test]
+    psnr = [ms.psnr(*pair) for pair in pairs]
+    return f"{np.mean(psnr):.2f} ({np.median(psnr):.2f})", f"{np.mean([ms.ssim(*p) for p in pairs]):.3f}"
+
+
+def as_nerfstudio(data: ms.Dataset, photographs: Path, project: Path) -> Path:
+    """``project``: the training photographs of ``data`` as nerfstudio has them, with the known points."""
+    (project / "images").mkdir(parents=True)
+    frames = []
+    for number, view in enumerate(data.train):
+        camera, file = view.camera, f"images/{number:04d}.png"
+        ms.save_image(project / file, view.load().color)
+        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append(
+            {
+                "file_path": file,
+                "transform_matrix": pose.tolist(),
+                **{"w": camera.width, "h": camera.height, "cx": camera.cx, "cy": camera.cy},
+                **{"fl_x": camera.fx, "fl_y": camera.fy},
+            }
+        )
+    content = {"camera_model": "OPENCV", "frames": frames, "ply_file_path": "points.ply"}
+    (project / "transforms.json").write_text(json.dumps(content))
+    known = ms.load_points(photographs)
+    if known is None:
+        rng = np.random.default_rng(0)
+        places = RANDOM_SIDE * (rng.random((RANDOM_POINTS, 3)) - 0.5)
+        colors = rng.integers(0, 256, places.shape)
+    else:
+        places, colors = known.positions, known.colors
+    write_points(project / "points.ply", places, colors)
+    return project
+
+
+def write_points(path: Path, places: np.ndarray, colors: np.ndarray) -> None:
+    columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    table = np.empty(len(places), columns)
+    for values, names in ((places, "x y z"), (colors, "red green blue")):
+        for axis, name in enumerate(names.split()):
+            table[name] = values[:, axis]
+    kinds = {"<f4": "float", "u1": "uchar"}
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(places)}"]
+    head += [f"property {kinds[kind]} {name}" for name, kind in columns]
+    path.write_bytes("\n".join([*head, "end_header", ""]).encode() + table.tobytes())
+
+
+def affordable_steps(program: Path, project: Path, seconds: float) -> int:
+    """Steps of OpenSplat in so many ``seconds``: a quarter at a quarter of the size, a quarter at half of it,
+    the rest at the whole."""
+    each = []
+    for factor in (4, 2, 1):
+        times = []
+        for steps in (2, 2 + PILOT_STEPS):
+            start = time.perf_counter()
+            sizes = ["-d", str(factor), "--num-downscales", "0"]
+            command = opensplat(program, project, project / "pilot.ply", steps, sizes)
+            subprocess.run(command, check=True, preexec_fn=on_core(0), env=ALONE, stdout=subprocess.DEVNULL)
+            times.append(time.perf_counter() - start)
+        each.append((times[1] - times[0]) / PILOT_STEPS)
+    return max(40, round(seconds / (0.25 * each[0] + 0.25 * each[1] + 0.5 * each[2])))
+
+
+def start_opensplat(program: Path, project: Path, made: Path, steps: int) -> subprocess.Popen[bytes]:
+    """OpenSplat as it is made for 30,000 steps, with its schedule shortened to so many ``steps``."""
+    part = max(1, steps // 4)
+    sizes = ["--num-downscales", "2", "--resolution-schedule", str(part), "--sh-degree-interval", str(part)]
+    sizes += ["--warmup-length", str(part), "--refine-every", str(max(20, steps // 20))]
+    command = opensplat(program, project, made, steps, sizes)
+    return subprocess.Popen(command, preexec_fn=on_core(0), env=ALONE, stdout=subprocess.DEVNULL)
+
+
+def opensplat(program: Path, project: Path, made: Path, steps: int, more: list[str]) -> list[str]:
+    return [str(program), str(project), "-o", str(made), "-n", str(steps), "--keep-crs", "--cpu", *more]
+
+
+ALONE = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def on_core(number: int) -> Callable[[], None]:
+    """What a process does first to stay on that core."""
+    return lambda: os.sched_setaffinity(0, {number})
+
+
+if __name__ == "__main__":
+    main()
