@@ -15,21 +15,21 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from _common import Report, arguments
+from _common import Report, Used, arguments, run
 
 import meshsplats as ms
 
 SCENES = ("bonsai", "lego", "saharov")
 BACKGROUNDS = ((0.0, 0.0, 0.0), (0.6130, 0.0101, 0.3984))
 """Black, and what OpenSplat draws behind its splats."""
+ON_CORE = ("taskset", "--cpu-list")
 PILOT_STEPS = 12
 RANDOM_POINTS, RANDOM_SIDE = 50_000, 2.6
 """Points, and the side of the cube about zero that they fill."""
@@ -54,17 +54,13 @@ def rows(name: str, folder: Path, options: argparse.Namespace) -> list[tuple[str
     data = data.over(BACKGROUNDS[0])
     project = as_nerfstudio(data, photographs, folder / "project")
     steps = affordable_steps(options.opensplat, project, 60 * options.minutes)
-    theirs = start_opensplat(options.opensplat, project, folder / "theirs.ply", steps)
-    mesh, ours = folder / "ours.npz", folder / "ours.ply"
-    words = ["train", str(photographs), "-o", str(mesh), "--as-splats", str(ours), "--threads", "1"]
-    start = time.perf_counter()
+    mesh, ours, theirs = folder / "ours.npz", folder / "ours.ply", folder / "theirs.ply"
+    words = ["train", photographs, "-o", mesh, "--as-splats", ours, "--threads", "1"]
     command = [sys.executable, "-m", "meshsplats", *words, "--minutes", str(options.minutes)]
-    subprocess.run(command, check=True, preexec_fn=on_core(1), stdout=subprocess.DEVNULL)
-    seconds = time.perf_counter() - start
-    theirs.wait()
-    spent = time.perf_counter() - start
-    if theirs.returncode:
-        raise SystemExit(f"OpenSplat ended with {theirs.returncode}")
+    with ThreadPoolExecutor() as both:
+        other = both.submit(run_opensplat, options.opensplat, project, theirs, steps)
+        seconds = run([*ON_CORE, "1", *command]).wall
+        spent = other.result().wall
     record = (folder / "ours.npz.run" / "metrics.jsonl").read_text()
     taken = max(json.loads(line)["step"] for line in record.splitlines())
     made = ms.load_mesh(mesh)
@@ -72,10 +68,12 @@ def rows(name: str, folder: Path, options: argparse.Namespace) -> list[tuple[str
     def drawn(cloud: ms.GaussianCloud, background: tuple[float, ...]) -> Drawn:
         return lambda camera: ms.render_splats(cloud, camera, background=background).color
 
-    own, other = ms.load_gaussians(ours), ms.load_gaussians(folder / "theirs.ply")
-    both = [scores(drawn(other, color), data) for color in BACKGROUNDS]
+    own, foreign = ms.load_gaussians(ours), ms.load_gaussians(theirs)
     return [
-        ("OpenSplat", f"{steps:,}", f"{spent:.0f}", f"{len(other):,}", *max(both)),
+        (
+            *("OpenSplat", f"{steps:,}", f"{spent:.0f}", f"{len(foreign):,}"),
+            *max(scores(drawn(foreign, color), data) for color in BACKGROUNDS),
+        ),
         (
             "`train`, its mesh",
             f"{taken:,}",
@@ -149,36 +147,26 @@ def affordable_steps(program: Path, project: Path, seconds: float) -> int:
     the rest at the whole."""
     each = []
     for factor in (4, 2, 1):
-        times = []
-        for steps in (2, 2 + PILOT_STEPS):
-            start = time.perf_counter()
-            sizes = ["-d", str(factor), "--num-downscales", "0"]
-            command = opensplat(program, project, project / "pilot.ply", steps, sizes)
-            subprocess.run(command, check=True, preexec_fn=on_core(0), env=ALONE, stdout=subprocess.DEVNULL)
-            times.append(time.perf_counter() - start)
-        each.append((times[1] - times[0]) / PILOT_STEPS)
+        sizes = ["-d", str(factor), "--num-downscales", "0"]
+        short, longer = (
+            opensplat(program, project, project / "pilot.ply", steps, sizes).wall
+            for steps in (2, 2 + PILOT_STEPS)
+        )
+        each.append((longer - short) / PILOT_STEPS)
     return max(40, round(seconds / (0.25 * each[0] + 0.25 * each[1] + 0.5 * each[2])))
 
 
-def start_opensplat(program: Path, project: Path, made: Path, steps: int) -> subprocess.Popen[bytes]:
+def run_opensplat(program: Path, project: Path, made: Path, steps: int) -> Used:
     """OpenSplat as it is made for 30,000 steps, with its schedule shortened to so many ``steps``."""
     part = max(1, steps // 4)
     sizes = ["--num-downscales", "2", "--resolution-schedule", str(part), "--sh-degree-interval", str(part)]
     sizes += ["--warmup-length", str(part), "--refine-every", str(max(20, steps // 20))]
-    command = opensplat(program, project, made, steps, sizes)
-    return subprocess.Popen(command, preexec_fn=on_core(0), env=ALONE, stdout=subprocess.DEVNULL)
+    return opensplat(program, project, made, steps, sizes)
 
 
-def opensplat(program: Path, project: Path, made: Path, steps: int, more: list[str]) -> list[str]:
-    return [str(program), str(project), "-o", str(made), "-n", str(steps), "--keep-crs", "--cpu", *more]
-
-
-ALONE = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-
-
-def on_core(number: int) -> Callable[[], None]:
-    """What a process does first to stay on that core."""
-    return lambda: os.sched_setaffinity(0, {number})
+def opensplat(program: Path, project: Path, made: Path, steps: int, more: list[str]) -> Used:
+    command = [program, project, "-o", made, "-n", str(steps), "--keep-crs", "--cpu", *more]
+    return run([*ON_CORE, "0", *command], env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
 if __name__ == "__main__":
