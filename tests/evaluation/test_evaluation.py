@@ -153,6 +153,16 @@ def test_splats_beside_the_mesh_at_degree_zero_and_in_full():
     assert [m.method for m in evaluate(None, dataset, splats=cloud(0)).methods] == ["splats_sh0"]
 
 
+def test_splats_are_as_bright_against_photographs_as_their_trainer_draws_them():
+    splats = replace(cloud(0), sh=4 * cloud(0).sh)
+    assert (0.5 + 0.28209479 * splats.sh[:, 0]).max() > 1
+    same = replace(splats, sh=np.concatenate([splats.sh, np.zeros((len(splats), 3, 3), np.float32)], axis=1))
+    cameras = orbit(splats, 2, width=40, height=30)
+    photographs = [ViewImage(render_splats(same, camera).color, None) for camera in cameras]
+    dataset = Dataset((), tuple(View(*pair) for pair in zip(cameras, photographs, strict=True)))
+    assert evaluate(None, dataset, splats=splats).method("splats_sh0").mean("psnr") > 100
+
+
 def report_of(psnrs, ssims, lpips) -> Report:
     rows = zip(psnrs, ssims, lpips, strict=True)
     views = tuple(ViewScores(f"{i}.png", *row) for i, row in enumerate(rows))

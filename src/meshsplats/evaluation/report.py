@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat
 
@@ -220,11 +220,14 @@ def evaluate(
     if before is not None:
         others["before"] = _mesh_renderer(before, samples, threads)
     if splats is not None:
-        # Against photographs splats have the look of their training, against images of splats that of these.
-        look = dataset.look if _targets_are_splats(dataset) else "splats"
-        others["splats_sh0"] = _splat_renderer(splats, look, 0, threads)
+        # Against photographs splats look as in their training, against images of splats as these.
+        if _targets_are_splats(dataset):
+            look, plain = dataset.look, splats.of_degree(0)
+        else:
+            look, plain = "splats", _without_limit(splats) if splats.sh_degree == 0 else splats.of_degree(0)
+        others["splats_sh0"] = _splat_renderer(plain, look, threads)
         if splats.sh_degree > 0:
-            others["splats"] = _splat_renderer(splats, look, None, threads)
+            others["splats"] = _splat_renderer(splats, look, threads)
     if images is not None:
         others["images"] = images
     if taken := methods.keys() & others.keys():
@@ -368,12 +371,18 @@ def _mesh_renderer(mesh: SplatMesh, samples: int, threads: int | None) -> ImageA
     return at
 
 
-def _splat_renderer(cloud: GaussianCloud, look: Look, degree: int | None, threads: int | None) -> ImageAt:
+def _splat_renderer(cloud: GaussianCloud, look: Look, threads: int | None) -> ImageAt:
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        rendered = draw_splats(cloud, camera, look, background=background, sh_degree=degree, threads=threads)
+        rendered = draw_splats(cloud, camera, look, background=background, threads=threads)
         return rendered.color, rendered.alpha
 
     return at
+
+
+def _without_limit(cloud: GaussianCloud) -> GaussianCloud:
+    """Splats of degree 0 as their trainer draws them, where bright: colours above 1 stay. With harmonics of
+    degree 1, which are 0, ``render_splats`` has no limit either."""
+    return replace(cloud, sh=np.concatenate([cloud.sh, np.zeros((len(cloud), 3, 3), np.float32)], axis=1))
 
 
 def _finite(value: float | None) -> float | None:
