@@ -289,6 +289,27 @@ def test_gltf_transforms_and_wrapping(tmp_path):
     np.testing.assert_array_equal(corner_colors(base), SQUARE[[1, 2, 3, 0]])
 
 
+@pytest.mark.parametrize(
+    "material",
+    [
+        {
+            "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]},
+            "emissiveFactor": [1, 1, 1],
+            "emissiveTexture": {"index": 0},
+        },
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}}},
+    ],
+)
+def test_gltf_textures_that_are_no_base_colour(tmp_path, material):
+    np.testing.assert_array_equal(corner_colors(load_base(gltf(tmp_path, materials=[material]))), SQUARE)
+
+
+def test_corners_of_mirror_images_keep_their_colours(tmp_path):
+    base = load_base(gltf(tmp_path, nodes=[{"mesh": 0, "scale": [-1, 1, 1]}]))
+    assert base.faces.tolist() == [[0, 2, 1], [0, 3, 2]]
+    np.testing.assert_array_equal(np.rint(at_corners(base).reshape(-1, 4)[[0, 2, 1, 4], :3]), SQUARE)
+
+
 def test_gltf_alpha_modes(tmp_path):
     pbr = {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 1, 1, 0.4]}
     for mode, alpha in (("OPAQUE", 1), ("BLEND", 0.4), ("MASK", 0)):

@@ -42,6 +42,47 @@ def test_gltf_without_colours_takes_the_materials(tmp_path):
     assert mesh.up.tolist() == [0, 1, 0]
 
 
+BLACK = {"baseColorFactor": [0, 0, 0, 0.5]}
+OLD = "KHR_materials_pbrSpecularGlossiness"
+
+
+@pytest.mark.parametrize(
+    ("material", "wanted"),
+    [
+        ({"pbrMetallicRoughness": BLACK, "emissiveFactor": [0, 1, 0]}, [0, 1, 0, 0.5]),
+        ({"pbrMetallicRoughness": BLACK}, [0, 0, 0, 0.5]),
+        (
+            {
+                "pbrMetallicRoughness": BLACK,
+                "emissiveFactor": [0, 1, 0],
+                "extensions": {"KHR_materials_unlit": {}},
+            },
+            [0, 0, 0, 0.5],
+        ),
+        ({"emissiveFactor": [0, 1, 0]}, [0.5, 1, 0, 1]),
+        ({"extensions": {OLD: {"diffuseFactor": [1, 0, 1, 1]}}}, [0.5, 0, 0, 1]),
+        (
+            {
+                "extensions": {OLD: {"diffuseFactor": [1, 0, 1, 1]}},
+                "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.5]},
+            },
+            [0.5, 1, 0, 0.5],
+        ),
+    ],
+)
+def test_gltf_colours_that_are_no_base_colour(tmp_path, material, wanted):
+    """What a black material emits, which colours of vertices have no part in; the diffuse colour of old
+    files, unless there is a base colour, too."""
+    document = gltf(
+        [(TRIANGLE, "VEC3", False), (np.array([[0.5, 1, 0, 1]] * 3, "<f4"), "VEC4", False)],
+        primitive={"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0},
+        materials=[{"alphaMode": "BLEND"} | material],
+        extensionsRequired=[OLD],
+    )
+    expected = [*linear_to_srgb(np.array(wanted[:3])), wanted[3]]
+    np.testing.assert_allclose(load(tmp_path, document).colors, [expected] * 3, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("array", "kind"),
     [
@@ -81,7 +122,8 @@ def test_gltf_nodes_place_their_meshes(tmp_path):
     first = [[10, 0, 0], [10, 2, 0], [8, 0, 0]]
     last = [[0, 0, 5], [0, 1, 5], [2, 0, 5]]
     np.testing.assert_allclose(mesh.vertices, first + first + last + last, atol=1e-6)
-    assert mesh.faces.tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]]
+    # The last matrix makes a mirror image, whose triangles go the other way around to keep their sides.
+    assert mesh.faces.tolist() == [[0, 1, 2], [3, 4, 5], [6, 8, 7], [9, 11, 10]]
     # Under the scale of (1, 2, 1) the normal (-0.8, 0.6) goes with (1, 1/2, 1).
     turned = np.array([-0.8, 0.3, 0]) / np.hypot(0.8, 0.3)
     np.testing.assert_allclose(mesh.normals[0], turned, atol=1e-6)
@@ -124,6 +166,85 @@ def test_gltf_skins_that_stand_apart(tmp_path):
     np.testing.assert_allclose(load(tmp_path, document).vertices, np.add(TRIANGLE, [10, 0, 0]), atol=1e-6)
     del document["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"]
     np.testing.assert_allclose(load(tmp_path, document).vertices, 100 * TRIANGLE + 7, atol=1e-6)
+
+
+def test_gltf_mirror_images_keep_their_sides(tmp_path):
+    """glTF 2.0, 3.7.4; of a skin the joints count, not the node that holds it."""
+    mirror = {"scale": [-1, 1, 1]}
+    mesh = load(tmp_path, gltf([(TRIANGLE, "VEC3", False)], nodes=[{"mesh": 0} | mirror]))
+    np.testing.assert_array_equal(mesh.vertices, TRIANGLE * [-1, 1, 1])
+    assert mesh.faces.tolist() == [[0, 2, 1]]
+    assert load(tmp_path, instanced(SCALE=[[1, 1, 1], [1, -1, 1]])).faces.tolist() == [[0, 1, 2], [3, 5, 4]]
+    document = skinned()
+    document["nodes"][0] |= mirror
+    assert load(tmp_path, document).faces.tolist() == [[0, 1, 2]]
+    document["nodes"][1] |= mirror
+    assert load(tmp_path, document).faces.tolist() == [[0, 2, 1]]
+
+
+def morphed(weights, of_mesh=None, values=((1, 2, 3),)):
+    """A triangle with two targets: one moves all of it, a sparse one its last corner."""
+    sideways = np.array([[0, 0, 1]] * 3, "<f4")
+    document = gltf(
+        [
+            (TRIANGLE, "VEC3", False),
+            (sideways, "VEC3", False),
+            (np.array([[2]], "u1"), "SCALAR", False),
+            (np.array(values, "<f4"), "VEC3", False),
+        ],
+        primitive={
+            "attributes": {"POSITION": 0, "NORMAL": 1},
+            "targets": [{"POSITION": 1, "NORMAL": 1}, {"POSITION": 4}],
+        },
+        nodes=[{"mesh": 0} | ({} if weights is None else {"weights": weights})],
+    )
+    sparse = {"count": 1, "indices": {"bufferView": 2, "componentType": 5121}, "values": {"bufferView": 3}}
+    document["accessors"].append({"componentType": 5126, "count": 3, "type": "VEC3", "sparse": sparse})
+    if of_mesh is not None:
+        document["meshes"][0]["weights"] = of_mesh
+    return document
+
+
+@pytest.mark.parametrize(
+    ("weights", "of_mesh", "counted"),
+    [(None, None, (0, 0)), (None, [0.5, 2], (0.5, 2)), ([1, 0], [0.5, 2], (1, 0)), ([0, 1], None, (0, 1))],
+)
+def test_gltf_morph_targets_count_by_their_weights(tmp_path, weights, of_mesh, counted):
+    mesh = load(tmp_path, morphed(weights, of_mesh))
+    wanted = (
+        TRIANGLE + counted[0] * np.array([0, 0, 1]) + counted[1] * np.array([[0] * 3, [0] * 3, [1, 2, 3]])
+    )
+    np.testing.assert_allclose(mesh.vertices, wanted, atol=1e-6)
+    np.testing.assert_allclose(mesh.normals[0], [0, 0, 1 + counted[0]], atol=1e-6)
+
+
+def test_gltf_sparse_elements_replace_others(tmp_path):
+    document = morphed(None)
+    document["accessors"][0]["sparse"] = document["accessors"][4]["sparse"]
+    np.testing.assert_array_equal(load(tmp_path, document).vertices, [*TRIANGLE[:2], [1, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["nodes"][0].update(weights=[1]), "weights of morph targets must be 2 numbers"),
+        (lambda d: d["meshes"][0]["primitives"][0].update(targets=7), "targets of a primitive must be an"),
+        (lambda d: d["accessors"][4].update(count=4), r"target must have shape \(3, 3\), got \(4, 3\)"),
+        (lambda d: d["accessors"][4].update(count=2), "sparse indices of POSITION .* run up to 2 of 2"),
+        (lambda d: d["accessors"][4].update(count=10**12), "would take the data beyond"),
+        (lambda d: d["accessors"][4]["sparse"].update(count=2), "claims 2 elements"),
+        (
+            lambda d: d["accessors"][4]["sparse"]["indices"].update(componentType=5126),
+            "sparse indices that are unsigned",
+        ),
+        (lambda d: d["accessors"][4]["sparse"].update(values=1), "refers to index None of 4 bufferViews"),
+    ],
+)
+def test_gltf_morph_targets_that_lie(tmp_path, change, message):
+    document = morphed([1, 1])
+    change(document)
+    with pytest.raises(FileFormatError, match=message):
+        load(tmp_path, document)
 
 
 @pytest.mark.parametrize(

@@ -310,7 +310,7 @@ def put(*keys):
         (put("accessors", 0, "type", "MAT3"), "has type MAT3"),
         (put("accessors", 0, "type", "VEC2"), "POSITION must be 3 vectors of 3"),
         (put("accessors", 0, "componentType", 7), "of components 7"),
-        (put("accessors", 0, "sparse", {}), "sparse accessor"),
+        (put("accessors", 0, "sparse", {}), "POSITION needs a whole number 'count'"),
         (put("accessors", 1, "componentType", 5126), "indices must be unsigned|claims"),
         (put("bufferViews", 0, "byteLength", 1000), "ends at byte 1,000"),
         (put("bufferViews", 0, "byteOffset", 2**60), "needs a whole number 'byteOffset'"),

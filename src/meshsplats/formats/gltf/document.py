@@ -165,13 +165,9 @@ class GltfDocument:
         return found.reshape(-1).view(np.uint8).data
 
     def accessor(self, index: object, what: str) -> np.ndarray:
-        """(count, columns) array of the stored type, a view into the file's bytes."""
+        """(count, columns) array of the stored type: a view into the file's bytes, or an array of its own
+        where the accessor is sparse."""
         accessor = self.item("accessors", index, what)
-        if "sparse" in accessor:
-            raise self.error(
-                f"{what} uses a sparse accessor, which is not supported; rewrite the file without,"
-                " for example with 'gltf-transform copy' or Blender"
-            )
         dtype = _COMPONENTS.get(self.whole(accessor, "componentType", what))
         columns = _COLUMNS.get(str(accessor.get("type")))
         if dtype is None or columns is None:
@@ -180,10 +176,35 @@ class GltfDocument:
                 f" {accessor['componentType']}, expected numbers or vectors"
             )
         count = self.whole(accessor, "count", what)
+        if "sparse" in accessor:
+            return self._sparse(accessor, dtype, (count, columns), what)
         if "bufferView" not in accessor:
             raise self.error(f"{what} has an accessor without data")
-        data, stride = self.view_bytes(accessor["bufferView"], what)
-        offset = self.whole(accessor, "byteOffset", what, 0)
+        return self._elements(accessor, dtype, (count, columns), what)
+
+    def _sparse(self, accessor: dict[str, Any], dtype: str, shape: tuple[int, int], what: str) -> np.ndarray:
+        """The elements of an accessor that stores some of them apart from the others, or from zeros."""
+        sparse = dict_or_empty(accessor["sparse"])
+        indices, values = (dict_or_empty(sparse.get(name)) for name in ("indices", "values"))
+        count = self.whole(sparse, "count", what)
+        kind = _COMPONENTS.get(self.whole(indices, "componentType", what), "")
+        if kind[1:2] != "u":
+            raise self.error(f"{what} needs sparse indices that are unsigned integers")
+        rows = self._elements(indices, kind, (count, 1), what)[:, 0]
+        if count and rows.max() >= shape[0]:
+            raise self.error(f"sparse indices of {what} run up to {rows.max()} of {shape[0]:,}")
+        self.budget.spend(shape[0] * shape[1] * np.dtype(dtype).itemsize, what)
+        result = np.zeros(shape, dtype)
+        if "bufferView" in accessor:
+            result[:] = self._elements(accessor, dtype, shape, what)
+        result[rows] = self._elements(values, dtype, (count, shape[1]), what)
+        return result
+
+    def _elements(self, held: dict[str, Any], dtype: str, shape: tuple[int, int], what: str) -> np.ndarray:
+        """Array of this ``shape`` in the buffer view that ``held`` names, a view into the file's bytes."""
+        count, columns = shape
+        data, stride = self.view_bytes(held.get("bufferView"), what)
+        offset = self.whole(held, "byteOffset", what, 0)
         element = columns * np.dtype(dtype).itemsize
         step = stride or element
         if step < element or (count and offset + (count - 1) * step + element > len(data)):
@@ -192,7 +213,7 @@ class GltfDocument:
                 f" {offset:,} on, in a buffer view of {len(data):,} bytes"
             )
         strides = (step, np.dtype(dtype).itemsize)
-        return np.ndarray((count, columns), dtype, data, offset if count else 0, strides)
+        return np.ndarray(shape, dtype, data, offset if count else 0, strides)
 
     def floats(self, index: object, what: str, *, fractions: bool = False) -> np.ndarray:
         """As ``accessor``, as float32; integers become fractions of their largest value where ``normalized``.

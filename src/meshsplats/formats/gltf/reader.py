@@ -17,6 +17,7 @@ from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
 from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
+from meshsplats.formats.gltf.looks import Look, look_of
 from meshsplats.formats.gltf.own import (
     fits,
     grid_of,
@@ -69,12 +70,12 @@ def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     Our own files give back positions and extra arrays exactly, and colours within their stored precision.
     From other programs' files, all triangles of the scene are joined in its y-up frame; colours are COLOR_0
     times the material's base colour, converted to display values; textures are left out with a DataWarning.
+    Morph targets count by the weights of their node or mesh.
     Buffers must be embedded or lie beside the file. Positions are relative to ``origin``; by default to that
     of our files, or to one that suits those of others, whose nodes are applied in float64.
 
     Raises:
-        FileFormatError: the file is broken, or has Draco compression, meshopt compression with filters, or
-            sparse accessors.
+        FileFormatError: the file is broken, or has Draco compression, meshopt compression with filters.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # SplatMesh refuses values that are not finite
         return _read(GltfDocument(path), origin)
@@ -96,16 +97,16 @@ def listed_order(path: Path, mesh: SplatMesh) -> DrawOrder | None:
     Raises FileFormatError for a broken file.
     """
     document = GltfDocument(path)
-    meshes = [place.mesh for place in shown_meshes(document)]
-    entry = dict_or_empty(our_note(meshes[0]).get("copies")) if meshes else {}
-    if not copies.counts(entry) or copies.counts(entry) != len(meshes):
+    placed = shown_meshes(document)
+    entry = dict_or_empty(our_note(placed[0].mesh).get("copies")) if placed else {}
+    if not copies.counts(entry) or copies.counts(entry) != len(placed):
         return None
     listed, first = [], 0
-    for each in meshes:
-        primitive = document.objects(each.get("primitives"), "primitives of a mesh")[0]
+    for place in placed:
+        primitive = document.objects(place.mesh.get("primitives"), "primitives of a mesh")[0]
         places = document.accessor(dict_or_empty(primitive.get("attributes")).get("POSITION"), "POSITION")
         count = len(places)
-        listed.append(primitive_faces(document, primitive, count) + first)
+        listed.append(placed_faces(document, place, primitive, count) + first)
         first += count
     vertex = listed_vertices(document, entry, first)
     faces, starts = np.concatenate(listed), np.cumsum([0, *map(len, listed)])
@@ -136,11 +137,11 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
                 skipped += 1
                 _refuse_splats(document, primitive)
                 continue
-            material = material_of(document, primitive)
-            textured += "baseColorTexture" in pbr_of(material)
-            colored |= "baseColorFactor" in pbr_of(material)
+            look = look_of(document, primitive)
+            textured += bool(look.texture)
+            colored |= look.factor is not None
             colored |= "COLOR_0" in dict_or_empty(primitive.get("attributes"))
-            pieces.append(_piece(document, primitive, material, place, stored))
+            pieces.append(_piece(document, primitive, look, place, stored))
     if skipped:
         warn(f"{path}: {skipped:,} primitives of points or lines were left out")
     if textured:
@@ -176,7 +177,7 @@ def _chosen_origin(document: GltfDocument, pieces: list[_Piece]) -> np.ndarray:
 def _piece(
     document: GltfDocument,
     primitive: dict[str, Any],
-    material: dict[str, Any],
+    look: Look,
     place: Placed,
     stored: Stored | None,
 ) -> _Piece:
@@ -187,9 +188,8 @@ def _piece(
         raise document.compressed()
     vertices = document.floats(attributes["POSITION"], "POSITION")
     v = len(vertices)
-    faces = primitive_faces(document, primitive, v)
+    faces = placed_faces(document, place, primitive, v)
     document.budget.spend(64 * v + 12 * len(faces), "a mesh")
-    factor = document.numbers(pbr_of(material).get("baseColorFactor", [1, 1, 1, 1]), 4, "baseColorFactor")
     linear = np.ones((v, 4), np.float32)
     if "COLOR_0" in attributes:
         shape = document.accessor(attributes["COLOR_0"], "COLOR_0").shape
@@ -197,9 +197,11 @@ def _piece(
             raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {shape}")
         colors = document.floats(attributes["COLOR_0"], "COLOR_0", fractions=True)
         linear[:, : colors.shape[1]] = colors
-    if (factor != 1).any():
-        linear *= factor.astype(np.float32)
-    if material.get("alphaMode", "OPAQUE") == "OPAQUE":
+    if look.emits:
+        linear[:, :3] = 1
+    if look.factor is not None:
+        linear *= look.factor.astype(np.float32)
+    if look.alpha_mode == "OPAQUE":
         linear[:, 3] = 1
     normals = None
     if "NORMAL" in attributes:
@@ -207,6 +209,9 @@ def _piece(
     for name, values in (("POSITION", vertices), ("NORMAL", normals)):
         if values is not None and values.shape != (v, 3):
             raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
+    vertices = place.morphed(document, primitive, "POSITION", vertices)
+    if normals is not None:
+        normals = place.morphed(document, primitive, "NORMAL", normals)
     tables = {}
     for name in stored.names if stored else ():
         if name in attributes:
@@ -217,7 +222,14 @@ def _piece(
     return _Piece(place, place.skinning(document, attributes, v), vertices, faces, linear, normals, tables)
 
 
-def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
+def placed_faces(document: GltfDocument, place: Placed, primitive: dict[str, Any], v: int) -> np.ndarray:
+    """(m, 3) int32 triangles of a primitive of ``v`` vertices at its ``place``: the other way around where
+    that makes a mirror image of it, so that they still face outwards."""
+    faces = _faces(document, primitive, v)
+    return faces[:, [0, 2, 1]] if place.mirrors(primitive) else faces
+
+
+def _faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
     if "indices" in primitive:
         stored = document.accessor(primitive["indices"], "indices")
         if stored.dtype.kind != "u" or stored.shape[1] != 1:
@@ -289,16 +301,6 @@ def _join(
 
 
 # -- helpers
-
-
-def material_of(document: GltfDocument, primitive: dict[str, Any]) -> dict[str, Any]:
-    if "material" not in primitive:
-        return {}
-    return document.item("materials", primitive["material"], "a primitive")
-
-
-def pbr_of(material: dict[str, Any]) -> dict[str, Any]:
-    return dict_or_empty(material.get("pbrMetallicRoughness"))
 
 
 def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Placement of the meshes of a glTF scene: nodes, instances and skins."""
+"""Placement of the meshes of a glTF scene: nodes, instances, skins and morph targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from meshsplats._geometry import rotation_rows
 from meshsplats._origin import SAMPLE
-from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _AT_ONCE = 1 << 15
@@ -28,6 +28,33 @@ class Placed(NamedTuple):
     joints: Callable[[], np.ndarray] | None = None
     """Returns (j, 4, 4), one for each joint of the skin, which replace ``matrix`` for primitives with joints
     and weights; None without a skin."""
+    weights: object = None
+    """Of the morph targets, as the file has them; None without any."""
+
+    def morphed(
+        self, document: GltfDocument, primitive: dict[str, Any], name: str, values: np.ndarray
+    ) -> np.ndarray:
+        """``values`` (v, 3) float32 of the attribute ``name`` of a primitive, moved by its morph targets."""
+        targets = document.objects(primitive.get("targets", []), "targets of a primitive")
+        if not targets or self.weights is None:
+            return values
+        weights = document.numbers(self.weights, len(targets), "weights of morph targets")
+        for weight, target in zip(weights, targets, strict=True):
+            if weight and name in target:
+                what = f"{name} of a morph target"
+                steps = document.floats(target[name], what, fractions=name == "NORMAL")
+                if steps.shape != values.shape:
+                    raise document.error(f"{what} must have shape {values.shape}, got {steps.shape}")
+                values = values + np.float32(weight) * steps
+        return values
+
+    def mirrors(self, primitive: dict[str, Any]) -> bool:
+        """Whether a primitive is there as its mirror image, whose triangles wind the other way (glTF 2.0,
+        3.7.4); with a skin, whether most of its joints make one."""
+        joints = self.joints if _is_skinned(dict_or_empty(primitive.get("attributes"))) else None
+        matrices = self.matrix[None] if joints is None else joints()
+        signs, _ = np.linalg.slogdet(matrices[:, :3, :3])
+        return bool(signs.sum() < 0)
 
     def applied(
         self,
@@ -64,7 +91,7 @@ class Placed(NamedTuple):
 
     def skinning(self, document: GltfDocument, attributes: dict[str, Any], v: int) -> Skinning | None:
         """That of a primitive of ``v`` vertices; None without joints and weights."""
-        if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
+        if self.joints is not None and _is_skinned(attributes):
             return Skinning(document, attributes, self.joints(), v)
         return None
 
@@ -111,7 +138,7 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
     """Each mesh of the scene, once for each of its nodes and instances."""
     nodes = document.items("nodes")
     if not document.items("scenes") and not nodes:
-        yield from (Placed(mesh, np.eye(4)) for mesh in document.items("meshes"))
+        yield from (Placed(mesh, np.eye(4), weights=mesh.get("weights")) for mesh in document.items("meshes"))
         return
     matrices = _scene_matrices(document)
     for index, matrix in matrices.items():
@@ -119,13 +146,15 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
         if "mesh" not in node:
             continue
         mesh = document.item("meshes", node["mesh"], f"node {index}")
+        weights = node.get("weights", mesh.get("weights"))
         # Computed once for all primitives, and only if one needs it.
         joints = cache(partial(_joints, document, node["skin"], matrices)) if "skin" in node else None
         extensions = node.get("extensions")
         if isinstance(extensions, dict) and INSTANCING in extensions:
-            yield from (Placed(mesh, matrix @ own) for own in _instances(document, extensions[INSTANCING]))
+            for own in _instances(document, extensions[INSTANCING]):
+                yield Placed(mesh, matrix @ own, weights=weights)
         else:
-            yield Placed(mesh, matrix, joints)
+            yield Placed(mesh, matrix, joints, weights)
 
 
 def placed_nodes(document: GltfDocument) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
@@ -244,6 +273,10 @@ def rotation_matrix(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = list(rotation_rows(w, x, y, z))
     return matrix
+
+
+def _is_skinned(attributes: dict[str, Any]) -> bool:
+    return {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys()
 
 
 def _indices(document: GltfDocument, value: object, what: str) -> list[int]:

@@ -1,4 +1,4 @@
-"""Base-colour textures of glTF files with their coordinates, for base meshes."""
+"""Textures of glTF files, of the colours that materials show, with their coordinates, for base meshes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ import numpy as np
 from meshsplats.base_mesh import Texture, Wrap
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
+from meshsplats.formats.gltf.looks import Look, look_of
 from meshsplats.formats.gltf.reader import (
     POINTS_TO_LINES,
-    material_of,
-    pbr_of,
-    primitive_faces,
+    placed_faces,
 )
 from meshsplats.formats.gltf.scene_parts import shown_meshes
 
@@ -46,13 +45,14 @@ def gltf_textures(
             v = document.whole(
                 document.item("accessors", attributes.get("POSITION"), "POSITION"), "count", "POSITION"
             )
-            faces = primitive_faces(document, primitive, v)
-            material = material_of(document, primitive)
-            info = dict_or_empty(pbr_of(material).get("baseColorTexture"))
-            uv = _coordinates(document, attributes, info, v) if info or override is not None else None
+            faces = placed_faces(document, place, primitive, v)
+            look = look_of(document, primitive)
+            uv = None
+            if look.texture or override is not None:
+                uv = _coordinates(document, attributes, look.texture, v)
             index = -1
             if uv is not None:
-                index = 0 if override is not None else found.index_of(material, info)
+                index = 0 if override is not None else found.index_of(look)
                 document.budget.spend(24 * len(faces), "texture coordinates")
             corners = np.zeros((len(faces), 3, 2), np.float32) if uv is None else uv[faces]
             parts.append((corners, np.full(len(faces), index, np.int32)))
@@ -117,10 +117,10 @@ class _Textures:
     _images: dict[int, np.ndarray] = field(default_factory=dict)
     _cut: dict[tuple[int, float, float], np.ndarray] = field(default_factory=dict)
 
-    def index_of(self, material: dict[str, Any], info: dict[str, Any]) -> int:
-        """Index of the base-colour texture ``info`` of ``material``; -1 if it is of an unknown kind."""
+    def index_of(self, look: Look) -> int:
+        """Index of the texture of ``look``; -1 if it is of an unknown kind."""
         document = self.document
-        texture = document.item("textures", info.get("index"), "baseColorTexture")
+        texture = document.item("textures", look.texture.get("index"), "the texture of a material")
         source = texture.get("source")
         for name in _SOURCES:
             source = dict_or_empty(dict_or_empty(texture.get("extensions")).get(name)).get("source", source)
@@ -133,14 +133,15 @@ class _Textures:
         wraps = [_WRAPS.get(sampler.get(way, 10497)) for way in ("wrapS", "wrapT")]
         if None in wraps:
             raise document.error(f"unknown wrapping of a texture: {str(sampler)[:80]}")
-        factor = document.numbers(pbr_of(material).get("baseColorFactor", [1] * 4), 4, "baseColorFactor")
-        mode = material.get("alphaMode", "OPAQUE")
-        cutoff = float(document.numbers([material.get("alphaCutoff", 0.5)], 1, "alphaCutoff")[0])
+        factor = np.ones(4) if look.factor is None else look.factor.copy()
+        mode, cutoff = look.alpha_mode, look.cutoff
         key = (source, *wraps, *factor, mode, cutoff)
         if key not in self._indices:
             pixels = self._image(source)
             if mode != "BLEND":
-                pixels = self._cut_out(source, pixels, factor[3], -math.inf if mode == "OPAQUE" else cutoff)
+                pixels = self._cut_out(
+                    source, pixels, factor[3], -math.inf if mode == "OPAQUE" else look.cutoff
+                )
                 factor[3] = 1
             self._indices[key] = len(self.textures)
             self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]
