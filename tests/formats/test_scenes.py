@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from _glb import read_glb
 from _splats import few_splats
+from PIL import Image
 
 import meshsplats as ms
 from meshsplats.base_mesh import Texture
@@ -141,6 +143,63 @@ def write_plain(folder):
     return path
 
 
+RELIEF = replace(SURFACE, normal_map=np.random.default_rng(6).integers(1, 255, (4, 4, 3), np.uint8))
+
+
+def test_a_lit_surface_of_a_glb_has_its_normals_and_normal_map(tmp_path):
+    ms.save_scene(tmp_path / "lit.glb", surface=RELIEF, lit=True)
+    document, chunk = read_glb(tmp_path / "lit.glb")
+
+    def array(index, columns):
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        return np.frombuffer(chunk, "<f4", columns * accessor["count"], view["byteOffset"]).reshape(
+            -1, columns
+        )
+
+    bare, *textured = [part["attributes"] for part in document["meshes"][0]["primitives"]]
+    assert "TANGENT" not in bare
+    for part in (bare, *textured):
+        np.testing.assert_allclose(np.linalg.norm(array(part["NORMAL"], 3), axis=1), 1, atol=1e-6)
+    for part in textured:
+        normals, tangents = array(part["NORMAL"], 3), array(part["TANGENT"], 4)
+        np.testing.assert_allclose((normals * tangents[:, :3]).sum(axis=1), 0, atol=1e-6)
+        assert set(np.abs(tangents[:, 3])) == {1}
+    relief = [material.get("normalTexture") for material in document["materials"]]
+    assert relief == [None, {"index": 0}, {"index": 0}]
+    view = document["bufferViews"][document["images"][document["textures"][0]["source"]]["bufferView"]]
+    with Image.open(io.BytesIO(chunk[view["byteOffset"] :][: view["byteLength"]])) as image:
+        np.testing.assert_array_equal(np.asarray(image), RELIEF.normal_map)
+    back = ms.load_base(tmp_path / "lit.glb")
+    np.testing.assert_array_equal(back.textures[1].pixels, SURFACE.textures[1].pixels)
+    ms.save_scene(tmp_path / "unlit.glb", surface=RELIEF)
+    attributes = read_glb(tmp_path / "unlit.glb")[0]["meshes"][0]["primitives"][1]["attributes"]
+    assert attributes.keys() == {"POSITION", "TEXCOORD_0"}
+
+
+def test_a_lit_surface_of_a_package_has_its_normals_and_normal_map(tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom, UsdShade
+
+    pixels = np.where(PIXELS > 99, np.uint8(255), np.uint8(0))  # cut out
+    base = replace(RELIEF, textures=(Texture(pixels), RELIEF.textures[1]))
+    ms.save_scene(tmp_path / "a.usdz", surface=base, lit=True)
+    stage = usd.Stage.Open(str(tmp_path / "a.usdz"))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/Scene/Surface/Mesh"))
+    normals = np.array(shape.GetNormalsAttr().Get())
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    assert shape.GetNormalsInterpolation() == "vertex"
+    for i, threshold in enumerate((0.5, None)):
+        at = f"/Scene/Surface/Texture_{i}"
+        shader = UsdShade.Shader(stage.GetPrimAtPath(f"{at}/Surface"))
+        (source, *_), _ = shader.GetInput("normal").GetConnectedSources()
+        assert source.source.GetPath() == f"{at}/Normals"
+        asset = UsdShade.Shader(stage.GetPrimAtPath(f"{at}/Normals")).GetInput("file").Get()
+        assert asset.resolvedPath.endswith("normals.png]")
+        found = shader.GetInput("opacityThreshold")
+        assert (found.Get() if found else None) == threshold
+
+
 def test_a_package_of_usd_holds_the_textures(tmp_path):
     sdf = pytest.importorskip("pxr.Sdf")
     ms.save_scene(tmp_path / "a.usdz", splats=CLOUD, surface=SURFACE, collider=BOX)
@@ -158,7 +217,7 @@ def test_the_validators_of_openusd_are_content(tmp_path, suffix):
     validation = pytest.importorskip("pxr.UsdValidation", reason="usd-core 25.05 or newer")
     from pxr import Usd
 
-    surface = SURFACE if suffix == ".usdz" else BOX
+    surface = RELIEF if suffix == ".usdz" else BOX
     ms.save_scene(tmp_path / f"a{suffix}", splats=CLOUD, mesh=MESH, surface=surface, collider=BOX, lit=True)
     stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
     context = validation.ValidationContext(validation.ValidationRegistry().GetOrLoadAllValidators())
@@ -168,7 +227,7 @@ def test_the_validators_of_openusd_are_content(tmp_path, suffix):
 def test_the_khronos_validator_finds_nothing_but_the_extension(tmp_path, gltf_issues):
     files = [tmp_path / "plain.glb", tmp_path / "lit.glb"]
     for lit, file in enumerate(files):
-        parts = {"splats": CLOUD, "mesh": MESH, "surface": SURFACE, "collider": BOX}
+        parts = {"splats": CLOUD, "mesh": MESH, "surface": RELIEF, "collider": BOX}
         ms.save_scene(file, **parts, lit=bool(lit))
     for issues in gltf_issues(*files):
         codes = {issue["code"] for issue in issues["messages"]}

@@ -46,7 +46,8 @@ def save_scene(
         collider: triangles that physics engines collide with, and nobody draws. USD: a mesh of the purpose
             'guide' with UsdPhysics' CollisionAPI and MeshCollisionAPI. glTF, which has no such thing: an
             invisible mesh whose node is named ``collider-colonly``, as Godot imports colliders.
-        lit: materials of ``mesh`` and ``surface`` that take light, not ones that show colours as they are.
+        lit: materials of ``mesh`` and ``surface`` that take light, not ones that show colours as they are;
+            the surface with smooth normals and its normal map.
 
     Raises:
         ValueError: nothing is given, a part is empty, the suffix is unknown, textures do not go into the

@@ -20,6 +20,8 @@ from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write
 from meshsplats.formats.gltf.scene_parts import COLLIDES, INVISIBLE
 from meshsplats.formats.gltf.splats_writer import splats_part
 from meshsplats.formats.gltf.writer import mesh_part
+from meshsplats.formats.surfaces.corners import normal_file, smooth_normals
+from meshsplats.formats.surfaces.tangents import corner_frames
 
 COLLIDER = "collider-colonly"
 """Godot's suffix for a mesh that becomes a collider and is not drawn."""
@@ -110,6 +112,14 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
     primitives, samplers = [], []
     materials: list[dict[str, Any]] = []
     images: list[dict[str, Any]] = []
+    normals = smooth_normals(base) if lit else None
+    relief: dict[str, Any] = {}
+    if lit and base.normal_map is not None and base.textured and base.uv is not None:
+        frames = corner_frames(base.vertices, base.faces, base.uv, base.up)
+        tangents = np.concatenate([frames.tangents, frames.signs[..., None]], axis=2, dtype=np.float32)
+        relief = {"normalTexture": {"index": 0}}
+        images.append(_image(chunk, normal_file(base)[1]))
+        samplers.append(_sampler(base.textures[0]))
     for texture in np.unique(of_face):
         chosen = of_face == texture
         corners, factor = base.faces[chosen].reshape(-1), None
@@ -118,8 +128,12 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
             extra = {}
         else:
             rows = np.concatenate([corners[:, None], base.uv[chosen].reshape(-1, 2)], axis=1)
-            rows, faces = np.unique(rows, axis=0, return_inverse=True)
+            rows, first, faces = np.unique(rows, axis=0, return_index=True, return_inverse=True)
             used, extra = rows[:, 0].astype(np.int64), {"TEXCOORD_0": rows[:, 1:].astype(np.float32)}
+            if relief:
+                extra["TANGENT"] = tangents[chosen].reshape(-1, 4)[first]
+        if normals is not None:
+            extra["NORMAL"] = normals[used]
         if texture < 0 and base.colors is not None:
             linear = base.colors[used].copy()
             linear[:, :3] = srgb_to_linear(linear[:, :3])
@@ -127,12 +141,13 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
         if texture >= 0:
             source = base.textures[texture]
             factor = {"baseColorFactor": list(source.factor), "baseColorTexture": {"index": len(images)}}
-            images.append({"mimeType": "image/png", "bufferView": _image(chunk, source.pixels)})
-            samplers.append({"wrapS": _WRAPS[source.wrap[0]], "wrapT": _WRAPS[source.wrap[1]]})
+            images.append(_image(chunk, png_of(source.pixels)))
+            samplers.append(_sampler(source))
         primitive = _triangles(chunk, base.vertices[used], faces.reshape(-1, 3).astype(np.int32), extra)
         primitives.append(primitive | {"material": len(materials)})
         mode = "OPAQUE" if texture < 0 else alpha_mode(base.textures[texture])
-        materials.append(_material(factor or {}, mode, lit))
+        material = _material(factor or {}, mode, lit)
+        materials.append(material if factor is None else material | relief)
     meshes = [{"name": "surface", "primitives": primitives}]
     document = chunk.document([placed_node("surface", base, mesh=0)], meshes, materials)
     if images:
@@ -174,8 +189,12 @@ def png_of(pixels: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def _image(chunk: BinaryChunk, pixels: np.ndarray) -> int:
-    return chunk.view(np.frombuffer(png_of(pixels), np.uint8))
+def _image(chunk: BinaryChunk, png: bytes) -> dict[str, Any]:
+    return {"mimeType": "image/png", "bufferView": chunk.view(np.frombuffer(png, np.uint8))}
+
+
+def _sampler(texture: Texture) -> dict[str, int]:
+    return {"wrapS": _WRAPS[texture.wrap[0]], "wrapT": _WRAPS[texture.wrap[1]]}
 
 
 def _triangles(

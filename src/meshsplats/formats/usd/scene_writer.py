@@ -17,10 +17,13 @@ from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.scene_writer import alpha_mode, png_of
-from meshsplats.formats.usd.materials import preview_material, texture_reader
+from meshsplats.formats.surfaces.corners import normal_file, smooth_normals
+from meshsplats.formats.usd.materials import normal_reader, preview_material, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed, splats_stage
 from meshsplats.formats.usd.stage import make_collider, new_stage, placed_mesh
 from meshsplats.formats.usd.writer import mesh_stage
+
+_NORMALS = "normals.png"
 
 
 def write_scene_usd(parts: SceneParts, path: Path, where: Path, *, lit: bool) -> None:
@@ -42,6 +45,8 @@ def write_scene_usd(parts: SceneParts, path: Path, where: Path, *, lit: bool) ->
     if parts.surface is not None:
         stages["Surface"] = _surface_stage(parts.surface, lit)
         images = {f"texture_{i}.png": png_of(t.pixels) for i, t in enumerate(parts.surface.textures)}
+        if _has_relief(parts.surface, lit):
+            images[_NORMALS] = normal_file(parts.surface)[1]
     if parts.collider is not None:
         stages["Collider"] = _collider_stage(parts.collider)
     scene, root = new_stage("/Scene")
@@ -70,6 +75,9 @@ def _surface_stage(base: BaseMesh, lit: bool) -> Any:
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
     stage, shape = placed_mesh(base)
+    if lit:
+        shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(smooth_normals(base)))
+        shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     if base.colors is not None:
         colors = srgb_to_linear(base.colors[:, :3]).astype(np.float32)
         primvar = shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
@@ -93,11 +101,20 @@ def _surface_stage(base: BaseMesh, lit: bool) -> Any:
 
 def _textured(stage: Any, i: int, base: BaseMesh, lit: bool) -> Any:
     """A UsdPreviewSurface that shows texture ``i``."""
-    from pxr import Sdf
+    from pxr import Sdf, UsdShade
 
     types, texture, at = Sdf.ValueTypeNames, base.textures[i], f"/Splats/Texture_{i}"
     image = texture_reader(stage, at, f"texture_{i}.png", texture.wrap)
     image.CreateInput("scale", types.Float4).Set(tuple(texture.factor))
     opacity = None if alpha_mode(texture) == "OPAQUE" else image.CreateOutput("a", types.Float)
     color = image.CreateOutput("rgb", types.Float3)
-    return preview_material(stage, at, color, lit=lit, opacity=opacity)
+    normal = normal_reader(stage, at, _NORMALS) if _has_relief(base, lit) else None
+    material = preview_material(stage, at, color, lit=lit, opacity=opacity, normal=normal)
+    if alpha_mode(texture) == "MASK":  # cut out, so that nothing has to be sorted
+        UsdShade.Shader.Get(stage, f"{at}/Surface").CreateInput("opacityThreshold", types.Float).Set(0.5)
+    return material
+
+
+def _has_relief(base: BaseMesh, lit: bool) -> bool:
+    """Whether the normal map of the surface counts."""
+    return lit and base.normal_map is not None
