@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import runpy
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -124,3 +126,84 @@ def test_meshsplatbench_draws_what_render_draws(monkeypatch, imported, tmp_path)
     soup = adapter.to_primitive()
     shown = soup.sh_coeffs.numpy() * 0.28209479177387814 + 0.5
     np.testing.assert_allclose(shown, MESH.plain.colors[:, :3], atol=1e-6)
+
+
+class Attributes:
+    """Stands in for the classes and values of a module of an engine: any attribute is its own name."""
+
+    def __getattr__(self, name):
+        return name
+
+
+@pytest.fixture
+def unreal(monkeypatch):
+    """A stand-in for Unreal's module: what it holds afterwards are ``assets`` and ``errors``."""
+
+    class StaticMesh:
+        def __init__(self, names):
+            self.static_materials = [SimpleNamespace(imported_material_slot_name=name) for name in names]
+            self.given = {}
+
+        def set_material(self, slot, material):
+            self.given[slot] = material
+
+    class Material:
+        def __init__(self):
+            self.properties, self.connected = {}, {}
+
+        def set_editor_property(self, name, value):
+            self.properties[name] = value
+
+    assets, errors, made = {}, [], []
+
+    def create_asset(name, folder, kind, factory):
+        assert f"{folder}/{name}" not in assets, "the editor returns None for a name that is taken"
+        made.append(name)
+        return assets.setdefault(f"{folder}/{name}", kind())
+
+    def import_asset_tasks(tasks):
+        (task,) = tasks
+        task.imported_object_paths = [f"{task.destination_path}/scene"]
+        assets[f"{task.destination_path}/scene"] = StaticMesh(["splats", "splats_1", "surface", "invisible"])
+
+    tools = SimpleNamespace(create_asset=create_asset, import_asset_tasks=import_asset_tasks)
+    library = SimpleNamespace(does_asset_exist=assets.__contains__, save_loaded_asset=lambda asset: None)
+    editing = SimpleNamespace(
+        create_material_expression=lambda material, kind, x, y: (material, kind),
+        connect_material_property=lambda color, output, name: color[0].connected.update({name: output}),
+        recompile_material=lambda material: None,
+    )
+    module(
+        monkeypatch,
+        "unreal",
+        **{"StaticMesh": StaticMesh, "Material": Material, "MaterialFactoryNew": SimpleNamespace},
+        AssetImportTask=SimpleNamespace,
+        AssetToolsHelpers=SimpleNamespace(get_asset_tools=lambda: tools),
+        EditorAssetLibrary=library,
+        MaterialEditingLibrary=editing,
+        MaterialExpressionVertexColor="VertexColor",
+        **dict.fromkeys(("BlendMode", "MaterialProperty", "MaterialShadingModel"), Attributes()),
+        load_asset=assets.get,
+        log_error=errors.append,
+    )
+    return SimpleNamespace(assets=assets, errors=errors, made=made)
+
+
+def test_unreal_imports_the_solid_and_the_blended_triangles_of_a_file_twice(monkeypatch, unreal, tmp_path):
+    script, mesh = ROOT / "engines/unreal/import_meshsplats.py", ms.convert(few_splats())
+    colors = mesh.colors.copy()
+    colors[mesh.faces[: len(mesh.faces) // 2].ravel(), 3] = 1
+    ms.save_mesh(replace(mesh, colors=colors), tmp_path / "engine.glb", alpha="hybrid")
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "engine.glb")])
+    for _ in range(2):
+        runpy.run_path(str(script), run_name="__main__")
+    solid, blended = (unreal.assets[f"/Game/MeshSplats/M_MeshSplats_{mode}"] for mode in ("Opaque", "Blend"))
+    assert unreal.assets["/Game/MeshSplats/scene"].given == {0: solid, 1: blended}
+    assert solid.connected == {"MP_EMISSIVE_COLOR": ""}
+    assert blended.connected == {"MP_EMISSIVE_COLOR": "", "MP_OPACITY": "A"}
+    assert blended.properties["blend_mode"] == "BLEND_TRANSLUCENT"
+    assert blended.properties["two_sided"] is True
+    assert len(unreal.made) == 2
+    monkeypatch.setattr(sys, "argv", [str(script)])
+    runpy.run_path(str(script), run_name="__main__")
+    assert "no file" in unreal.errors[0]

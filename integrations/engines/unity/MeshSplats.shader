@@ -7,11 +7,16 @@ Shader "MeshSplats/Unlit"
         [Toggle] _ViewDependent ("Colours depend on the view", Float) = 0
         _Base ("Base (extras.meshsplats.viewColors)", Float) = 1
         _Scale ("Scale", Float) = 1
+        [Enum(UnityEngine.Rendering.BlendMode)] _Source ("Source, of blended triangles SrcAlpha", Float) = 1
+        [Enum(UnityEngine.Rendering.BlendMode)] _Target ("Target, of blended triangles OneMinusSrcAlpha", Float) = 0
+        [Toggle] _Depth ("Writes depth, not of blended triangles", Float) = 1
     }
     SubShader
     {
         Tags { "RenderPipeline" = "UniversalPipeline" "RenderType" = "Opaque" "Queue" = "Geometry" }
         Cull Off
+        Blend [_Source] [_Target]
+        ZWrite [_Depth]
         Pass
         {
             HLSLPROGRAM
@@ -49,7 +54,7 @@ Shader "MeshSplats/Unlit"
                 return o;
             }
 
-            half4 frag(Drawn i) : SV_Target { return half4(i.color.rgb, 1); }
+            half4 frag(Drawn i) : SV_Target { return i.color; }
             ENDHLSL
         }
     }
