@@ -287,6 +287,8 @@ def _no_splats(job: Job) -> str:
     endings = [f".{written_ending(path.name)}" for path in job.outputs]
     if splats := [ending for ending in endings if ending not in written_mesh_suffixes()]:
         why = f"convert writes {listed(tuple(splats), 'and')} of splats only; as a mesh it can be {meshes}"
+        if ".usdz" in splats:
+            why += "; in Python, save_scene(path, mesh=mesh) writes a mesh as .usdz"
     else:
         why = f"no splats are made of it; without ``as_splats`` it can become {meshes}"
     return f"{job.source}: a mesh, not splats: {why}"
