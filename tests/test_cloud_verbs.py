@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshsplats import Camera, GaussianCloud, render_splats
+from meshsplats import Camera, DataWarning, GaussianCloud, render_splats
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 
@@ -91,6 +91,23 @@ def test_the_origin_is_a_point_of_the_world():
     np.testing.assert_allclose(other.means, moved.means - [1, 0, 0], atol=1e-6)
 
 
+def test_a_far_move_goes_to_the_origin():
+    near, far, matrix = cloud(), np.array([5e5, 4.5e6, 100]), np.eye(4)
+    matrix[:3, 3] = far
+    moved = near.transformed(matrix)
+    assert_bits(moved, near)
+    np.testing.assert_array_equal(moved.origin, far)
+    assert_bits(moved.transformed(np.linalg.inv(matrix), origin=[0, 0, 0]), near)
+    matrix[:3, 3] = [300, 0, 0]
+    assert near.transformed(matrix).origin.tolist() == [0, 0, 0]
+    matrix[:3, 3] = far
+    with pytest.warns(DataWarning, match="means near 500000 4500000 .* given as origin, they keep it"):
+        coarse = near.transformed(matrix, origin=[0, 0, 0])
+    coarse.transformed(similarity(0, 2.0))  # what is lost already is not lost again
+    with pytest.warns(DataWarning, match="positions near 500000 4500000"):
+        GaussianCloud.joined([replace(near, origin=-far), near])
+
+
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
@@ -125,6 +142,15 @@ def test_a_cloud_that_is_divided_and_joined_is_the_same():
     np.testing.assert_array_equal(back.origin, whole.origin)
     with pytest.raises(ValueError, match="at least one cloud"):
         GaussianCloud.joined([])
+
+
+def test_kernels_that_differ_are_told_of():
+    fine = cloud(kernel="antialiased")
+    with pytest.warns(
+        DataWarning, match="kernels '3dgs' and 'antialiased' are joined: all are drawn as '3dgs'"
+    ):
+        assert GaussianCloud.joined([fine, cloud()]).kernel == "3dgs"
+    assert GaussianCloud.joined([fine, fine]).kernel == "antialiased"
 
 
 def test_a_cloud_behind_another_is_drawn_behind_it():

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import FrozenInstanceError
+
 import numpy as np
 import pytest
+from _splats import few_splats
 
-from meshsplats import GaussianCloud, SplatMesh
+from meshsplats import (
+    BaseMesh,
+    DataWarning,
+    GaussianCloud,
+    SplatMesh,
+    orbit,
+    plain_colors_of,
+    render,
+    save_mesh,
+)
 from meshsplats._arrays import checked_array
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
@@ -47,6 +60,55 @@ def test_good_arrays_are_not_copied():
     assert mesh.vertices is CORNERS
     assert mesh.faces is FACES
     assert mesh.colors is COLORS
+
+
+def test_float64_positions_that_lose_their_detail_are_told_of():
+    far = CORNERS * 0.1 + np.array([5e5, 4.5e6, 100])
+    splats = {name: getattr(few_splats(), name)[:3] for name in ("quaternions", "scales", "opacities", "sh")}
+    for make in (
+        lambda points: triangle(vertices=points),
+        lambda points: BaseMesh(points, FACES),
+        lambda points: GaussianCloud(points, **splats),
+    ):
+        for given in (far, far.tolist()):
+            with pytest.warns(
+                DataWarning, match="steps of 0.5 across an extent of 0.09.* given as origin"
+            ) as told:
+                make(given)
+            assert told[0].filename == __file__
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for fine in (far.astype(np.float32), far.astype(np.float32).astype(float), far - far.min(axis=0)):
+                make(fine)
+
+
+def test_assigning_a_field_says_how_to_change_it():
+    cloud, mesh = few_splats(), triangle(colors=COLORS.copy())
+    with pytest.raises(
+        FrozenInstanceError, match=r"'sh' of a GaussianCloud.*replace\(it, sh=...\) makes another.$"
+    ):
+        cloud.sh = cloud.sh + 1
+    with pytest.raises(
+        FrozenInstanceError, match=r"replace.*The operation has changed the array in place already"
+    ):
+        mesh.colors *= 0.5
+    with pytest.raises(FrozenInstanceError, match="'more' of a SplatMesh"):
+        mesh.more = 1
+
+
+@pytest.mark.parametrize("number", [-5, 3, 10**7])
+def test_faces_that_are_changed_in_place_do_not_crash(number, tmp_path):
+    mesh = triangle(faces=FACES.copy(), face_splat=[0], harmonics=np.ones((1, 3, 3)))
+    cameras = orbit(mesh, 1, width=8, height=8)
+    mesh.faces[0, 1] = number
+    for use in (
+        lambda: render(mesh, cameras[0]),
+        lambda: plain_colors_of(mesh, cameras),
+        *(lambda end=end: save_mesh(mesh, tmp_path / f"mesh.{end}") for end in ("npz", "glb", "ply")),
+    ):
+        with pytest.raises(ValueError, match="faces must be vertex indices from 0 to 2, got"):
+            use()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -210,7 +210,24 @@ def test_joined_meshes_far_apart_keep_their_detail():
     both = SplatMesh.joined([one, two])
     assert both.origin.tolist() == [4e6, 0, 0]
     np.testing.assert_array_equal(both.vertices[len(one.vertices) :], two.vertices + np.float32([64, 0, 0]))
-    assert SplatMesh.joined([fans(), one]).origin.tolist() == [4e6, 0, 0]
+    with pytest.warns(DataWarning, match="positions near -4000000 0 .* steps of 0.25 .* detail is lost"):
+        assert SplatMesh.joined([fans(), one]).origin.tolist() == [4e6, 0, 0]
+
+
+def test_a_far_move_goes_to_the_origin():
+    mesh, far, matrix = fans(), np.array([5e5, 4.5e6, 100]), np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn(0), far
+    moved = mesh.transformed(matrix)
+    assert_same(by_corner(moved), by_corner(mesh.transformed(turn(0))))
+    np.testing.assert_array_equal(moved.origin, far)
+    nearby = mesh.transformed(matrix, origin=far + np.array([1, 0, 0]))
+    np.testing.assert_allclose(nearby.vertices, moved.vertices - np.float32([1, 0, 0]), atol=1e-5)
+    back = moved.transformed(np.linalg.inv(matrix), origin=[0, 0, 0])
+    np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-5)
+    with pytest.warns(DataWarning, match="vertices near 499994 4500002 .* given as origin, they keep it"):
+        mesh.transformed(matrix, origin=[0, 0, 0])
+    with pytest.warns(DataWarning, match="vertices near 500000 4500000 .* steps of 0.5"):
+        mesh.moved(mesh.vertices + far)
 
 
 @pytest.mark.parametrize(

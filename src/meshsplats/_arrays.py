@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar, overload
+from dataclasses import FrozenInstanceError
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
@@ -137,6 +138,36 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
                     f"{name} must be finite, row {int(bad.argmax())} is not ({int(bad.sum())} such rows)"
                 )
     return array
+
+
+def check_faces(faces: np.ndarray, vertices: int) -> None:
+    """Raises ValueError unless the int32 ``faces`` (f, 3) number some of so many ``vertices``. Renderers and
+    writers ask again: what was written into a mesh since would take their process down."""
+    if (
+        len(faces) and faces.view(np.uint32).max() >= vertices
+    ):  # in one pass: -1 is large, too
+        raise ValueError(
+            f"faces must be vertex indices from 0 to {vertices - 1}, got {faces.min()} to {faces.max()}"
+        )
+
+
+def guarded(cls: type[T]) -> type[T]:
+    """The frozen dataclass of arrays ``cls``, which says how to change a field where one is assigned.
+
+    ``cloud.means += 1`` changes the array first and assigns it then, so that the error comes too late.
+    """
+
+    def refuse(self: Any, name: str, value: object) -> None:
+        done = ""
+        if isinstance(value, np.ndarray) and value is getattr(self, name, None):
+            done = " The operation has changed the array in place already, here and wherever it is shared."
+        raise FrozenInstanceError(
+            f"cannot assign to {name!r} of a {cls.__name__}, which does not change: dataclasses.replace(it,"
+            f" {name}=...) makes another.{done}"
+        )
+
+    cls.__setattr__ = refuse  # type: ignore[method-assign]
+    return cls
 
 
 def checked_attributes(attributes: Mapping[str, ArrayLike], rows: int) -> dict[str, np.ndarray]:

@@ -8,10 +8,16 @@ local, in float64.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from meshsplats.errors import DataWarning
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 REACH = 64
 """Distance from (0, 0, 0), in extents of the scene, up to which float32 is fine enough: 17 of its 24 bits
@@ -50,18 +56,35 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
 def lost_detail(positions: np.ndarray) -> str:
     """What a file that stores ``positions`` (n, 3), a sample of them, as float32 has lost, in words; empty
     unless there are fewer than ``FEWEST_STEPS`` steps across the scene."""
-    found = _spread(positions)
-    if found is None:
-        return ""
-    center, extent, farthest = found
-    step = _step(farthest)
-    if extent == 0 or extent >= FEWEST_STEPS * step:
+    coarse = _coarse(positions)
+    if coarse is None:
         return ""
     return (
-        f"positions near {in_words(np.round(center))} are stored as float32, in steps of {step:g} across an"
-        f" extent of {extent:.3g}: detail is lost; double coordinates, or a point nearby that they are"
-        " relative to, keep it"
+        f"positions {coarse}: detail is lost; double coordinates, or a point nearby that they are relative"
+        " to, keep it"
     )
+
+
+def warn_of_rounding(name: str, exact: ArrayLike, *, stacklevel: int) -> None:
+    """A DataWarning, for the caller ``stacklevel`` calls up, if positions ``exact`` (n, 3) are float64 and
+    lose detail as float32: fewer than ``FEWEST_STEPS`` steps are left across them. Looks at a sample."""
+    given = np.asarray(exact)
+    if given.dtype.kind != "f" or given.dtype.itemsize <= 4:
+        return
+    sample = sampled(given)
+    coarse = _coarse(sample)
+    if coarse is not None and (sample != sample.astype(np.float32)).any():
+        warnings.warn(
+            f"{name} {coarse}: detail is lost; relative to a point nearby, given as ``origin``, they keep it",
+            DataWarning,
+            stacklevel=stacklevel + 1,
+        )
+
+
+def loses_detail(local: np.ndarray, shift: np.ndarray) -> bool:
+    """Whether positions ``local`` (n, 3) have their detail in float32, but not after a ``shift`` (3,)."""
+    sample = sampled(local)
+    return _coarse(sample) is None and _coarse(sample + shift) is not None
 
 
 def need_detail(samples: Mapping[Any, np.ndarray], origin: np.ndarray) -> None:
@@ -86,6 +109,20 @@ def need_detail(samples: Mapping[Any, np.ndarray], origin: np.ndarray) -> None:
         )
 
 
+def _coarse(positions: np.ndarray) -> str | None:
+    """Where ``positions`` (n, 3) are and how coarse float32 is there, in words; None unless there are fewer
+    than ``FEWEST_STEPS`` steps across them."""
+    found = _spread(positions)
+    if found is None:
+        return None
+    center, extent, farthest = found
+    step = _step(farthest)
+    if extent == 0 or extent >= FEWEST_STEPS * step:
+        return None
+    near = in_words(np.round(center))
+    return f"near {near} are stored as float32, in steps of {step:g} across an extent of {extent:.3g}"
+
+
 def _step(farthest: float) -> float:
     """The step of float32 at that coordinate."""
     return 2.0 ** (math.floor(math.log2(farthest)) - 23) if farthest else 0.0
@@ -107,10 +144,13 @@ def sampled(positions: np.ndarray) -> np.ndarray:
 
 
 def relative(local: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """``local`` (n, 3) float32 coordinates, of the origin ``own``, relative to the origin ``other``."""
+    """``local`` (n, 3) float32 coordinates, of the origin ``own``, relative to the origin ``other``. A
+    DataWarning, for the caller's caller, says where that is too far for their detail."""
     if (own == other).all():
         return local
-    return (local + (own - other)).astype(np.float32)
+    exact = local + (own - other)
+    warn_of_rounding("positions", exact, stacklevel=3)
+    return exact.astype(np.float32)
 
 
 def shared_origin(origins: Iterable[np.ndarray]) -> np.ndarray:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._origin import in_words, relative, zero_origin
+from meshsplats._arrays import checked_array, guarded
+from meshsplats._origin import in_words, relative, warn_of_rounding, zero_origin
 from meshsplats.binding import check_indices
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 
@@ -66,9 +68,11 @@ class Texture:
         return np.mod(index, side).astype(np.int64)
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class BaseMesh:
-    """n vertices and m triangles. The constructor checks and converts the arrays."""
+    """n vertices and m triangles. The constructor checks and converts the arrays. float64 vertices whose
+    detail float32 would lose are told of by a DataWarning: give ``origin``."""
 
     vertices: np.ndarray
     """(n, 3) float32 positions relative to ``origin``."""
@@ -99,9 +103,12 @@ class BaseMesh:
 
     def __post_init__(self) -> None:
         vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
+        warn_of_rounding("vertices", self.vertices, stacklevel=3)
         faces = checked_array("faces", self.faces, np.int32, (None, 3))
         check_indices("faces", faces, len(vertices), "vertices")
         arrays = {"vertices": vertices, "faces": faces, "up": checked_array("up", self.up, np.float32, (3,))}
+        if not arrays["up"].any():
+            raise ValueError("up must not be the zero vector")
         arrays["origin"] = checked_array("origin", self.origin, np.float64, (3,))
         m = len(faces)
         if self.colors is not None:
@@ -127,8 +134,9 @@ class BaseMesh:
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
 
-    def relative_to(self, origin: Sequence[float] | np.ndarray) -> BaseMesh:
-        """The same mesh in the world, with coordinates relative to ``origin`` (3,)."""
+    def relative_to(self, origin: ArrayLike) -> BaseMesh:
+        """The same mesh in the world, with coordinates relative to ``origin`` (3,). A DataWarning says where
+        that is too far for their detail."""
         point = checked_array("origin", origin, np.float64, (3,))
         if (point == self.origin).all():
             return self

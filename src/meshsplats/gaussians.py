@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, chosen_rows
+from meshsplats._arrays import checked_array, chosen_rows, guarded
 from meshsplats._geometry import affine_parts, quaternion_product, quaternions_of, rotation_rows
 from meshsplats._kinds import need_all, need_choice
-from meshsplats._origin import in_words, relative, shared_origin, zero_origin
+from meshsplats._origin import (
+    in_words,
+    loses_detail,
+    relative,
+    shared_origin,
+    warn_of_rounding,
+    zero_origin,
+)
+from meshsplats.errors import DataWarning
 from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 Kernel = Literal["3dgs", "antialiased", "2dgs"]
 
@@ -25,10 +37,13 @@ def constant_harmonics(colors: np.ndarray) -> np.ndarray:
     return (colors - np.float32(0.5)) / np.float32(SH_C0)
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class GaussianCloud:
     """N Gaussians. Arrays are float32 and C-contiguous; the constructor checks and converts them. Those that
-    need no conversion are kept, not copied: what is written into them later is in the splats, unchecked.
+    need no conversion are kept, not copied: what is written into them later is in the splats, unchecked, and
+    in all that share them. ``dataclasses.replace(cloud, means=...)`` is another cloud with other centres.
+    float64 centres whose detail float32 would lose are told of by a DataWarning: give ``origin``.
 
     Concretely, splat i is ``opacities[i] * exp(-0.5 * |diag(1 / scales[i]) R_i^T (x - means[i])|^2)`` with
     ``R_i`` the rotation of ``quaternions[i]``.
@@ -58,6 +73,7 @@ class GaussianCloud:
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
+        warn_of_rounding("means", self.means, stacklevel=3)
         n = len(means)
         quaternions = checked_array("quaternions", self.quaternions, np.float32, (n, 4))
         scales = checked_array("scales", self.scales, np.float32, (n, 3))
@@ -126,7 +142,7 @@ class GaussianCloud:
                 matrices[:, i, j] = entry
         return matrices
 
-    def take(self, splats: np.ndarray | slice) -> GaussianCloud:
+    def take(self, splats: ArrayLike | slice) -> GaussianCloud:
         """The splats that a mask (n,) bool, indices or a slice chooses, in that order."""
         rows = chosen_rows(splats, len(self), "splats")
         # np.take is several times as fast as indexing on rows as short as these.
@@ -140,7 +156,8 @@ class GaussianCloud:
         """One cloud of one or more, one behind the other.
 
         Missing harmonics are zero; the kernel is '3dgs' unless all share one, ``up`` is None unless all have
-        the same, and the origin is that of the first cloud whose origin is not zero.
+        the same, and the origin is that of the first cloud whose origin is not zero. A DataWarning says where
+        the kernel of a cloud is lost, or the detail of one that is too far from that origin.
         """
         need_all(GaussianCloud, clouds=clouds)
         if not clouds:
@@ -152,7 +169,14 @@ class GaussianCloud:
         for cloud in clouds:
             sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
             start += len(cloud)
-        kernels = {cloud.kernel for cloud in clouds}
+        kernels = sorted({cloud.kernel for cloud in clouds})
+        if len(kernels) > 1:
+            warnings.warn(
+                f"splats of the kernels {' and '.join(map(repr, kernels))} are joined: all are drawn as"
+                " '3dgs', which makes fine splats of the others wider",
+                DataWarning,
+                stacklevel=2,
+            )
         origin = shared_origin(cloud.origin for cloud in clouds)
         clouds = [cloud.relative_to(origin) for cloud in clouds]
         rest = [name for name in GaussianCloud._PER_SPLAT if name != "sh"]
@@ -160,12 +184,12 @@ class GaussianCloud:
         return GaussianCloud(
             **arrays,
             sh=sh,
-            kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
+            kernel=kernels[0] if len(kernels) == 1 else "3dgs",
             up=shared_up([cloud.up for cloud in clouds]),
             origin=origin,
         )
 
-    def transformed(self, matrix: np.ndarray, *, origin: np.ndarray | None = None) -> GaussianCloud:
+    def transformed(self, matrix: ArrayLike, *, origin: ArrayLike | None = None) -> GaussianCloud:
         """The splats after the affine map ``matrix`` of the world: moved, turned, scaled, mirrored.
 
         Concretely, a splat of covariance C and mean m in the world gets covariance A C A^T and mean A m + t.
@@ -176,17 +200,21 @@ class GaussianCloud:
         Args:
             matrix: (4, 4) [[A, t], [0, 1]], (3, 4) [A, t], or (3, 3) A.
             origin: (3,) float64, of the result; None: A times that of the cloud, so that ``means`` become A
-                times them plus t.
+                times them plus t. Where t is so large that float32 would lose their detail, it goes to the
+                origin instead.
 
         Raises ValueError for another shape or last row, and for a matrix that is singular or not finite.
         """
-        a, shift = affine_parts(matrix)
+        a, shift = affine_parts(np.asarray(matrix))
         reverses_axes = (np.abs(a) == np.eye(3)).all()
         moved = self._mirrored(np.diag(a)) if reverses_axes else self._mapped(a)
         mapped = a @ self.origin + 0.0
+        if origin is None and shift.any() and loses_detail(moved.means, shift):
+            origin = mapped + shift
         if origin is not None:
-            means = (self.means.astype(np.float64) @ a.T + (mapped - origin + shift)).astype(np.float32)
-            return replace(moved, means=means, origin=origin)
+            point = checked_array("origin", origin, np.float64, (3,))
+            means = self.means.astype(np.float64) @ a.T + (mapped - point + shift)
+            return replace(moved, means=means, origin=point)
         if shift.any():
             moved = replace(moved, means=moved.means + shift.astype(np.float32))
         return moved if (mapped == moved.origin).all() else replace(moved, origin=mapped)
@@ -227,12 +255,13 @@ class GaussianCloud:
         sh = self.sh
         if sh.shape[1] > 1:
             sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, self.sh_degree) @ sh[:, 1:]], axis=1)
-        means = self.means.astype(np.float64) @ a.T
+        means = (self.means.astype(np.float64) @ a.T).astype(np.float32)
         up = None if self.up is None else orthogonal @ self.up
         return replace(self, means=means, quaternions=quaternions, scales=scales, sh=sh, up=up)
 
-    def relative_to(self, origin: Sequence[float] | np.ndarray) -> GaussianCloud:
-        """The same splats in the world, with coordinates relative to ``origin`` (3,)."""
+    def relative_to(self, origin: ArrayLike) -> GaussianCloud:
+        """The same splats in the world, with coordinates relative to ``origin`` (3,). A DataWarning says
+        where that is too far for their detail."""
         point = checked_array("origin", origin, np.float64, (3,))
         if (point == self.origin).all():
             return self

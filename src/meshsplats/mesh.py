@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, checked_attributes, chosen_rows
+from meshsplats._arrays import check_faces, checked_array, checked_attributes, chosen_rows, guarded
 from meshsplats._kinds import need_all, need_choice
-from meshsplats._origin import in_words, relative, zero_origin
+from meshsplats._origin import in_words, relative, warn_of_rounding, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
-from meshsplats.face_splats import FaceSplats, check_ascending
+from meshsplats.face_splats import FaceSplats, check_ascending, check_harmonics
 from meshsplats.mesh_joining import joined_meshes
 from meshsplats.mesh_moving import moved_mesh, transformed_mesh
 from meshsplats.order import Order, checked_order
 from meshsplats.spherical_harmonics import TERMS, degree_of
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 Blending = Literal["display", "linear"]
 
@@ -55,10 +58,13 @@ class Triangles(NamedTuple):
     order: Order = "fragment"
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class SplatMesh:
     """V vertices and F triangles. The constructor checks and converts the arrays (C-contiguous). Those that
-    need no conversion are kept, not copied: what is written into them later is in the mesh, unchecked.
+    need no conversion are kept, not copied: what is written into them later is in the mesh, unchecked, and in
+    all that share them. ``dataclasses.replace(mesh, colors=...)`` is another mesh with other colours. float64
+    vertices whose detail float32 would lose are told of by a DataWarning: give ``origin``.
 
     Concretely, ``colors[faces[j, k]]`` is the straight (not premultiplied) RGBA at corner k of triangle j;
     inside a triangle RGBA is interpolated with perspective-correct barycentric weights.
@@ -121,19 +127,19 @@ class SplatMesh:
     float32, those of faces single integers."""
 
     def __post_init__(self) -> None:
+        given = self.vertices
         counts = check_fields(self)
+        warn_of_rounding("vertices", given, stacklevel=3)
         v, f, faces = counts["vertex"], counts["face"], self.faces
-        if f and faces.view(np.uint32).max() >= v:  # one pass: negative indices are large as unsigned ones
-            raise ValueError(
-                f"faces must be vertex indices from 0 to {v - 1}, got {faces.min()} to {faces.max()}"
-            )
+        check_faces(faces, v)
         if v and (self.colors.min() < 0 or self.colors.max() > MAX_COLOR):
             low, high = self.colors.min(), self.colors.max()
-            raise ValueError(f"colors must lie in [0, {MAX_COLOR}], got {low:.4g} to {high:.4g}")
+            todo = "; divide bytes by 255" if high > MAX_COLOR else ""
+            raise ValueError(f"colors must lie in [0, {MAX_COLOR}], got {low:.4g} to {high:.4g}{todo}")
         if v and (opacity := self.colors[:, 3].max()) > 1:
             raise ValueError(f"opacities, the last column of colors, must lie in [0, 1], got {opacity:.4g}")
         if self.harmonics is not None:
-            self._check_harmonics(self.harmonics)
+            check_harmonics(self.harmonics, self.blending, self.splats)
         plain = self.plain_colors
         if plain is not None and v and (plain.min() < 0 or plain.max() > 1):
             raise ValueError(f"plain_colors must lie in [0, 1], got {plain.min():.4g} to {plain.max():.4g}")
@@ -168,22 +174,6 @@ class SplatMesh:
             raise ValueError(f"{name} has a row for each splat: give face_splat, too")
         check_ascending(self.face_splat)
         return len(self.splats)
-
-    def _check_harmonics(self, harmonics: np.ndarray) -> None:
-        if harmonics.shape[1] not in TERMS:
-            raise ValueError(
-                "harmonics must have 3, 8 or 15 coefficients for degree 1, 2 or 3, without the constant one,"
-                f" got shape {harmonics.shape}"
-            )
-        if self.blending != "display":
-            raise ValueError(
-                "harmonics are display colours, but the mesh is blended in linear light: give harmonics=None"
-            )
-        if self.splats.share_vertices:
-            raise ValueError(
-                "harmonics are of splats, but two splats share a vertex: give every splat its own vertices,"
-                " or harmonics=None"
-            )
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"attributes": dict(self.attributes)}  # a view of a dictionary cannot be copied
@@ -302,8 +292,9 @@ class SplatMesh:
         one. Found anew at each access, and as large as the mesh: hold it while it is used."""
         return FaceSplats(self.faces, self.face_splat, len(self.vertices))
 
-    def relative_to(self, origin: Sequence[float] | np.ndarray) -> SplatMesh:
-        """The same mesh in the world, with coordinates relative to ``origin`` (3,), also of its base."""
+    def relative_to(self, origin: ArrayLike) -> SplatMesh:
+        """The same mesh in the world, with coordinates relative to ``origin`` (3,), also of its base. A
+        DataWarning says where that is too far for their detail."""
         point = checked_array("origin", origin, np.float64, (3,))
         if (point == self.origin).all():
             return self
@@ -313,7 +304,7 @@ class SplatMesh:
         vertices = relative(self.vertices, self.origin, point)
         return replace(self, vertices=vertices, binding=binding, origin=point)
 
-    def take(self, faces: np.ndarray | slice) -> SplatMesh:
+    def take(self, faces: ArrayLike | slice) -> SplatMesh:
         """The chosen triangles with everything that belongs to them, and without vertices that none uses.
 
         Args:
@@ -368,7 +359,8 @@ class SplatMesh:
         The parts must agree in ``blending``, ``filter_px2``, ``order``, their base, and in which optional
         arrays and attributes they have; only ``depth_group`` and ``plain_colors`` may be missing in some, and
         harmonics, which are 0 then. ``up`` is the first's, from which others differ by less than 45 degrees.
-        Positions are relative to the first ``origin`` that is not zero. Depth groups stay apart.
+        Positions are relative to the first ``origin`` that is not zero; a DataWarning says where that is too
+        far for the detail of a part. Depth groups stay apart.
 
         Args:
             parts: the meshes.
@@ -382,7 +374,7 @@ class SplatMesh:
         return joined_meshes(parts, same_splats=same_splats)
 
     def moved(
-        self, vertices: np.ndarray, *, normals: np.ndarray | None = None, binding: Binding | None = None
+        self, vertices: ArrayLike, *, normals: ArrayLike | None = None, binding: Binding | None = None
     ) -> SplatMesh:
         """The mesh with its vertices at (v, 3) ``vertices``, as after an edit, a pose or a simulation.
 
@@ -399,20 +391,22 @@ class SplatMesh:
         """
         return moved_mesh(self, vertices, normals, binding)
 
-    def transformed(self, matrix: np.ndarray) -> SplatMesh:
+    def transformed(self, matrix: ArrayLike, *, origin: ArrayLike | None = None) -> SplatMesh:
         """The mesh after the affine map ``matrix`` of the world: moved, turned, scaled, mirrored.
 
-        Concretely, a vertex v goes to A v + t, ``origin`` to A times it. Colours seen from direction d become
+        Concretely, a vertex v of the world goes to A v + t. Colours seen from direction d become
         those seen from U^T d, where U is the orthogonal factor of A, and ``up`` turns by U. A mirror reverses
         the order of the corners, so that normals stay outside. A binding to a base stays, but for one with
         layers above it and a map that is no similarity; a DataWarning says so.
 
         Args:
             matrix: (4, 4) [[A, t], [0, 1]], (3, 4) [A, t], or (3, 3) A.
+            origin: (3,) float64, of the result; None: A times that of the mesh. Where t is so large that
+                float32 would lose the detail of the vertices, it goes to the origin instead.
 
         Raises ValueError for another shape or last row, and for a matrix that is singular or not finite.
         """
-        return transformed_mesh(self, matrix)
+        return transformed_mesh(self, matrix, origin)
 
     def prune(self, min_opacity: float) -> SplatMesh:
         """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the

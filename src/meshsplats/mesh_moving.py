@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._geometry import affine_parts
+from meshsplats._origin import loses_detail, warn_of_rounding
 from meshsplats.errors import DataWarning
 from meshsplats.spherical_harmonics import moved_harmonics, turned_harmonics
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 _ALIKE = 1e-6
 """Largest difference between the stretches of a similarity, relative."""
@@ -19,8 +23,9 @@ Mesh = TypeVar("Mesh", bound=Any)
 """``SplatMesh``, which imports this module."""
 
 
-def moved_mesh(mesh: Mesh, vertices: np.ndarray, normals: np.ndarray | None, binding: Any) -> Mesh:
+def moved_mesh(mesh: Mesh, vertices: ArrayLike, normals: ArrayLike | None, binding: Any) -> Mesh:
     """``SplatMesh.moved``."""
+    warn_of_rounding("vertices", vertices, stacklevel=3)
     vertices = checked_array("vertices", vertices, np.float32, (len(mesh.vertices), 3))
     harmonics = mesh.harmonics
     old = mesh.normals if normals is None else None
@@ -32,9 +37,16 @@ def moved_mesh(mesh: Mesh, vertices: np.ndarray, normals: np.ndarray | None, bin
     return replace(mesh, vertices=vertices, normals=normals, harmonics=harmonics, binding=binding)
 
 
-def transformed_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+def transformed_mesh(mesh: Mesh, matrix: ArrayLike, origin: ArrayLike | None) -> Mesh:
     """``SplatMesh.transformed``."""
-    a, shift = affine_parts(matrix)
+    a, shift = affine_parts(np.asarray(matrix))
+    point = a @ mesh.origin + 0.0
+    if origin is not None:
+        given = checked_array("origin", origin, np.float64, (3,))
+        point, shift = given, shift + (point - given)
+        warn_of_rounding("vertices", mesh.vertices @ a.T + shift, stacklevel=3)
+    elif shift.any() and loses_detail(mesh.vertices @ a.T, shift):
+        point, shift = point + shift, np.zeros(3)
     u, stretch, vt = np.linalg.svd(a)
     mirrors = np.linalg.det(a) < 0
 
@@ -66,5 +78,5 @@ def transformed_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
         harmonics=None if mesh.harmonics is None else moved_harmonics(mesh.harmonics, a),
         up=u @ vt @ mesh.up,
         binding=binding,
-        origin=a @ mesh.origin + 0.0,
+        origin=point,
     )

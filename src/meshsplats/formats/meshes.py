@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import check_faces, checked_array
 from meshsplats._files.atomic import atomic_path
 from meshsplats._foreign import foreign, foreign_archive
 from meshsplats._kinds import each, need, need_path
@@ -154,7 +154,8 @@ def save_mesh(
             texture coordinates, which engines import: docs/viewers.md has the shaders.
 
     Raises:
-        ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh.
+        ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh, or its
+            faces were changed in place and number vertices that there are not.
         MissingDependencyError: a package is missing.
         OSError: the file cannot be written.
     """
@@ -162,6 +163,7 @@ def save_mesh(
         SplatMesh, mesh=mesh, instead={"GaussianCloud": "save_gaussians writes splats, convert makes a mesh"}
     )
     need_path(path=path)
+    check_faces(mesh.faces, len(mesh.vertices))
     target = Path(path)
     suffix = target.suffix.lower()
     kind = mesh_format_to_write(target)

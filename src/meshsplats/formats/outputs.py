@@ -105,11 +105,10 @@ def placed(scene: Scene, origin: WantedOrigin) -> Scene:
     check_origin(origin)
     if isinstance(origin, str):
         return scene if origin == "keep" else replace(scene, origin=np.zeros(3))
-    scene = scene.relative_to(origin)
     places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
-    if lost := lost_detail(sampled(places)):
+    if lost := lost_detail(sampled(places) + (scene.origin - origin)):
         raise OptionsError(f"``origin``: too far from the scene; relative to that point, {lost}")
-    return replace(scene, origin=np.zeros(3))
+    return replace(scene.relative_to(origin), origin=np.zeros(3))
 
 
 def check_origin(origin: WantedOrigin) -> None:

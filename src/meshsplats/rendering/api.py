@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from meshsplats._arrays import check_faces
 from meshsplats._core import library, structures
 from meshsplats._kinds import each, need
 from meshsplats.camera import Camera
@@ -118,8 +119,9 @@ def render(
         device: 'cpu' or 'gpu'.
 
     Raises:
-        ValueError: an option out of its range, an attribute that the mesh does not have, or a filter for a
-            mesh without ``face_splat`` or whose splats share vertices.
+        ValueError: an option out of its range, an attribute that the mesh does not have, a filter for a mesh
+            without ``face_splat`` or whose splats share vertices, or faces that were changed in place and
+            number vertices that there are not.
         MemoryError: the scene does not fit.
         MissingDependencyError: no GPU, or no library for it.
         DeviceError: the GPU failed, or did not finish; this process was forked from one that uses it.
@@ -127,6 +129,7 @@ def render(
     need(SplatMesh, mesh=mesh, instead={"GaussianCloud": "render_splats draws splats, convert makes a mesh"})
     need(Camera, camera=camera)
     check_device(device)
+    check_faces(mesh.faces, len(mesh.vertices))
     camera = camera.with_near_plane(mesh.vertices)
     checked_options(Pointers(), camera, background, samples, threads)
     if max_layers is not None and not (

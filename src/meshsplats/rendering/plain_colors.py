@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from meshsplats._arrays import check_faces
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
@@ -36,6 +37,7 @@ def plain_colors_of(mesh: SplatMesh, cameras: Sequence[Camera], *, threads: int 
     need_all(Camera, cameras=cameras)
     if not len(cameras):
         raise ValueError("cameras must be at least one view that colours are taken from, got none")
+    check_faces(mesh.faces, len(mesh.vertices))
     if mesh.harmonics is None:
         return mesh.plain.colors[:, :3].copy()
     drawing = engine("cpu", threads)

@@ -57,9 +57,10 @@ def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = Non
     clouds = []
     for cloud, matrix in placed:
         try:
-            clouds.append(cloud.transformed(matrix[:3], origin=origin if origin.any() else None))
+            moved = cloud.transformed(matrix[:3], origin=origin if origin.any() else None)
         except ValueError as error:
             raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
+        clouds.append(moved.relative_to(origin))
     return joined_within(clouds, document.budget)
 
 
