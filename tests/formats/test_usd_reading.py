@@ -14,7 +14,8 @@ from _meshes import assert_same, random_mesh
 from meshsplats import DataWarning, FileFormatError, MissingDependencyError, load_mesh, save_mesh
 from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.usd import reader as usd_reader
-from meshsplats.formats.usd.extraction import checked, extract_meshes
+from meshsplats.formats.usd.extraction import extract_meshes
+from meshsplats.formats.usd.opening import checked
 
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed")
 COLOR = ' color3f[] primvars:displayColor = [(0.5, 0, 1)] (interpolation = "constant")'
@@ -105,6 +106,29 @@ def test_polygons_places_and_winding(tmp_path):
     np.testing.assert_array_equal(arrays["faces"], [[0, 1, 2], [0, 2, 3], [0, 3, 4], [7, 6, 5]])
     settings = {"attributes": [], "blending": "display", "up": [0, 1, 0], "origin": [0, 0, 0]}
     assert report == {"warnings": [], "textured": False, **settings}
+
+
+@needs_usd
+def test_mirrors_do_not_turn_meshes_inside_out(tmp_path):
+    """Nor do two of them, or one of a mesh that is wound the other way."""
+    mirror = ' float3 xformOp:scale = (-1, 1, 1)\n uniform token[] xformOpOrder = ["xformOp:scale"]\n'
+    meshes = (
+        shape("A", mirror),
+        shape("B", mirror + ' uniform token orientation = "leftHanded"'),
+        f'def Xform "X" {{\n{mirror}{shape("C", mirror)}}}\n',
+    )
+    for body, expected in zip(meshes, ([2, 1, 0], [0, 1, 2], [0, 1, 2]), strict=True):
+        assert read(tmp_path, stage(body))[0]["faces"].tolist() == [expected]
+
+
+@needs_usd
+def test_holes_are_not_filled(tmp_path):
+    body = (
+        'def Mesh "M" {\n point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]\n'
+        " int[] faceVertexCounts = [4, 3, 3]\n int[] faceVertexIndices = [0, 1, 2, 3, 0, 1, 2, 0, 2, 3]\n"
+        " int[] holeIndices = [0, 2]\n}\n"
+    )
+    assert read(tmp_path, stage(body))[0]["faces"].tolist() == [[0, 1, 2]]
 
 
 @needs_usd

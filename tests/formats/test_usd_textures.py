@@ -78,7 +78,7 @@ DEFAULTS = {
 @pytest.fixture
 def parts(monkeypatch):
     """Reads USD in this process, which is quick; the names of the parts that ran."""
-    from meshsplats.formats.usd import camera_extraction, extraction, texture_extraction
+    from meshsplats.formats.usd import camera_extraction, extraction, opening, texture_extraction
 
     found = {
         "extraction": extraction.extract_meshes,
@@ -90,7 +90,7 @@ def parts(monkeypatch):
     def extract(module, file, path, result, origin):
         ran.append(module.rpartition(".")[2])
         try:
-            report = extraction.checked(found[ran[-1]], file, result, origin)
+            report = opening.checked(found[ran[-1]], file, result, origin)
         except FileFormatError as error:
             raise FileFormatError(f"{path}: {error}") from None
         return json.loads(json.dumps(report))

@@ -21,9 +21,9 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._orientation import up_rotation
+from meshsplats.formats._polygons import cut_polygons
 from meshsplats.formats._validation import checked, local_positions, straight_colors
 from meshsplats.formats.mesh_formats import FileSize, MeshCodec
-from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
 _TURNED_COMMENT = "# meshsplats turned"
@@ -142,14 +142,14 @@ def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
                 elif words[0] == b"f":
                     count = len(positions) // 3
                     lengths.append(len(words) - 1)
-                    corners.extend(_corner(word, count) for word in words[1:])
+                    corners.extend(corner(word, count) for word in words[1:])
             except (ValueError, OverflowError):
                 text = b" ".join(words)[:60].decode("latin-1")
                 raise FileFormatError(f"{path}: line {number:,} cannot be read: {text!r}") from None
     if not lengths:
         raise FileFormatError(f"{path}: holds no faces")
-    faces, _ = cut_polygons(np.array(lengths), np.array(corners), {})
-    points = np.array(positions).reshape(-1, 3)
+    points, polygons = np.array(positions).reshape(-1, 3), np.array(corners)
+    faces = polygons[cut_polygons(np.array(lengths), corner_places(points, polygons))[0]]
     if turn is not None:
         with np.errstate(invalid="ignore", over="ignore"):
             points = points @ turn
@@ -166,6 +166,11 @@ def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         up=up,
         origin=at,
     )
+
+
+def corner_places(points: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+    """(k, 3) the ``points`` (v, 3) at the ``corners`` (k,) of polygons; None where one is not among them."""
+    return points[corners] if corners.max(initial=0) < len(points) else None
 
 
 def _turned(words: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
@@ -190,7 +195,7 @@ def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             yield number, words
 
 
-def _corner(word: bytes, count: int) -> int:
+def corner(word: bytes, count: int) -> int:
     """0-based vertex index of ``v``, ``v/vt`` or ``v/vt/vn``, which count from 1, or from -1 back."""
     stored = int(word.partition(b"/")[0])
     index = stored - 1 if stored > 0 else stored + count

@@ -11,8 +11,8 @@ import numpy as np
 from meshsplats.base_mesh import Texture, Wrap
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
-from meshsplats.formats.obj.mesh import statements
-from meshsplats.formats.ply.faces import cut_polygons
+from meshsplats.formats._polygons import cut_polygons
+from meshsplats.formats.obj.mesh import corner, corner_places, statements
 
 MAX_LIBRARY_BYTES = 16 << 20
 """A larger file of materials is refused."""
@@ -26,7 +26,8 @@ def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], li
 
     None for a file without texture coordinates. Raises FileFormatError that names the line.
     """
-    coordinates, lengths, corners, materials = array("d"), array("q"), array("q"), array("q")
+    positions, coordinates = array("d"), array("d")
+    lengths, points, corners, materials = array("q"), array("q"), array("q"), array("q")
     names: dict[bytes, int] = {b"": 0}
     libraries: list[bytes] = []
     current = 0
@@ -35,9 +36,13 @@ def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], li
             try:
                 if words[0] == b"vt":
                     coordinates.extend((float(words[1]), 1 - float(words[2]) if len(words) > 2 else 0.0))
+                elif words[0] == b"v":
+                    positions.extend(map(float, words[1:4]))
                 elif words[0] == b"f":
                     lengths.append(len(words) - 1)
                     materials.append(current)
+                    count = len(positions) // 3
+                    points.extend(corner(word, count) for word in words[1:])
                     count = len(coordinates) // 2
                     corners.extend(_coordinate(word, count) for word in words[1:])
                 elif words[0] == b"usemtl":
@@ -49,9 +54,11 @@ def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], li
                 raise FileFormatError(f"{path}: line {number:,} cannot be read: {text!r}") from None
     if not coordinates or not lengths:
         return None
-    triangles, kept = cut_polygons(np.array(lengths), np.array(corners), {"material": np.array(materials)})
+    places = corner_places(np.array(positions).reshape(-1, 3), np.array(points))
+    cut, owner = cut_polygons(np.array(lengths), places)
+    triangles = np.array(corners)[cut]
     uv = np.array(coordinates).reshape(-1, 2)
-    if triangles.max() >= len(uv):
+    if triangles.max(initial=-1) >= len(uv):
         raise FileFormatError(f"{path}: a face names texture coordinate {triangles.max() + 1} of {len(uv):,}")
     with np.errstate(over="ignore"):
         found = np.where((triangles >= 0)[..., None], uv[triangles], 0).astype(np.float32)
@@ -60,7 +67,7 @@ def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], li
     return (
         np.nan_to_num(found, posinf=0, neginf=0),
         complete,
-        [ordered[i] for i in kept["material"]],
+        [ordered[i] for i in np.array(materials)[owner]],
         libraries,
     )
 

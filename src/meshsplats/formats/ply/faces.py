@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._polygons import cut_polygons
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.header import Element, PlyHeader, Property
 
@@ -21,12 +22,18 @@ _INDEX_NAMES = ("vertex_indices", "vertex_index")
 
 
 def read_faces(
-    file: BinaryIO, header: PlyHeader, face: Element, names: tuple[str, ...], budget: Budget, path: Path
+    file: BinaryIO,
+    header: PlyHeader,
+    face: Element,
+    names: tuple[str, ...],
+    points: np.ndarray,
+    budget: Budget,
+    path: Path,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Triangles (f, 3) of the element ``face``, and its integer properties among ``names``, each (f,)
     int64.
 
-    Polygons become fans of triangles around their first corner; points and lines are dropped. Raises
+    Polygons are cut by the positions ``points`` (v, 3) of the vertices; points and lines are dropped. Raises
     FileFormatError.
     """
     index = _index(face)
@@ -44,7 +51,12 @@ def read_faces(
     data = file.read()
     polygons = (_ascii if header.encoding == "ascii" else _binary)(data, header, face, index, keep, path)
     lengths, corners, values = polygons
-    return cut_polygons(lengths, corners, {p.name: v for p, v in zip(keep, values, strict=True)})
+    if not len(corners) or (lengths == 3).all() or corners.min() < 0 or corners.max() >= len(points):
+        places = None  # no need for them, or an error of the mesh
+    else:
+        places = points[corners]
+    cut, owner = cut_polygons(lengths, places)
+    return corners[cut], {p.name: v[owner] for p, v in zip(keep, values, strict=True)}
 
 
 def read_corner_values(
@@ -78,24 +90,6 @@ def _index(face: Element) -> Property | None:
 def _integers(face: Element, names: tuple[str, ...]) -> list[Property]:
     """The integer properties among ``names``."""
     return [p for p in face.properties if p.name in names and not p.is_list and p.dtype.kind in "iu"]
-
-
-def cut_polygons(
-    lengths: np.ndarray, corners: np.ndarray, values: dict[str, np.ndarray]
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Triangles of polygons of ``lengths`` (n,), concatenated in ``corners``.
-
-    Returns:
-        (f, 3) corners of the triangles; ``values``, each (n,), as (f,): those of their polygons.
-    """
-    if (lengths == 3).all():
-        return corners.reshape(-1, 3), values
-    per_face = np.maximum(lengths - 2, 0)
-    owner = np.repeat(np.arange(len(lengths)), per_face)
-    start = (np.cumsum(lengths) - lengths)[owner]
-    step = np.arange(len(owner)) - (np.cumsum(per_face) - per_face)[owner]
-    triangles = np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
-    return triangles, {name: v[owner] for name, v in values.items()}
 
 
 # -- binary

@@ -299,7 +299,7 @@ def _read(
             # Bytes in a wider type: no program writes white as the largest signed integer.
             arrays["colors"][:, i] /= np.float32(255)
     of_faces = tuple(field.name for field in SplatMesh.EXTRAS if field.per == "face")
-    faces, numbers = read_faces(file, header, face, of_faces, budget, path)
+    faces, numbers = read_faces(file, header, face, of_faces, arrays["vertices"], budget, path)
     plain = settings.pop("plain_colors", False)
     if own:
         settings["harmonics"] = _harmonics(file, header, budget, path)

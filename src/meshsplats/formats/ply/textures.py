@@ -9,13 +9,14 @@ from typing import BinaryIO
 
 import numpy as np
 
+from meshsplats._origin import choose_origin
 from meshsplats.base_mesh import Texture
 from meshsplats.errors import DataWarning
 from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.faces import read_corner_values, read_faces
 from meshsplats.formats.ply.header import PlyHeader, read_header
-from meshsplats.formats.ply.table import FloatTable
+from meshsplats.formats.ply.table import POSITION, FloatTable
 
 _OF_CORNERS, _NUMBER = "texcoord", "texnumber"
 _OF_VERTICES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
@@ -71,12 +72,13 @@ def _coordinates(file: BinaryIO, header: PlyHeader, path: Path) -> tuple[np.ndar
     if columns is None:
         return None
     budget = Budget(path)
-    faces, _ = read_faces(file, header, face, (), budget, path)
-    budget.spend(8 * vertex.count, "texture coordinates")
-    table = FloatTable(file, header, vertex, columns, path)
-    at = [table.names.index(name) for name in columns]
+    budget.spend(20 * vertex.count, "texture coordinates")
+    table = FloatTable(file, header, vertex, (*POSITION, *columns), path)
+    table.origin = choose_origin(table.sample())
+    at = [table.names.index(name) for name in (*POSITION, *columns)]
     values = np.concatenate([chunk[:, at] for chunk in table.chunks()])
-    return values[faces], np.zeros(len(faces), np.int64)
+    faces, _ = read_faces(file, header, face, (), values[:, :3], budget, path)
+    return values[faces, 3:], np.zeros(len(faces), np.int64)
 
 
 def _images(

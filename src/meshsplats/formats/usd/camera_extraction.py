@@ -16,14 +16,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.formats._orientation import up_rotation
-from meshsplats.formats.usd.extraction import (
-    is_own_placement,
-    is_visible,
-    main,
-    opened,
-    our_note,
-    visible_meshes,
-)
+from meshsplats.formats.usd.opening import is_visible, main, opened, visible_meshes
+from meshsplats.formats.usd.own_notes import is_own_placement, our_note
 
 _MOST = 20_000
 """Cameras that are read."""

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._polygons import cut_polygons
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.ply.faces import cut_polygons
 
 
 class Polygons(NamedTuple):
@@ -22,17 +22,11 @@ class Polygons(NamedTuple):
     """(n,) int64 corners of each polygon."""
     corners: np.ndarray
     """(k,) int64 point at each corner."""
-    left_handed: bool
-    """Whether polygons face the side from which their corners go clockwise."""
-
-    def triangles(self, values: np.ndarray) -> np.ndarray:
-        """(f, 3) of ``values`` (k,), at the corners of the triangles that the polygons are cut into."""
-        cut, _ = cut_polygons(self.lengths, values, {})
-        return cut[:, ::-1] if self.left_handed else cut
-
-    def of_triangles(self, values: np.ndarray) -> np.ndarray:
-        """(f,) of ``values`` (n,): of each triangle, that of its polygon."""
-        return cut_polygons(self.lengths, self.corners, {"": values})[1][""]
+    cut: np.ndarray
+    """(f, 3) int64 corners, among the k, of the triangles that they are cut into, but for holes;
+    counterclockwise as seen from the front in the frame of the stage."""
+    owner: np.ndarray
+    """(f,) int64 polygon of each triangle."""
 
     def at_corners(self, values: np.ndarray, kind: str) -> np.ndarray:
         """(k, columns) of the values of a primvar, by its interpolation; a constant stays one row."""
@@ -43,7 +37,7 @@ class Polygons(NamedTuple):
 
 def polygons_of(shape: Any, budget: Budget) -> Polygons:
     """The polygons of a UsdGeom.Mesh. FileFormatError if their corners are not points of the mesh."""
-    from pxr import UsdGeom
+    from pxr import Usd, UsdGeom
 
     at = str(shape.GetPath())[-100:]
     points = _array(shape.GetPointsAttr(), None, at, "points").reshape(-1, 3)
@@ -57,8 +51,13 @@ def polygons_of(shape: Any, budget: Budget) -> Polygons:
         raise FileFormatError(f"mesh {at}: faceVertexCounts do not add up to {len(corners):,} corners")
     if len(corners) and (corners.min() < 0 or corners.max() >= v):
         raise FileFormatError(f"mesh {at}: corners {corners.min()} to {corners.max()} of {v:,} points")
-    left_handed = shape.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-    return Polygons(at, points, lengths, corners, left_handed)
+    cut, owner = cut_polygons(lengths, points[corners])
+    holes = _array(shape.GetHoleIndicesAttr(), np.int64, at, "holeIndices", required=False)
+    kept = ~np.isin(owner, holes)
+    # A mirror turns a mesh inside out, unless its faces are wound the other way.
+    mirrored = shape.ComputeLocalToWorldTransform(Usd.TimeCode.EarliestTime()).GetDeterminant() < 0
+    backwards = (shape.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded) != mirrored
+    return Polygons(at, points, lengths, corners, cut[kept, :: -1 if backwards else 1], owner[kept])
 
 
 def primvar(shape: Any, name: str, columns: int, polygons: Polygons) -> tuple[np.ndarray | None, str]:
@@ -90,10 +89,10 @@ def primvar(shape: Any, name: str, columns: int, polygons: Polygons) -> tuple[np
     return values, kind
 
 
-def _array(attribute: Any, dtype: type | None, at: str, what: str) -> np.ndarray:
+def _array(attribute: Any, dtype: type | None, at: str, what: str, *, required: bool = True) -> np.ndarray:
     from pxr import Usd
 
     stored = attribute.Get(Usd.TimeCode.EarliestTime()) if attribute else None
-    if stored is None:
+    if stored is None and required:
         raise FileFormatError(f"mesh {at} has no {what}")
-    return np.array(stored, dtype)
+    return np.array(() if stored is None else stored, dtype)

@@ -18,7 +18,7 @@ from meshsplats._geometry import rotation_rows
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.usd.extraction import is_visible, main, opened
+from meshsplats.formats.usd.opening import is_visible, main, opened
 from meshsplats.formats.usd.splats_writer import PRIM, turn_of
 from meshsplats.gaussians import Kernel
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.usd.extraction import main, opened, visible_meshes
 from meshsplats.formats.usd.looks import Looks
+from meshsplats.formats.usd.opening import main, opened, visible_meshes
 from meshsplats.formats.usd.polygons import polygons_of, primvar
 
 _PRIMVAR = "st"
@@ -59,7 +59,7 @@ def _coordinates(shape: Any, budget: Budget, looks: Looks) -> tuple[np.ndarray, 
         with np.errstate(over="ignore", invalid="ignore"):
             placed = placed @ matrix[:2, :2].T + matrix[:2, 2]
             uv[here] = placed * [1, -1] + [0, 1]  # USD's v is up
-    return uv[polygons.triangles(np.arange(count))], polygons.of_triangles(look)
+    return uv[polygons.cut], look[polygons.owner]
 
 
 if __name__ == "__main__":
