@@ -12,7 +12,7 @@ from _priors import CUBE, CUBE_FACES, bumpy, cube, rotation
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
+from meshsplats import Camera, SplatMesh, load_base, load_mesh, orbit, psnr, render
 from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View, ViewImage
@@ -534,6 +534,28 @@ def test_another_topology_is_refused():
         prior.check_topology(BaseMesh(CUBE, changed))
     with pytest.raises(ValueError, match="bound to no base"):
         MeshPrior(replace(prior.mesh, binding=None))
+
+
+def test_a_pose_whose_polygons_are_cut_along_other_diagonals(tmp_path):
+    """A corner of a quad of a cube is drawn in until the quad is concave; the cube is closed, too."""
+    lines = [[1, 4, 3, 2], [5, 6, 7, 8], [1, 2, 6, 5], [2, 3, 7, 6], [3, 4, 8, 7], [4, 1, 5, 8]]
+    faces = "".join(f"f {' '.join(map(str, face))}\n" for face in lines)
+
+    def write(points):
+        text = "".join("v {} {} {}\n".format(*p) for p in points.tolist())
+        (tmp_path / "m.obj").write_text(text + faces)
+        return load_base(tmp_path / "m.obj", textures=False)
+
+    points = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
+    prior = bind(write(points))
+    moved = points.copy()
+    moved[[1, 5], :2] = 0.2, 0.9  # of four of the six quads
+    edited = write(moved)
+    assert (edited.faces != prior.base_faces).any()
+    np.testing.assert_array_equal(prior.vertices_of(edited), moved.astype(np.float32))
+    for shuffled in (np.roll(edited.faces, 2, axis=0), edited.faces[:, ::-1], (edited.faces + 1) % 8):
+        with pytest.raises(ValueError, match="other triangles"):
+            prior.vertices_of(BaseMesh(moved, shuffled))
 
 
 def test_exported_bases_are_matched():

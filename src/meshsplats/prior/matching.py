@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import permutations, product
 
 import numpy as np
@@ -15,14 +16,18 @@ distance from the base itself: less than most poses, more than rounding."""
 _UNITS = 10.0 ** np.array([-3, -2, 0, 2, 3])
 """Factors between the units of programs."""
 
+_MOST_TRIANGLES = 1000
+"""Of a polygon that is recognised by its outline."""
+
 _SIGNS = np.array(list(product((1, -1), repeat=3)))
 
 
 def matched_vertices(binding: Binding, base: BaseMesh) -> np.ndarray:
     """(n, 3) float32 positions in the edited ``base`` of the n vertices that the ``binding`` has.
 
-    Its vertices are in the same order, with the same triangles in any order and from any corner; or its
-    triangles are in the same order, whatever an exporter has made of its vertices, which are split at seams.
+    Its vertices are in the same order, with the same triangles in any order and from any corner, or with the
+    same polygons in the same order, which readers may cut otherwise in another pose; or its triangles are in
+    the same order, whatever an exporter has made of its vertices, which are split at seams.
 
     Raises ValueError where neither is so.
     """
@@ -34,7 +39,7 @@ def matched_vertices(binding: Binding, base: BaseMesh) -> np.ndarray:
             f"the edited base has {count:,} vertices and {len(found):,} triangles, the splats"
             f" are bound to one of {n:,} and {len(expected):,}: {advice}"
         )
-    if count == n and (_sorted(found) == _sorted(expected)).all():
+    if count == n and ((_sorted(found) == _sorted(expected)).all() or _cut_otherwise(expected, found)):
         return base.vertices
     place = binding.places[expected].ravel()
     corners = base.vertices[found].reshape(-1, 3)
@@ -59,9 +64,39 @@ def matched_vertices(binding: Binding, base: BaseMesh) -> np.ndarray:
 
 def _sorted(faces: np.ndarray) -> np.ndarray:
     """(m, 3) the triangles, each from its first vertex on, in ascending order."""
-    start = faces.argmin(axis=1)[:, None]
-    turned = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+    turned = _turned(faces)
     return turned[np.lexsort(turned.T)]
+
+
+def _turned(faces: np.ndarray) -> np.ndarray:
+    """(m, 3) the triangles, each from its first vertex on."""
+    start = faces.argmin(axis=1)[:, None]
+    return np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+
+
+def _cut_otherwise(expected: np.ndarray, found: np.ndarray) -> bool:
+    """Whether triangles (m, 3) and (m, 3) are of the same polygons in the same order, cut along some other
+    diagonals."""
+    first, after = None, 0
+    open_edges: Counter[tuple[int, int]] = Counter()
+    for row in np.flatnonzero((_turned(expected) != _turned(found)).any(axis=1)).tolist():
+        # Triangles that both cuts of a polygon have change nothing, wherever they stand.
+        first = row if first is None else first
+        for triangle, sign in ((expected[row].tolist(), 1), (found[row].tolist(), -1)):
+            for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
+                edge = (min(a, b), max(a, b))
+                open_edges[edge] += sign if a < b else -sign
+                if not open_edges[edge]:
+                    del open_edges[edge]
+        after = row + 1
+        if after - first > _MOST_TRIANGLES:
+            return False
+        if not open_edges:  # all of a polygon, whose k triangles have k + 2 corners
+            one, other = set(expected[first:after].ravel().tolist()), set(found[first:after].ravel().tolist())
+            if one != other or len(one) != after - first + 2:
+                return False
+            first = None
+    return first is None
 
 
 def exchanged_axes(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, float]:
