@@ -20,6 +20,7 @@ from meshsplats import (
     load_gaussians,
     save_gaussians,
 )
+from meshsplats.demo_scene import make_scene
 from meshsplats.gaussians import SH_C0
 
 LAYOUTS = ("gsplat", "inria", "nerfstudio")
@@ -280,3 +281,21 @@ def test_what_holds_no_tensors(tensors, words):
 def test_a_layout_that_is_none():
     with pytest.raises(ValueError, match="layout must be one of gsplat, inria, nerfstudio, got 'ply'"):
         gaussians_to_tensors(gaussians_from_tensors(trained(2)), "ply")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_values_after_activation_are_told_of_and_taken(layout):
+    cloud = make_scene(600).of_degree(1)
+    tensors = gaussians_to_tensors(cloud, layout)
+    gaussians_from_tensors(tensors)  # says nothing
+    for name, array in tensors.items():
+        if "scal" in name:
+            tensors[name] = np.exp(array)
+        elif "opac" in name:
+            tensors[name] = cloud.opacities.reshape(array.shape)
+    with pytest.warns(DataWarning, match=rf"tensors of {layout}: .* activated=scales,opacities") as told:
+        gaussians_from_tensors(tensors)
+    assert told[0].filename == __file__
+    assert_close(gaussians_from_tensors(tensors, activated=["scales", "opacities"]), cloud)
+    with pytest.raises(ValueError, match="activated must be of scales, opacities, colors, got 'size'"):
+        gaussians_from_tensors(tensors, activated=["size"])

@@ -16,16 +16,18 @@ Layouts, from the programs' sources:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import checked_array, subsample
 from meshsplats._kinds import described, need, need_choice
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.formats import _activation
 from meshsplats.formats._validation import local_positions
+from meshsplats.formats.ply import activated as stored_activated
+from meshsplats.formats.ply.activated import Activated
 from meshsplats.formats.splats._cloud_builder import CloudBuilder
 from meshsplats.gaussians import GaussianCloud, Kernel, constant_harmonics
 
@@ -69,6 +71,7 @@ def gaussians_from_tensors(
     kernel: Kernel | None = None,
     strict: bool = False,
     origin: Sequence[float] | np.ndarray | None = None,
+    activated: Iterable[Activated] = (),
 ) -> GaussianCloud:
     """The splats that a training program holds, after activation.
 
@@ -93,11 +96,14 @@ def gaussians_from_tensors(
         strict: raise an error for unusable splats, where by default a DataWarning says how many are left out:
             those with values that are not finite after activation, or with a zero quaternion.
         origin: as for ``load_gaussians``.
+        activated: which of 'scales', 'opacities' and 'colors' are given as they are, such as ``get_scaling``
+            and ``get_opacity`` of a ``GaussianModel``. A DataWarning says where values look so.
 
     Raises:
         TypeError: ``tensors`` is nothing of the kind.
-        ValueError: one is missing, its shape is wrong, or there are no splats.
+        ValueError: one is missing, its shape is wrong, there are no splats, or an option is out of range.
     """
+    done = stored_activated.checked_activated(activated)
     layout, take = _layout(tensors)
     names = _LAYOUTS[layout]
     given = _array(names.means, take(names.means), "(n, 3)", lambda shape: shape[1:] == (3,))
@@ -118,25 +124,52 @@ def gaussians_from_tensors(
     rest = first[:, :0]
     if take(names.rest) is not None:
         rest = part(names.rest, "(n, k, 3) with k = 0, 3, 8 or 15", *((k, 3) for k in (0, 3, 8, 15)))
-    if layout == "nerfstudio" and not rest.shape[1]:
-        first = constant_harmonics(_activation.activated_opacities(first))
     stored = _Stored(means, quaternions, logs, logits, first, rest)
-    return _activated(stored, kernel, f"the tensors of {layout}", at, strict=strict)
+    looks = {name: span for name, span in _looks_activated(stored).items() if name not in done}
+    stored_activated.warn_of(looks, f"the tensors of {layout}", stacklevel=2)
+    if "colors" in done:
+        stored = stored._replace(first=stored_activated.harmonics_of(first, stored_activated.span_of(first)))
+    elif layout == "nerfstudio" and not rest.shape[1]:
+        stored = stored._replace(first=constant_harmonics(_activation.activated_opacities(first)))
+    return _cloud(stored, kernel, done, f"the tensors of {layout}", at, strict=strict)
 
 
-def _activated(
-    stored: _Stored, kernel: Kernel | None, where: str, origin: np.ndarray, *, strict: bool
+def _looks_activated(stored: _Stored) -> dict[Activated, int]:
+    """Which of the values look so, by a sample of them, and their greatest value."""
+    columns = stored.means, stored.logs, stored.logits, stored.first[:, 0]
+    sample = [subsample(column, stored_activated.SAMPLE) for column in columns]
+    finite = np.logical_and.reduce([np.isfinite(a.reshape(len(a), -1)).all(axis=1) for a in sample])
+    means, scales, opacities, colors = (array[finite] for array in sample)
+    return stored_activated.suspects(len(stored.means), means, scales, opacities, colors)
+
+
+def _cloud(
+    stored: _Stored,
+    kernel: Kernel | None,
+    done: Sequence[Activated],
+    where: str,
+    origin: np.ndarray,
+    *,
+    strict: bool,
 ) -> GaussianCloud:
-    """The cloud of ``stored`` values; warnings are for the caller's caller."""
+    """The cloud of ``stored`` values, of which some are activated already; warnings are for the caller's
+    caller."""
     means, quaternions, logs, logits, first, rest = stored
     n = len(means)
     builder = CloudBuilder(n, 1 + rest.shape[1], where, origin=origin)
     rows = builder.next(n)
     rows.means[:], rows.quaternions[:] = means, quaternions
-    _activation.activated_opacities(logits, out=rows.opacities)
+    if "opacities" in done:
+        rows.opacities[:] = np.clip(logits / np.float32(stored_activated.span_of(logits)), 0, 1)
+    else:
+        _activation.activated_opacities(logits, out=rows.opacities)
     kernel = kernel or ("2dgs" if logs.shape[1] == 2 else "3dgs")
     axes = 2 if kernel == "2dgs" else logs.shape[1]
-    rows.scales[:, :axes] = _activation.activated_scales(logs[:, :axes])
+    scales = logs[:, :axes]
+    if "scales" in done:
+        rows.scales[:, :axes] = np.where(scales >= 0, scales, np.nan)  # no deviation is negative
+    else:
+        rows.scales[:, :axes] = _activation.activated_scales(scales)
     rows.scales[:, axes:] = 0
     rows.sh[:, :1], rows.sh[:, 1:] = first, rest
     builder.keep(rows)

@@ -69,8 +69,8 @@ def suspects(
     return found
 
 
-def warn_of(found: dict[Activated, int], where: object) -> None:
-    """Says what looks activated, and how it is read."""
+def warn_of(found: dict[Activated, int], where: object, *, stacklevel: int = 4) -> None:
+    """Says what looks activated, and how it is read, to the caller ``stacklevel`` calls up."""
     if not found:
         return
     said = " and ".join(f"{name}: {_MEANINGS[name].format(span)}" for name, span in found.items())
@@ -79,7 +79,7 @@ def warn_of(found: dict[Activated, int], where: object) -> None:
         f"{where}: its values look as if they were stored after activation ({said}); if so,"
         f" ``activated``={','.join(names)} reads it right",
         DataWarning,
-        stacklevel=5,
+        stacklevel=stacklevel + 1,
     )
 
 
