@@ -84,6 +84,17 @@ def test_trained_on_splats(scene, tmp_path, capsys):
     assert load_prior(out).lift == pytest.approx(-0.01)
 
 
+def test_a_base_in_other_units_than_the_splats_is_told_before_training(scene, tmp_path, capsys):
+    base = load_mesh(scene / "base.obj")
+    save_mesh(replace(base, vertices=100 * base.vertices), tmp_path / "cm.obj")
+    options = ["--steps", "1", "--views", "1", "--held-out", "1", "--width", "16", "--colors", "grey"]
+    arguments = ("--splats", scene / "scene.ply", "-o", tmp_path / "p.npz", *options)
+    assert run("prior", tmp_path / "cm.obj", *arguments) == 0
+    printed = capsys.readouterr().err
+    assert "cm.obj: does not fit the splats of" in printed
+    assert printed.index("does not fit") < printed.index("faces carry")
+
+
 def test_a_prior_is_no_base(scene, trained, tmp_path, capsys):
     arguments = ("--splats", scene / "scene.ply", "-o", tmp_path / "p.npz")
     assert run("prior", trained, *arguments) == 1

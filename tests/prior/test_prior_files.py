@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +15,42 @@ from _glb import edit_glb, read_glb
 from _meshes import assert_same
 from _priors import bumpy, cube
 
-from meshsplats import DataWarning, FileFormatError, SplatMesh, load_mesh, save_mesh
+from meshsplats import BaseMesh, DataWarning, FileFormatError, SplatMesh, load_mesh, save_mesh
+from meshsplats._words import parse_up
+from meshsplats.demo_scene import make_scene
 from meshsplats.prior import MeshPrior, bind, load_prior
+from meshsplats.prior.agreement import warn_of_contradictions
+
+CLOUD = make_scene(300)
+EXTENT = np.abs(CLOUD.means).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "shift", "ups", "message"),
+    [
+        ("b.glb", 1, 0, ("y", "y"), None),
+        ("b.obj", 1, 0, ("y", "-y"), None),  # which declares none
+        ("b.glb", 1, 0, ("y", None), None),
+        ("b.glb", 100, 0, ("y", "y"), r"about \d+ times as large \(scale it by 0\.0\d+\)"),
+        ("b.glb", 0.01, 0, ("y", "y"), r"about 0\.0\d+ times as large \(scale it by \d+\)"),
+        ("b.obj", 1, 9, ("y", "y"), r"far away from them \(move it by -[\d.]+, [\d.e-]+, [\d.e-]+\)"),
+        ("b.usda", 1, 0, ("z", "-y"), r"its z points up, theirs is -y \(turn it by 90 degrees around x\)"),
+        ("b.glb", 1, 0, ("y", "-y"), r"its y points up, theirs is -y \(turn it by 180 degrees around x\)"),
+    ],
+)
+def test_a_base_that_contradicts_the_splats_is_told(name, scale, shift, ups, message):
+    up, other = (None if text is None else parse_up(text) for text in ups)
+    points = (cube().vertices * EXTENT + [shift * EXTENT, 0, 0]) * scale
+    base, cloud = BaseMesh(points, cube().faces, up=up), replace(CLOUD, up=other)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_of_contradictions(base, cloud, Path(name), Path("s.ply"))
+    if message is None:
+        assert not caught
+    else:
+        (found,) = (str(each.message) for each in caught)
+        assert re.search(f"^{re.escape(name)}: does not fit the splats of s.ply: .*{message}", found)
+
 
 PARTS = ("base_vertices", "base_faces", "vertex_face", "weights", "layers")
 

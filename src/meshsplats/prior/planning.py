@@ -29,6 +29,7 @@ from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 from meshsplats.mesh import SplatMesh
+from meshsplats.prior.agreement import warn_of_contradictions
 from meshsplats.prior.laying import bind
 from meshsplats.prior.matching import exchanged_axes, in_words
 from meshsplats.prior.model import MeshPrior, load_prior
@@ -101,6 +102,7 @@ class PriorTraining:
         if self.splats is None:
             return self.target.make(_grey_mesh(base), self.source, background, self.threads)
         cloud = self.reading.load(self.splats, base.origin, threads=self.threads)
+        warn_of_contradictions(base, cloud, self.source, self.splats)
         views = worthwhile_views(as_begun(config, earlier))
         return self.target.make(cloud, self.splats, background, self.threads, views)
 
