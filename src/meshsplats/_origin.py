@@ -22,12 +22,18 @@ if TYPE_CHECKING:
 REACH = 64
 """Distance from (0, 0, 0), in extents of the scene, up to which float32 is fine enough: 17 of its 24 bits
 are left for places in the scene, half a millimetre in 60 m."""
-FEWEST_STEPS = 1 << 10
+FAR = 10_000.0
+"""Least distance across, and greatest height, of the coordinates of a survey, in metres or feet. Those that
+were turned to y up have a northing for a height."""
+FEWEST_STEPS = 1 << 13
 """Steps across a scene below which what a float32 file itself has lost shows in images."""
 SAMPLE = 1 << 12
 """Positions that the choice of an origin looks at, about."""
 _SHARE = 0.05
 """Share of the positions at either end that do not count for the extent: outliers."""
+
+
+_LOST = "detail is lost; double coordinates, or a point nearby that they are relative to, keep it"
 
 
 def zero_origin() -> np.ndarray:
@@ -39,15 +45,17 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
     """The origin for a scene of ``positions`` (n, 3) float64 in the world: (3,) float64.
 
     Zero for a scene that is no farther away than ``REACH`` times its extent, so that coordinates stay as they
-    are; and for positions without an extent. Else the median, rounded to a power of ten of at most the extent
-    (below 1: a power of two). The nearest and farthest positions along each axis, one in twenty, do not
-    count.
+    are, unless they are those of a survey: ``FAR`` away, and farther than the scene is wide. Zero also for
+    positions without an extent. Else the median, rounded to a power of ten of at most the extent (below 1: a
+    power of two). The nearest and farthest positions along each axis, one in twenty, do not count.
     """
     found = _spread(positions)
     if found is None:
         return zero_origin()
     center, extent, farthest = found
-    if farthest <= REACH * extent or extent <= 2.0**-52 * farthest:
+    away = float(np.abs(center).max())
+    surveyed = away >= FAR and away > extent
+    if (farthest <= REACH * extent and not surveyed) or extent <= 2.0**-52 * farthest:
         return zero_origin()
     unit = 10.0 ** math.floor(math.log10(extent)) if extent >= 1 else 2.0 ** math.floor(math.log2(extent))
     return np.round(center / unit) * unit + 0.0
@@ -59,10 +67,18 @@ def lost_detail(positions: np.ndarray) -> str:
     coarse = _coarse(positions)
     if coarse is None:
         return ""
-    return (
-        f"positions {coarse}: detail is lost; double coordinates, or a point nearby that they are relative"
-        " to, keep it"
-    )
+    return f"positions {coarse}: {_LOST}"
+
+
+def lost_between(positions: np.ndarray, size: float) -> str:
+    """As ``lost_detail``, where there are steps enough across the scene, but larger ones than what is there:
+    splats or triangles of that ``size``."""
+    found = _spread(positions)
+    if found is None or not 0 < size < _step(found[2]) or _coarse(positions) is not None:
+        return ""
+    near, step = in_words(np.round(found[0])), _step(found[2])
+    where = f"positions near {near} are stored as float32, in steps of {step:g}"
+    return f"{where}, of what is {size:.2g} large: {_LOST}"
 
 
 def warn_of_rounding(name: str, exact: ArrayLike, *, stacklevel: int) -> None:

@@ -7,6 +7,7 @@ import json
 import struct
 import warnings
 import zipfile
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -35,12 +36,14 @@ from meshsplats import (
     stream_gaussians,
 )
 from meshsplats._origin import choose_origin, in_words
+from meshsplats.cameras.framing import default_up
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats.gaussians import save_gaussian_blocks
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.meshes import save_mesh_blocks
+from meshsplats.formats.outputs import placed
 from meshsplats.formats.tensors import gaussians_from_tensors
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.options import TileOptions
@@ -71,7 +74,7 @@ def turn_x(points):
 # -- which origin
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 50.0])
 def test_scenes_near_zero_have_none(scale):
     points = scale * np.random.default_rng(0).normal(size=(500, 3))
     assert not choose_origin(points).any()
@@ -89,6 +92,52 @@ def test_the_distance_in_extents_decides():
     assert not choose_origin(points + np.array([60 * extent, 0, 0])).any()
     assert choose_origin(points + np.array([66 * extent, 0, 0])).any()
     assert choose_origin(10_000 * points + FAR).any()
+
+
+@pytest.mark.parametrize(
+    "middle", [(530_000, 180_000, 20), (5_000, 431_000, 100), (4_206_000, 169_000, 4_776_000)]
+)
+def test_wide_surveys_have_one(middle):
+    """A town of 10 km and a corridor of 100 km, where float32 has steps of centimetres and more."""
+    rng = np.random.default_rng(0)
+    for size in ([5_000, 5_000, 50], [50_000, 500, 50]):
+        points = size * rng.uniform(-1, 1, (2000, 3))
+        assert choose_origin(points + middle).any()
+        assert not choose_origin(points).any()
+        assert not choose_origin(points + 9_000).any()  # nearer than a survey is
+
+
+@pytest.mark.parametrize("size", [0.3, 0.7])
+def test_splats_that_are_smaller_than_the_steps_of_their_file_are_named(tmp_path, size):
+    """20 km of splats in a UTM zone, where float32 has steps of 0.5 m: enough across them, not for each."""
+    values, _ = splats()
+    rng = np.random.default_rng(5)
+    for axis, middle in zip("xyz", FAR, strict=True):
+        values[axis] = middle + rng.uniform(-10_000, 10_000, 300) * (axis != "z")
+        values[f"scale_{'xyz'.index(axis)}"] = np.full(300, np.log(size))
+    for name, types, said in (("single.ply", {}, size < 0.5), ("double.ply", DOUBLES, False)):
+        path = write_ply(tmp_path / name, [splat_table(values, types)])
+        for read in (load_gaussians, lambda path: list(stream_gaussians(path, block=64))):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                read(path)
+            text = "in steps of 0.5, of what is 0.3 large: detail is lost"
+            assert sum(text in str(each.message) for each in caught) == said
+    placed(load_gaussians(tmp_path / "double.ply"), FAR)
+    with pytest.warns(DataWarning, match="in steps of 0.5") if size < 0.5 else nullcontext():
+        placed(load_gaussians(tmp_path / "double.ply"), (0, 0, 0))
+
+
+def test_up_is_away_from_the_ground_for_coordinates_from_the_middle_of_the_earth():
+    """48.79 north, 2.3 east by the formulas of WGS 84, and a place in a UTM zone that is as far from zero."""
+    north, east, height = np.radians(48.79), np.radians(2.3), 120.0
+    normal = np.array([np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)])
+    squared = 0.00669437999014
+    bend = 6_378_137 / np.sqrt(1 - squared * np.sin(north) ** 2)
+    place = (bend + height) * normal - [0, 0, squared * bend * np.sin(north)]
+    np.testing.assert_allclose(default_up(np.round(place)), normal, atol=1e-6)
+    assert default_up(np.array([500_000, 6_350_000, 120])).tolist() == [0, 0, 1]
+    assert default_up(2 * place).tolist() == [0, -1, 0]
 
 
 def test_an_extent_below_the_rounding_of_doubles_is_none():

@@ -11,8 +11,9 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
+from meshsplats._geometry import away_from_ground
 from meshsplats._kinds import need_array
-from meshsplats._origin import choose_origin, sampled
+from meshsplats._origin import FAR, choose_origin, sampled
 from meshsplats.camera import Camera
 from meshsplats.errors import DataWarning, StraysWarning
 from meshsplats.gaussians import GaussianCloud
@@ -22,9 +23,6 @@ DEFAULT_UP = (0.0, -1.0, 0.0)
 """Splats trained from COLMAP cameras have the y axis pointing down."""
 SURVEY_UP = (0.0, 0.0, 1.0)
 """Surveys have eastings, northings and heights."""
-FAR = 10_000.0
-"""Least distance across, and greatest height, of the coordinates of a survey, in metres or feet. Those that
-were turned to y up have a northing for a height."""
 SAMPLE = 20_000
 """Largest number of points to measure: more do not change the quantiles visibly."""
 SURROUNDINGS = 4.0
@@ -301,16 +299,20 @@ def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = N
 
 
 def up_of_survey(cloud: GaussianCloud) -> np.ndarray | None:
-    """(3,) unit direction that points up in the coordinates of a survey, such as UTM; None for other ones."""
+    """(3,) unit direction that points up in the coordinates of a survey, such as UTM or ECEF; None for other
+    ones."""
     up = default_up(choose_origin(sampled(cloud.means) + cloud.origin))
     return None if np.array_equal(up, DEFAULT_UP) else up
 
 
 def default_up(origin: np.ndarray) -> np.ndarray:
     """(3,) unit direction that points up in a scene of which no more is known than its ``origin`` (3,) in the
-    world: (0, 0, 0), or a point in its midst if it is far from there."""
-    surveyed = np.hypot(*origin[:2]) >= FAR > abs(origin[2])
-    return np.array(SURVEY_UP if surveyed else DEFAULT_UP)
+    world: (0, 0, 0), or a point in its midst if it is far from there. Surveys have z up, coordinates from the
+    middle of the Earth (ECEF) the normal of its ellipsoid."""
+    if np.hypot(*origin[:2]) >= FAR > abs(origin[2]):
+        return np.array(SURVEY_UP)
+    away = away_from_ground(origin)
+    return np.array(DEFAULT_UP) if away is None else away
 
 
 def _up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:

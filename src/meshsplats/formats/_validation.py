@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, lost_detail, sampled
+from meshsplats._origin import choose_origin, lost_between, lost_detail, sampled
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
 from meshsplats.mesh import SplatMesh
 
@@ -77,6 +77,13 @@ def warn_of_lost_detail(sample: np.ndarray, where: object) -> None:
     """A DataWarning if a file that stores positions as float32, of which this is a ``sample``, has lost
     detail."""
     if lost := lost_detail(sample):
+        warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
+
+
+def warn_of_coarse_steps(means: np.ndarray, scales: np.ndarray, origin: np.ndarray, where: object) -> None:
+    """A DataWarning if splats of a file that stores positions as float32 are smaller than its steps there.
+    ``means`` and ``scales`` (n, 3) are some of them, relative to ``origin``."""
+    if len(means) and (lost := lost_between(sampled(means) + origin, float(np.median(scales.max(axis=1))))):
         warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 

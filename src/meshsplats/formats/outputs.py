@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from meshsplats._files.atomic import refuse_existing
 from meshsplats.errors import (
+    DataWarning,
     EarlierRunError,
     FileFormatError,
     NothingToResumeError,
@@ -95,20 +97,38 @@ def scaled(scene: Scene, factor: float | None) -> Scene:
 
 def placed(scene: Scene, origin: WantedOrigin) -> Scene:
     """``scene`` as it is to be written: with its origin ("keep"), without any ("local"), or relative to this
-    point of the world. OptionsError for a point that is too far away for float32, OptionValueError for any
-    other word."""
+    point of the world. OptionsError for a point that is too far away for float32, a DataWarning where only
+    details are lost there, OptionValueError for any other word."""
     import numpy as np
 
-    from meshsplats._origin import lost_detail, sampled
+    from meshsplats._origin import lost_between, lost_detail, sampled
     from meshsplats.gaussians import GaussianCloud
 
     check_origin(origin)
     if isinstance(origin, str):
         return scene if origin == "keep" else replace(scene, origin=np.zeros(3))
     places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
-    if lost := lost_detail(sampled(places) + (scene.origin - origin)):
+    there = sampled(places) + (scene.origin - origin)
+    if lost := lost_detail(there):
         raise OptionsError(f"``origin``: too far from the scene; relative to that point, {lost}")
+    if lost := lost_between(there, _size_of(scene)):
+        warnings.warn(f"``origin``: relative to that point, {lost}", DataWarning, stacklevel=2)
     return replace(scene.relative_to(origin), origin=np.zeros(3))
+
+
+def _size_of(scene: GaussianCloud | SplatMesh | BaseMesh) -> float:
+    """Usual size of a splat or a triangle, scene units; of a sample of them."""
+    import numpy as np
+
+    from meshsplats._origin import sampled
+    from meshsplats.gaussians import GaussianCloud
+
+    if isinstance(scene, GaussianCloud):
+        return float(np.median(scene.scales.max(axis=1))) if len(scene) else 0.0
+    if not len(scene.faces):
+        return 0.0
+    a, b, _ = sampled(scene.faces).astype(int).T
+    return float(np.median(np.linalg.norm(scene.vertices[a] - scene.vertices[b], axis=1)))
 
 
 def check_origin(origin: WantedOrigin) -> None:

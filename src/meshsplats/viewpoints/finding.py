@@ -13,7 +13,7 @@ import numpy as np
 from meshsplats._kinds import need
 from meshsplats._words import direction_in_words
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import DEFAULT_UP, SURVEY_UP, guess_up, scene_bounds, unit_up, up_of_survey
+from meshsplats.cameras.framing import DEFAULT_UP, guess_up, scene_bounds, unit_up, up_of_survey
 from meshsplats.cameras.placing import (
     OBJECT_ELEVATIONS,
     STEPS,
@@ -315,7 +315,8 @@ def _from_outside(cloud: GaussianCloud, key: _Key, up: np.ndarray, threads: int 
             as_it_stands, surer = kind_from_outside(cloud, stance, threads)
             if as_it_stands == "object":
                 kind, confidence, up, sure = as_it_stands, surer, stance, SEEN
-        if key[1] is None and np.array_equal(up, SURVEY_UP) and up_of_survey(cloud) is not None:
+        surveyed = up_of_survey(cloud) if key[1] is None else None
+        if surveyed is not None and np.array_equal(up, surveyed):
             sure = MEASURED
         seen = _Outside(relief, kind, confidence, up, sure)
         known = _outsides[cloud] = key, seen

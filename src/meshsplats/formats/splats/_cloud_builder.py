@@ -11,7 +11,7 @@ import numpy as np
 
 from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import Budget, warn_of_lost_detail
+from meshsplats.formats._validation import Budget, warn_of_coarse_steps, warn_of_lost_detail
 from meshsplats.formats.opened import Splats
 from meshsplats.gaussians import GaussianCloud, Kernel
 
@@ -89,7 +89,9 @@ class SplatReader(Splats):
             rows = builder.next(m)
             fill(rows)
             builder.keep(rows)
-        return builder.finish(self.kernel, strict=strict)
+        cloud = builder.finish(self.kernel, strict=strict)
+        self._check_steps(cloud)
+        return cloud
 
     def blocks(self, size: int, *, strict: bool, origin: np.ndarray) -> Iterator[GaussianCloud]:
         builder: CloudBuilder | None = None
@@ -97,7 +99,7 @@ class SplatReader(Splats):
             if builder is None:
                 builder = self._builder(origin, max(size, m))
             elif builder.held and builder.held + m > size:
-                yield builder.take(self.kernel)
+                yield from self._taken(builder)
             rows = builder.next(m)
             fill(rows)
             builder.keep(rows)
@@ -106,7 +108,18 @@ class SplatReader(Splats):
         builder = builder or self._builder(origin)
         builder.report(strict=strict)
         if builder.held:
-            yield builder.take(self.kernel)
+            yield from self._taken(builder)
+
+    def _taken(self, builder: CloudBuilder) -> Iterator[GaussianCloud]:
+        """The splats that ``builder`` holds, as a block; the first is looked at for lost detail."""
+        first, block = builder.taken == 0, builder.take(self.kernel)
+        if first:
+            self._check_steps(block)
+        yield block
+
+    def _check_steps(self, cloud: GaussianCloud) -> None:
+        if self.float32 and self.origin is None:
+            warn_of_coarse_steps(cloud.means, cloud.scales, cloud.origin, self.where)
 
     def _builder(self, origin: np.ndarray, capacity: int | None = None) -> CloudBuilder:
         flat = self.kernel == "2dgs"
@@ -150,6 +163,11 @@ class CloudBuilder:
         )
         self._kept = self._taken = self._not_finite = self._zero_quaternions = 0
         self._first_bad: int | None = None
+
+    @property
+    def taken(self) -> int:
+        """Count of the rows that were taken."""
+        return self._taken
 
     @property
     def held(self) -> int:
