@@ -104,7 +104,7 @@ def test_a_far_move_goes_to_the_origin():
     with pytest.warns(DataWarning, match="means near 500000 4500000 .* given as origin, they keep it"):
         coarse = near.transformed(matrix, origin=[0, 0, 0])
     coarse.transformed(similarity(0, 2.0))  # what is lost already is not lost again
-    with pytest.warns(DataWarning, match="positions near 500000 4500000"):
+    with pytest.warns(DataWarning, match="means near 500000 4500000"):
         GaussianCloud.joined([replace(near, origin=-far), near])
 
 

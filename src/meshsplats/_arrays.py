@@ -143,9 +143,7 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
 def check_faces(faces: np.ndarray, vertices: int) -> None:
     """Raises ValueError unless the int32 ``faces`` (f, 3) number some of so many ``vertices``. Renderers and
     writers ask again: what was written into a mesh since would take their process down."""
-    if (
-        len(faces) and faces.view(np.uint32).max() >= vertices
-    ):  # in one pass: -1 is large, too
+    if len(faces) and faces.view(np.uint32).max() >= vertices:  # in one pass: -1 is large, too
         raise ValueError(
             f"faces must be vertex indices from 0 to {vertices - 1}, got {faces.min()} to {faces.max()}"
         )

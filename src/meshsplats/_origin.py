@@ -8,13 +8,10 @@ local, in float64.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from meshsplats.errors import DataWarning
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -81,20 +78,17 @@ def lost_between(positions: np.ndarray, size: float) -> str:
     return f"{where}, of what is {size:.2g} large: {_LOST}"
 
 
-def warn_of_rounding(name: str, exact: ArrayLike, *, stacklevel: int) -> None:
-    """A DataWarning, for the caller ``stacklevel`` calls up, if positions ``exact`` (n, 3) are float64 and
-    lose detail as float32: fewer than ``FEWEST_STEPS`` steps are left across them. Looks at a sample."""
+def lost_by_rounding(name: str, exact: ArrayLike) -> str:
+    """What positions ``exact`` (n, 3), if they are float64, lose as float32, in words; empty unless there are
+    fewer than ``FEWEST_STEPS`` steps across them. Looks at a sample."""
     given = np.asarray(exact)
     if given.dtype.kind != "f" or given.dtype.itemsize <= 4:
-        return
+        return ""
     sample = sampled(given)
     coarse = _coarse(sample)
-    if coarse is not None and (sample != sample.astype(np.float32)).any():
-        warnings.warn(
-            f"{name} {coarse}: detail is lost; relative to a point nearby, given as ``origin``, they keep it",
-            DataWarning,
-            stacklevel=stacklevel + 1,
-        )
+    if coarse is None or (sample == sample.astype(np.float32)).all():
+        return ""
+    return f"{name} {coarse}: detail is lost; relative to a point nearby, given as ``origin``, they keep it"
 
 
 def loses_detail(local: np.ndarray, shift: np.ndarray) -> bool:
@@ -160,13 +154,9 @@ def sampled(positions: np.ndarray) -> np.ndarray:
 
 
 def relative(local: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """``local`` (n, 3) float32 coordinates, of the origin ``own``, relative to the origin ``other``. A
-    DataWarning, for the caller's caller, says where that is too far for their detail."""
-    if (own == other).all():
-        return local
-    exact = local + (own - other)
-    warn_of_rounding("positions", exact, stacklevel=3)
-    return exact.astype(np.float32)
+    """``local`` (n, 3) float32 coordinates, of the origin ``own``, relative to the origin ``other``: float64
+    where that moves them."""
+    return local if (own == other).all() else local + (own - other)
 
 
 def shared_origin(origins: Iterable[np.ndarray]) -> np.ndarray:

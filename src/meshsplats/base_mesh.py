@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from meshsplats._arrays import checked_array, guarded
-from meshsplats._origin import in_words, relative, warn_of_rounding, zero_origin
+from meshsplats._origin import in_words, lost_by_rounding, relative, zero_origin
 from meshsplats.binding import check_indices
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.errors import warn_of_data
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -103,7 +104,7 @@ class BaseMesh:
 
     def __post_init__(self) -> None:
         vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
-        warn_of_rounding("vertices", self.vertices, stacklevel=3)
+        warn_of_data(lost_by_rounding("vertices", self.vertices))
         faces = checked_array("faces", self.faces, np.int32, (None, 3))
         check_indices("faces", faces, len(vertices), "vertices")
         arrays = {"vertices": vertices, "faces": faces, "up": checked_array("up", self.up, np.float32, (3,))}

@@ -24,6 +24,8 @@ MAX_SKEW = 1e-2
 """How far a rotation may be from orthonormal; less than that is taken for rounding."""
 OPENGL = np.array([1.0, -1.0, -1.0])
 """Turns OpenGL's y and z axes, up and backwards, to those of OpenCV, and back."""
+OUT_OF_SIGHT = "are they of one scene, and do the matrices of the cameras lead from world to camera?"
+"""What to ask of cameras that do not see a scene."""
 _MAX_NAME = 1000
 """Length of a name that camera files may have."""
 

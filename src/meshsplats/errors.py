@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import sys
+import warnings
 from collections.abc import Callable
 
 
@@ -69,6 +71,20 @@ class DataWarning(NamingOptions, UserWarning):
     """Some of the data was left out or altered; the message counts it."""
 
 
+def warn_of_data(message: str) -> None:
+    """A DataWarning with ``message``, unless it is empty, at the line that called this package, be it through
+    ``dataclasses.replace``."""
+    if not message:
+        return
+    frame, level = sys._getframe(1), 2
+    while frame.f_back and frame.f_back.f_globals["__name__"].partition(".")[0] in (
+        "meshsplats",
+        "dataclasses",
+    ):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, DataWarning, stacklevel=level + 1)
+
+
 class StraysWarning(DataWarning):
     """Splats lie far outside of the scene, or are far larger than it."""
 
@@ -79,6 +95,10 @@ class NoColorsWarning(DataWarning):
 
 class NoTextureWarning(DataWarning):
     """The textures of a mesh file were left out, or became colours of vertices."""
+
+
+class AnimationWarning(DataWarning):
+    """Of a mesh file with an animation, the first time was read."""
 
 
 class DivergenceError(ValueError):

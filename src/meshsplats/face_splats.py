@@ -7,8 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from meshsplats.spherical_harmonics import TERMS
-
 _CLEAR = 1e-6
 """Weight of a corner of opacity 0, so that splats of nothing else have a centre, too."""
 _OPEN = 1e-10
@@ -25,13 +23,8 @@ def check_ascending(face_splat: np.ndarray | None) -> None:
         raise ValueError("face_splat must be ascending indices >= 0")
 
 
-def check_harmonics(harmonics: np.ndarray, blending: str, splats: FaceSplats) -> None:
-    """Raises ValueError unless ``harmonics`` (s, k, 3) are those of ``splats``, which are blended so."""
-    if harmonics.shape[1] not in TERMS:
-        raise ValueError(
-            "harmonics must have 3, 8 or 15 coefficients for degree 1, 2 or 3, without the constant one,"
-            f" got shape {harmonics.shape}"
-        )
+def check_harmonics(blending: str, splats: FaceSplats) -> None:
+    """Raises ValueError unless ``splats`` that are blended so can have harmonics."""
     if blending != "display":
         raise ValueError(
             "harmonics are display colours, but the mesh is blended in linear light: give harmonics=None"

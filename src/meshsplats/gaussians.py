@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -15,12 +14,12 @@ from meshsplats._kinds import need_all, need_choice
 from meshsplats._origin import (
     in_words,
     loses_detail,
+    lost_by_rounding,
     relative,
     shared_origin,
-    warn_of_rounding,
     zero_origin,
 )
-from meshsplats.errors import DataWarning
+from meshsplats.errors import warn_of_data
 from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ class GaussianCloud:
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
-        warn_of_rounding("means", self.means, stacklevel=3)
+        warn_of_data(lost_by_rounding("means", self.means))
         n = len(means)
         quaternions = checked_array("quaternions", self.quaternions, np.float32, (n, 4))
         scales = checked_array("scales", self.scales, np.float32, (n, 3))
@@ -171,11 +170,9 @@ class GaussianCloud:
             start += len(cloud)
         kernels = sorted({cloud.kernel for cloud in clouds})
         if len(kernels) > 1:
-            warnings.warn(
+            warn_of_data(
                 f"splats of the kernels {' and '.join(map(repr, kernels))} are joined: all are drawn as"
-                " '3dgs', which makes fine splats of the others wider",
-                DataWarning,
-                stacklevel=2,
+                " '3dgs', which makes fine splats of the others wider"
             )
         origin = shared_origin(cloud.origin for cloud in clouds)
         clouds = [cloud.relative_to(origin) for cloud in clouds]

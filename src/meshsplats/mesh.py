@@ -11,8 +11,9 @@ import numpy as np
 
 from meshsplats._arrays import check_faces, checked_array, checked_attributes, chosen_rows, guarded
 from meshsplats._kinds import need_all, need_choice
-from meshsplats._origin import in_words, relative, warn_of_rounding, zero_origin
+from meshsplats._origin import in_words, lost_by_rounding, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
+from meshsplats.errors import warn_of_data
 from meshsplats.face_splats import FaceSplats, check_ascending, check_harmonics
 from meshsplats.mesh_joining import joined_meshes
 from meshsplats.mesh_moving import moved_mesh, transformed_mesh
@@ -129,7 +130,7 @@ class SplatMesh:
     def __post_init__(self) -> None:
         given = self.vertices
         counts = check_fields(self)
-        warn_of_rounding("vertices", given, stacklevel=3)
+        warn_of_data(lost_by_rounding("vertices", given))
         v, f, faces = counts["vertex"], counts["face"], self.faces
         check_faces(faces, v)
         if v and (self.colors.min() < 0 or self.colors.max() > MAX_COLOR):
@@ -139,7 +140,12 @@ class SplatMesh:
         if v and (opacity := self.colors[:, 3].max()) > 1:
             raise ValueError(f"opacities, the last column of colors, must lie in [0, 1], got {opacity:.4g}")
         if self.harmonics is not None:
-            check_harmonics(self.harmonics, self.blending, self.splats)
+            if self.harmonics.shape[1] not in TERMS:
+                raise ValueError(
+                    "harmonics must have 3, 8 or 15 coefficients for degree 1, 2 or 3, without the constant"
+                    f" one, got shape {self.harmonics.shape}"
+                )
+            check_harmonics(self.blending, self.splats)
         plain = self.plain_colors
         if plain is not None and v and (plain.min() < 0 or plain.max() > 1):
             raise ValueError(f"plain_colors must lie in [0, 1], got {plain.min():.4g} to {plain.max():.4g}")

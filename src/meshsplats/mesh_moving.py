@@ -10,8 +10,8 @@ import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._geometry import affine_parts
-from meshsplats._origin import loses_detail, warn_of_rounding
-from meshsplats.errors import DataWarning
+from meshsplats._origin import loses_detail, lost_by_rounding
+from meshsplats.errors import DataWarning, warn_of_data
 from meshsplats.spherical_harmonics import moved_harmonics, turned_harmonics
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ Mesh = TypeVar("Mesh", bound=Any)
 
 def moved_mesh(mesh: Mesh, vertices: ArrayLike, normals: ArrayLike | None, binding: Any) -> Mesh:
     """``SplatMesh.moved``."""
-    warn_of_rounding("vertices", vertices, stacklevel=3)
+    warn_of_data(lost_by_rounding("vertices", vertices))
     vertices = checked_array("vertices", vertices, np.float32, (len(mesh.vertices), 3))
     harmonics = mesh.harmonics
     old = mesh.normals if normals is None else None
@@ -44,7 +44,7 @@ def transformed_mesh(mesh: Mesh, matrix: ArrayLike, origin: ArrayLike | None) ->
     if origin is not None:
         given = checked_array("origin", origin, np.float64, (3,))
         point, shift = given, shift + (point - given)
-        warn_of_rounding("vertices", mesh.vertices @ a.T + shift, stacklevel=3)
+        warn_of_data(lost_by_rounding("vertices", mesh.vertices @ a.T + shift))
     elif shift.any() and loses_detail(mesh.vertices @ a.T, shift):
         point, shift = point + shift, np.zeros(3)
     u, stretch, vt = np.linalg.svd(a)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from meshsplats import DataWarning, convert, splat_dataset
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.comparison import Comparison, ViewSimilarity, compare, compare_views
@@ -86,3 +87,22 @@ def test_nothing_to_compare():
     cloud, mesh, _ = scene()
     with pytest.raises(ValueError, match="at least one camera"):
         compare(cloud, mesh, [])
+
+
+def test_cameras_that_see_nothing_are_told_of():
+    cloud, mesh, cameras = scene()
+    away = [replace(camera, cx=camera.cx + 1e4) for camera in cameras]
+    unseen = r"none of the 3 cameras sees any of the 60 splats: are they of one scene, and do the matrices"
+    for use in (compare, lambda cloud, _, cameras: splat_dataset(cloud, cameras=cameras, train=3)):
+        with pytest.raises(ValueError, match=unseen):
+            use(cloud, mesh, away)
+        with pytest.warns(DataWarning, match=r"2 of 3 cameras see none .*\(view_0001, view_0002\)"):
+            use(cloud, mesh, [cameras[0], *away[1:]])
+        near = [replace(camera, near=99) for camera in cameras]
+        with pytest.raises(ValueError, match="sees any of the 60 splats: what they look at is nearer"):
+            use(cloud, mesh, near)
+    # A camera may see a splat whose centre is beside its image.
+    one = cloud.take([0])
+    beside = orbit(one, 1, width=64, height=64)[0].window(-40, 0, 62, 64)
+    assert not beside.sees(one.means).any()
+    assert compare(one, convert(one), [beside]).psnr < 100

@@ -188,7 +188,7 @@ def test_joined_clouds_have_one_origin(tmp_path):
     np.testing.assert_array_equal(both.origin, far.origin)
     np.testing.assert_allclose(places(both), np.tile(near + FAR, (2, 1)), atol=1e-6)
     assert "origin 500000 4500000 100" in repr(far)
-    with pytest.warns(DataWarning, match="positions near 500000 4500000 1.. are stored as float32"):
+    with pytest.warns(DataWarning, match="means near 500000 4500000 1.. are stored as float32"):
         assert "origin" not in repr(far.relative_to([0, 0, 0]))
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from meshsplats import convert, orbit, plain_colors_of, render
 from meshsplats.demo_scene import make_scene
+from meshsplats.rendering.plain_colors import plain_means
 from meshsplats.rendering.shading import seen_from
 
 
@@ -44,7 +45,13 @@ def test_vertices_that_no_view_shows_have_the_mean_of_all(mesh):
     cameras = orbit(mesh, 2, width=20, height=20)
     away = [replace(c, cx=c.cx + 1e5) for c in cameras]
     alike = np.mean([seen_from(mesh, c).colors[:, :3] for c in cameras], axis=0).clip(0, 1)
-    np.testing.assert_allclose(plain_colors_of(mesh, away), alike, atol=1e-6)
+    colors, shown = plain_means(mesh, away)
+    np.testing.assert_allclose(colors, alike, atol=1e-6)
+    assert not shown
+    with pytest.raises(
+        ValueError, match="none of the 2 cameras sees any of the .* triangles: are they of one"
+    ):
+        plain_colors_of(mesh, away)
 
 
 def test_colours_of_a_mesh_without_harmonics_stay(mesh):

@@ -26,6 +26,7 @@ from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, V
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.core_arguments import MAX_SAMPLES
 from meshsplats.rendering.looks import check_look, draw_splats
+from meshsplats.rendering.sight import check_sight
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
 Placement = Literal["auto", "object", "surrounded", "inside", "found"]
@@ -97,7 +98,8 @@ def splat_dataset(
             views, which is faster, and the exact mean in test views; else 1.
         sh_degree, background, threads, cache_bytes: as in ``splat_views``.
 
-    Raises ValueError for an empty cloud or an option out of its range.
+    Raises ValueError for an empty cloud, an option out of its range, and ``cameras`` of which none sees any
+    of the splats; a DataWarning names those that see none where others do.
     """
     need(GaussianCloud, cloud=cloud)
     need_all(Camera, cameras=cameras, optional=True)
@@ -117,6 +119,7 @@ def splat_dataset(
     first = max(test, HELD_OUT)  # of the training views
     free, found = fov is None and tuple(distance) == DISTANCES, None
     if cameras is not None:
+        check_sight(cloud, cameras, threads=threads)
         cameras = [camera.with_near_plane(cloud.means) for camera in cameras]
         placed, first = _given(cameras, train, test, width)
     elif placement == "inside":

@@ -21,6 +21,7 @@ from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import check_look, draw_splats, image_of, mesh_samples
+from meshsplats.rendering.sight import check_sight
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,8 @@ def compare(
     """PSNR and SSIM of the mesh's images against the splats', view by view. Options are those of
     ``compare_views``.
 
-    Raises ValueError without cameras.
+    Raises ValueError without cameras, and where none of them sees any of the splats; a DataWarning names
+    those that see none where others do, whose PSNR would be inf.
     """
     need(GaussianCloud, cloud=cloud)
     need(SplatMesh, mesh=mesh)
@@ -167,6 +169,7 @@ def compare(
     need_all(Camera, cameras=cameras)
     if not cameras:
         raise ValueError("cameras must hold at least one camera")
+    check_sight(cloud, cameras, threads=threads)
     views = compare_views(
         cloud,
         mesh,
@@ -196,5 +199,6 @@ def fidelity(
     views = [camera.within(400) for camera in subsample(cameras, count)] or orbit(
         mesh, count, elevation=15, width=400, height=400
     )
-    mean = compare(cloud, mesh, views, look=look, threads=threads).to_dict()["mean"]
+    scores = tuple(view.score for view in compare_views(cloud, mesh, views, look=look, threads=threads))
+    mean = Comparison(scores).to_dict()["mean"]
     return {"views": len(views), "look": look, "psnr": mean["psnr"], "ssim": mean["ssim"]}

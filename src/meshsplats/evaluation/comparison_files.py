@@ -27,6 +27,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import amplified_error, save_image, strip
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import mesh_samples
+from meshsplats.rendering.sight import check_sight
 
 RESULTS = "results.json"
 
@@ -70,6 +71,7 @@ def save_comparison(
         cloud = without_gaps(cloud, options.draw.threads)
     photographs = options.views.photographs(cloud.origin)
     cameras = options.views.make(cloud, splats, count=8, side=400, photographs=photographs, say=say)
+    check_sight(cloud, cameras, threads=options.draw.threads)
     strips = view_names(len(cameras))
     check_outputs([folder / name for name in (*strips, RESULTS, CAMERAS, CONFIGURATION)], force, folder)
     made = _mesh(None if mesh is None else as_path("mesh", mesh), cloud, cameras, options)

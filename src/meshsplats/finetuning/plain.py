@@ -13,7 +13,7 @@ from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.plain_colors import plain_colors_of
+from meshsplats.rendering.plain_colors import plain_means
 
 MOST_VIEWS = 16
 """Largest number of views that the colours are means over, before they are optimised."""
@@ -33,7 +33,7 @@ def with_plain_means(
 ) -> SplatMesh:
     """``mesh`` with ``plain_colors`` that are means over so many training ``views`` of ``dataset``."""
     cameras = [view.camera for view in subsample(dataset.train, views)]
-    return replace(mesh, plain_colors=plain_colors_of(mesh, cameras, threads=threads))
+    return replace(mesh, plain_colors=plain_means(mesh, cameras, threads=threads)[0])
 
 
 def with_plain_colors(

@@ -8,7 +8,7 @@ import numpy as np
 
 from meshsplats._arrays import check_faces
 from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
+from meshsplats.camera import OUT_OF_SIGHT, Camera
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import visible_pixels
@@ -32,6 +32,8 @@ def plain_colors_of(mesh: SplatMesh, cameras: Sequence[Camera], *, threads: int 
 
     Returns:
         (v, 3) float32 in [0, 1].
+
+    Raises ValueError for no views, and for views that show nothing of the mesh.
     """
     need(SplatMesh, mesh=mesh)
     need_all(Camera, cameras=cameras)
@@ -40,11 +42,27 @@ def plain_colors_of(mesh: SplatMesh, cameras: Sequence[Camera], *, threads: int 
     check_faces(mesh.faces, len(mesh.vertices))
     if mesh.harmonics is None:
         return mesh.plain.colors[:, :3].copy()
+    colors, shown = plain_means(mesh, cameras, threads=threads)
+    if not shown and mesh.colors[mesh.faces, 3].any():
+        raise ValueError(
+            f"none of the {len(cameras)} cameras sees any of the {len(mesh.faces):,} triangles:"
+            f" {OUT_OF_SIGHT}"
+        )
+    return colors
+
+
+def plain_means(
+    mesh: SplatMesh, cameras: Sequence[Camera], *, threads: int | None = None
+) -> tuple[np.ndarray, bool]:
+    """``plain_colors_of`` a mesh with harmonics, and whether any view shows something of it."""
     drawing = engine("cpu", threads)
     sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros((len(mesh.vertices), 1))
+    shown = False
     for camera in cameras:
         triangles = shaded(mesh.triangles, camera, threads=threads)
-        pixels = visible_pixels(drawing, triangles, camera)[:, None] + _HIDDEN_PIXELS
+        visible = visible_pixels(drawing, triangles, camera)[:, None]
+        shown = shown or bool(visible.any())
+        pixels = visible + _HIDDEN_PIXELS
         sums += pixels * triangles.colors[:, :3]
         weights += pixels
-    return np.clip(sums / weights, 0, 1).astype(np.float32)
+    return np.clip(sums / weights, 0, 1).astype(np.float32), shown
