@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike
 
 T = TypeVar("T")
+_BRIGHTEST = 16
+"""Times white. Single pixels of an image may be brighter, most of it never is."""
 
 
 @overload
@@ -138,6 +140,15 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
                     f"{name} must be finite, row {int(bad.argmax())} is not ({int(bad.sum())} such rows)"
                 )
     return array
+
+
+def check_units(name: str, image: np.ndarray) -> None:
+    """Raises ValueError for a float ``image`` of values from 0 to 255, where white is 1. Looks at some of the
+    rows of large ones."""
+    rows = image[:: 1 + (image.size >> 18)]
+    high = rows.max(initial=0)
+    if high > _BRIGHTEST and np.median(rows[rows > 0]) > 1:
+        raise ValueError(f"{name} must hold values from 0 to 1, got up to {high:g}: divide bytes by 255")
 
 
 def check_faces(faces: np.ndarray, vertices: int) -> None:

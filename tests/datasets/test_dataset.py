@@ -63,6 +63,28 @@ def test_images_check_themselves(arrays, message):
         ViewImage(*arrays)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_colours_that_are_not_times_alpha_are_refused(kind):
+    white = 255 if kind == np.uint8 else 1
+    alpha = np.tile(np.linspace(0, 1, 64), (8, 1))
+    straight = np.broadcast_to([0.3, 0.4, 0.5], (8, 64, 3))
+    for brightness in (1, 6):  # as of splats that are brighter than white
+        ViewImage(
+            np.minimum(straight * brightness * alpha[..., None] * white, 255).astype(kind),
+            (alpha * white).astype(kind),
+        )
+    with pytest.raises(ValueError, match=r"color must be times alpha .*: give color \* alpha\[..., None\]"):
+        ViewImage((straight * white).astype(kind), (alpha * white).astype(kind))
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_floats_from_0_to_255_are_refused(kind):
+    with pytest.raises(
+        ValueError, match="color must hold values from 0 to 1, got up to 200: divide bytes by 255"
+    ):
+        ViewImage(np.full((8, 8, 3), 200, kind))
+
+
 def test_a_view_checks_that_its_image_has_the_cameras_size():
     camera = look_at((0, 0, -1), (0, 0, 0), width=3, height=2, name="a")
     view = View(camera, ViewImage(np.zeros((2, 3, 3), np.uint8)))

@@ -167,6 +167,10 @@ def test_bad_images_are_refused(metric):
     good = np.zeros((12, 12, 3))
     with pytest.raises(TypeError, match="divide bytes by 255"):
         metric(good, np.zeros((12, 12, 3), np.uint8))
+    with pytest.raises(
+        ValueError, match="images must hold values from 0 to 1, got up to 128: divide bytes by"
+    ):
+        metric(good, good + 128)
     with pytest.raises(ValueError, match=r"same shape, got \(12, 12, 3\) and \(12, 12\)"):
         metric(good, good[..., 0])
     with pytest.raises(ValueError, match=r"\(h, w\) or \(h, w, c\)"):

@@ -74,7 +74,12 @@ def test_images_of_other_shapes_and_names_are_refused(tmp_path, name, shape, wor
 def test_bytes_are_not_taken_for_values_from_0_to_1(tmp_path, kind):
     with pytest.raises(TypeError, match=f"from 0 to 1, got {kind.__name__}: divide bytes by 255"):
         save_image(tmp_path / "x.png", np.full((2, 2, 3), 128, kind))
+    with pytest.raises(ValueError, match="from 0 to 1, got up to 128: divide bytes by 255"):
+        save_image(tmp_path / "x.png", np.full((2, 2, 3), 128, kind).astype(np.float32))
     assert not list(tmp_path.iterdir())
+    glint = np.full((4, 4, 3), 0.5)
+    glint[0, 0] = 40
+    save_image(tmp_path / "x.png", glint)
 
 
 def test_straight_alpha_composes_to_the_same_image():

@@ -49,7 +49,7 @@ def test_vertices_that_no_view_shows_have_the_mean_of_all(mesh):
     np.testing.assert_allclose(colors, alike, atol=1e-6)
     assert not shown
     with pytest.raises(
-        ValueError, match="none of the 2 cameras sees any of the .* triangles: are they of one"
+        ValueError, match=r"none of the 2 cameras sees any of the .* triangles: are they of one"
     ):
         plain_colors_of(mesh, away)
 

@@ -11,18 +11,25 @@ from typing import Protocol
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import check_units, checked_array
 from meshsplats._kinds import need, need_all
 from meshsplats._origin import in_words, zero_origin
 from meshsplats.camera import Camera
 from meshsplats.choices import Look
 from meshsplats.errors import DataWarning
+from meshsplats.mesh import MAX_COLOR
 
 CACHE_BYTES = 2 << 30
 """Default limit on the images of a data set that are kept in memory after their first use, bytes."""
 WHITE = (1.0, 1.0, 1.0)
 SHOWN = 5
 """Names in a message, at most."""
+_PIXELS = 1 << 18
+"""Pixels that the check of premultiplied colours looks at, about."""
+_ROUNDING = 0.03
+"""Excess of a premultiplied colour that may come from rounding and resampling."""
+_MOST_BRIGHT = 0.05
+"""Share of the faint pixels that may be too bright, as where splats are broken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +37,8 @@ class ViewImage:
     """The image of one view. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
 
     color: np.ndarray
-    """(h, w, 3) RGB as it is on black, so times alpha where there is one: uint8 (255 is 1), or float16 or
-    float32 in units of 1."""
+    """(h, w, 3) RGB as it is on black, so times alpha where there is one (the straight RGB of a .png file is
+    not, and refused): uint8 (255 is 1), or float16 or float32 in units of 1."""
     alpha: np.ndarray | None = None
     """(h, w) opacity, of the same type; None: opaque, as photographs are."""
     mask: np.ndarray | None = None
@@ -50,6 +57,10 @@ class ViewImage:
             raise ValueError(f"alpha must have shape {shape[:2]} and the type of color")
         if self.mask is not None and (self.mask.shape, self.mask.dtype) != (shape[:2], np.dtype(bool)):
             raise ValueError(f"mask must have shape {shape[:2]} and type bool")
+        if self.color.dtype != np.uint8:
+            check_units("color", self.color)
+        if self.alpha is not None and self.color.dtype != np.float16:  # which images of splats are
+            _check_premultiplied(self.color, self.alpha)
 
     def over(self, background: Sequence[float] | np.ndarray = WHITE) -> np.ndarray:
         """(h, w, 3) float32 ``color + (1 - alpha) * background``; ``background``: RGB, (3,) or (h, w, 3)."""
@@ -280,6 +291,23 @@ class ImageCache:
             if key not in self._kept and image.nbytes <= self._left:
                 self._left -= image.nbytes
                 self._kept[key] = image
+
+
+def _check_premultiplied(color: np.ndarray, alpha: np.ndarray) -> None:
+    """Raises ValueError for ``color`` that is not times ``alpha``: where that is near 0, many pixels are far
+    brighter than a premultiplied colour can be. A sample of large images is looked at."""
+    white = 255 if color.dtype == np.uint8 else 1
+    step = max(1, alpha.size // _PIXELS)
+    shares = alpha.reshape(-1)[::step]
+    faint = shares < white / MAX_COLOR
+    colors, shares = color.reshape(-1, 3)[::step][faint], shares[faint]
+    most = MAX_COLOR * shares.astype(np.float32) + _ROUNDING * white
+    bright = (colors > most[:, None]).any(axis=1)
+    if bright.sum() > _MOST_BRIGHT * (bright | (shares > 0)).sum():
+        raise ValueError(
+            "color must be times alpha (premultiplied), as it is on black, but is bright where alpha is about"
+            " 0: give color * alpha[..., None], of bytes divided by 255"
+        )
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

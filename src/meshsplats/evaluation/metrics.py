@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from meshsplats._arrays import check_units
 from meshsplats._kinds import need_array, need_choice
 
 SsimConvention = Literal["3dgs", "valid", "reflect"]
@@ -28,7 +29,8 @@ def psnr(a: np.ndarray, b: np.ndarray, *, mask: np.ndarray | None = None) -> flo
 
     Raises:
         TypeError: images or masks of another type.
-        ValueError: shapes that differ, values that are not finite, images or masks without a pixel.
+        ValueError: shapes that differ, values that are not finite or from 0 to 255, images or masks without
+            a pixel.
     """
     a, b = checked_images(a, b)
     if mask is not None:
@@ -64,8 +66,8 @@ def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -
 
     Raises:
         TypeError: images of another type.
-        ValueError: shapes that differ, values that are not finite, an unknown convention, images smaller than
-            the window with convention 'valid'.
+        ValueError: shapes that differ, values that are not finite or from 0 to 255, an unknown convention,
+            images smaller than the window with convention 'valid'.
     """
     a, b = checked_images(a, b)
     need_choice(SsimConvention, convention=convention)
@@ -101,6 +103,7 @@ def checked_images(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray
     for image in (a, b):
         if not np.isfinite(image).all():
             raise ValueError("images must be finite, got NaN or infinite values")
+        check_units("images", image)
     return a, b
 
 

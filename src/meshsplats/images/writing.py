@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from meshsplats._arrays import check_units
 from meshsplats._files.atomic import write_bytes
 from meshsplats._kinds import need_array, need_path
 
@@ -39,13 +40,14 @@ CAPTION = 22
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """uint8 array of the same shape: ``round(255 * clip(image, 0, 1))``. TypeError for whole numbers,
-    ValueError for values not finite."""
+    ValueError for values not finite, or from 0 to 255."""
     kind = np.asarray(image).dtype
     if kind.kind in "iu":
         raise TypeError(f"an image must hold float values from 0 to 1, got {kind}: divide bytes by 255")
     image = np.asarray(image, np.float32)
     if not np.isfinite(image).all():
         raise ValueError("an image holds values that are not finite")
+    check_units("an image", image)
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
@@ -70,7 +72,7 @@ def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
 
     Raises:
         TypeError: an image of whole numbers, such as bytes: divide them by 255.
-        ValueError: the suffix or the shape is another, or a value is not finite.
+        ValueError: the suffix or the shape is another, a value is not finite, or they are from 0 to 255.
     """
     need_path(path=path, instead={"ndarray": "the path comes first, save_image(path, image)"})
     need_array(image=image)
