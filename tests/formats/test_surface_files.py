@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from _glb import read_glb
+from _priors import CUBE, CUBE_FACES
 from PIL import Image
 
 from meshsplats import BaseMesh, load_base, load_mesh, look_at, save_base
@@ -276,7 +277,8 @@ def test_unreal_gets_convex_parts_by_their_names(tmp_path):
     base = BaseMesh(ring.vertices, ring.faces.astype(np.int32), up=[0, 0, 1], origin=[5, 0, 0])
     save_base(base, tmp_path / "a.glb", collision="convex")
     scene = trimesh.load_scene(tmp_path / "a.glb")
-    assert sorted(scene.geometry) == [*(f"UCX_surface_{k:02d}" for k in range(32)), "surface"]
+    count = len(scene.geometry) - 1
+    assert sorted(scene.geometry) == [*(f"UCX_surface_{k:02d}" for k in range(count)), "surface"]
     shown = scene.geometry.pop("surface")
     hulls = list(scene.geometry.values())
     middle = shown.triangles.mean(axis=1)
@@ -288,13 +290,58 @@ def test_unreal_gets_convex_parts_by_their_names(tmp_path):
         held |= (sides <= (hull.face_normals * hull.triangles[:, 0]).sum(axis=1) + 1e-4).all(axis=1)
     assert held.all()
     volume = sum(hull.volume for hull in hulls)
-    assert volume < 1.4 * ring.volume
+    assert ring.volume < volume < 1.06 * ring.volume
+    assert count < 16
     assert ring.convex_hull.volume > 1.75 * ring.volume  # what a single part would have
     for hull in hulls:
         material = hull.visual.material
         assert (material.alphaMode, material.baseColorFactor[3]) == ("MASK", 0)
     again = load_base(tmp_path / "a.glb")
     np.testing.assert_array_equal(again.vertices[again.faces], base.vertices[base.faces])
+
+
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices, those of each triangle apart, and 768 triangles that face outwards, of a ball of radius 1."""
+    corners = CUBE[CUBE_FACES].astype(np.float64)
+    for _ in range(3):
+        a, b, c = corners.transpose(1, 0, 2)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        corners = np.concatenate(
+            [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+    points = corners.reshape(-1, 3)
+    points = (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
+    return points, np.arange(len(points), dtype=np.int32).reshape(-1, 3)
+
+
+def volumes(parts) -> list[float]:
+    return [float(np.linalg.det(points[triangles].astype(float)).sum() / 6) for points, triangles in parts]
+
+
+def test_convex_parts_fill_a_solid_and_are_few():
+    pytest.importorskip("scipy")
+    points, faces = ball()
+    (whole,) = volumes([(points, faces)])
+    assert whole == pytest.approx(4 / 3 * np.pi, rel=0.05)
+    (part,) = convex_parts(points, faces)
+    np.testing.assert_allclose(volumes([part]), whole, rtol=2e-3)
+    apart = (
+        np.concatenate([points, points + np.float32([5, 0, 0])]),
+        np.concatenate([faces, faces + len(points)]),
+    )
+    np.testing.assert_allclose(volumes(convex_parts(*apart)), [whole, whole], rtol=2e-3)
+    # A cube on a larger one: two boxes, whichever way it is cut.
+    steps = np.concatenate([CUBE * np.float32([3, 3, 1]), CUBE + np.float32([1, 1, 1])])
+    parts = convex_parts(steps, np.concatenate([CUBE_FACES, CUBE_FACES + 8]))
+    assert sum(volumes(parts)) == pytest.approx(10, rel=0.06)
+
+
+def test_an_open_surface_has_parts_of_its_shell():
+    pytest.importorskip("scipy")
+    points, faces = ball()
+    parts = convex_parts(points, faces[1:])
+    assert len(parts) == 32
+    assert sum(volumes(parts)) < 3
 
 
 def test_flat_and_tiny_surfaces_have_convex_parts(tmp_path):
