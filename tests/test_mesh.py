@@ -52,6 +52,8 @@ def test_everything_is_named_in_a_line():
     assert repr(ViewImage(np.zeros((4, 6, 3), np.uint8), None, np.ones((4, 6), bool))) == (
         "ViewImage(6 x 4 uint8, mask)"
     )
+    drawn = render(full, orbit(full, 1, width=6, height=4)[0], depth=True, attributes=["heat"])
+    assert repr(drawn) == f"Rendering(6 x 4, {drawn.fragments} fragments, depth, attribute 'heat')"
     assert repr(BaseMesh(CORNERS, FACES, COLORS)) == "BaseMesh(3 vertices, 1 faces, colours)"
 
 
@@ -80,6 +82,15 @@ def test_float64_positions_that_lose_their_detail_are_told_of():
             warnings.simplefilter("error")
             for fine in (far.astype(np.float32), far.astype(np.float32).astype(float), far - far.min(axis=0)):
                 make(fine)
+
+
+def test_values_that_float32_cannot_hold_are_named_without_a_warning_of_numpy():
+    with pytest.raises(ValueError, match="vertices must be finite, row 2 is not"):
+        triangle(vertices=CORNERS * np.array([1, 1e300, 1]))
+    with pytest.raises(ValueError, match=r"colors must lie in \[0, 16\], got 0 to 200; divide bytes by 255"):
+        triangle(colors=(COLORS * 400).astype(np.uint8) * np.array([1, 1, 1, 0], np.uint8))
+    with pytest.raises(ValueError, match="up must not be the zero vector"):
+        BaseMesh(CORNERS, FACES, up=(0, 0, 0))
 
 
 def test_assigning_a_field_says_how_to_change_it():

@@ -128,7 +128,8 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
             raise ValueError(
                 f"{name} must fit {np.dtype(dtype).name}, got values from {given.min()} to {given.max()}"
             )
-    array = np.ascontiguousarray(given, dtype=dtype)
+    with np.errstate(over="ignore"):  # what is infinite then is refused
+        array = np.ascontiguousarray(given, dtype=dtype)
     # The sum is not finite if any term is not. Each is checked only then, or where large values overflow it.
     if array.dtype.kind == "f" and array.size:
         with np.errstate(over="ignore", invalid="ignore"):

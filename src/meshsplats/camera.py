@@ -5,14 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
-from meshsplats._kinds import need, need_numbers
+from meshsplats._kinds import need, need_choice, need_numbers
 from meshsplats.choices import MAX_SIDE
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Axes = Literal["opencv", "opengl"]
+"""Of a camera: OpenCV's are +x right, +y down, +z forward, OpenGL's +x right, +y up, +z backward."""
 NEAR_SHARE = 0.002
 """Depth of the near plane of a camera that names none, as a share of the distance from which on the scene
 lies around it: 1 cm where that is 5 m."""
@@ -84,11 +89,13 @@ class Camera:
         for name in ("fx", "fy", "near"):
             if name == "near" and self.near is None:
                 continue
+            need_numbers(**{name: getattr(self, name)})
             value = float(getattr(self, name))
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive, got {value}")
             object.__setattr__(self, name, value)
         for name in ("cx", "cy"):
+            need_numbers(**{name: getattr(self, name)})
             value = float(getattr(self, name))
             if not np.isfinite(value):
                 raise ValueError(f"{name} must be finite, got {value}")
@@ -98,6 +105,54 @@ class Camera:
         need(str, name=self.name)
         if len(self.name) > _MAX_NAME:
             raise ValueError(f"name must have up to {_MAX_NAME:,} characters, got {len(self.name):,}")
+
+    @classmethod
+    def from_camera_to_world(
+        cls,
+        matrix: ArrayLike,
+        intrinsics: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        axes: Axes = "opencv",
+        near: float | None = None,
+        name: str = "",
+    ) -> Camera:
+        """The camera whose ``matrix`` leads from its own frame to the world, the inverse of
+        ``world_to_camera``, as NeRF data sets, nerfstudio and Blender have it.
+
+        Args:
+            matrix: (4, 4), or (3, 4) without the last row: a rotation and the position of the camera.
+            intrinsics: (4,) fx, fy, cx, cy in pixels, or (3, 3) [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. cx and
+                cy count from the corner of the image: OpenCV's, which count from the centre of the first
+                pixel, need 0.5 more.
+            width, height: of the image, pixels.
+            axes: of the camera's frame: 'opencv', or 'opengl' (+x right, +y up, +z backward), as in the
+                ``transform_matrix`` of a transforms.json and Blender's ``matrix_world``.
+            near, name: as in ``Camera``.
+
+        Raises ValueError for a matrix that scales, shears or mirrors, and for a value out of range.
+        """
+        need_choice(Axes, axes=axes)
+        rows = 3 if np.shape(matrix)[:1] == (3,) else 4
+        pose = checked_array("matrix", matrix, np.float64, (rows, 4))
+        flip = np.ones(3) if axes == "opengl" else OPENGL
+        world_to_camera = from_opengl(pose * [*flip, 1])
+        if world_to_camera is None or (pose[3:] != [0, 0, 0, 1]).any():
+            raise ValueError(
+                "matrix must lead from camera to world by a rotation and a translation, its last row being"
+                " 0 0 0 1: it scales, shears or mirrors"
+            )
+        shape = (3, 3) if np.ndim(intrinsics) == 2 else (4,)
+        lens = checked_array("intrinsics", intrinsics, np.float64, shape)
+        if lens.ndim == 2:
+            if lens[0, 1] or lens[1, 0] or (lens[2] != [0, 0, 1]).any():
+                raise ValueError(
+                    f"intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {lens.tolist()}"
+                )
+            lens = lens[[0, 1, 0, 1], [0, 1, 2, 2]]
+        fx, fy, cx, cy = lens.tolist()
+        return cls(world_to_camera, fx, fy, cx, cy, width, height, near, name)
 
     @property
     def center(self) -> np.ndarray:
@@ -120,7 +175,7 @@ class Camera:
             self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
         )
 
-    def relative_to(self, origin: Sequence[float] | np.ndarray) -> Camera:
+    def relative_to(self, origin: ArrayLike) -> Camera:
         """The same camera for coordinates relative to ``origin`` (3,), a point in those of this camera, such
         as the ``origin`` of the scene that is to be rendered."""
         point = checked_array("origin", origin, np.float64, (3,))
@@ -137,6 +192,9 @@ class Camera:
 
     def within(self, side: int) -> Camera:
         """The same view with no side of the image longer than ``side`` pixels; never a larger image."""
+        need_numbers(side=side)
+        if not side > 0:
+            raise ValueError(f"side must be a number of pixels above 0, got {side}")
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
     def near_plane(self, points: np.ndarray, pose: np.ndarray | None = None) -> float:

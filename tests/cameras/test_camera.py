@@ -453,3 +453,59 @@ def test_sees_what_projects_into_the_image():
     outside = [[-3.01, 0, 2], [5.01, 0, 2], [0, -2.01, 2], [0, 2.01, 2], [0, 0, 0.99], [0, 0, -2], [0, 0, 0]]
     assert camera.sees(np.array(inside)).all()
     assert not camera.sees(np.array(outside)).any()
+
+
+def test_cameras_of_other_programs():
+    camera = orbit(ball(), 3, elevation=20, width=40, height=30)[1]
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    matrix = np.linalg.inv(camera.world_to_camera)
+    calibrated = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    for pose, lens, axes in (
+        (matrix, intrinsics, "opencv"),
+        (matrix[:3].tolist(), calibrated, "opencv"),
+        (matrix @ np.diag([1, -1, -1, 1]), intrinsics, "opengl"),
+    ):
+        made = Camera.from_camera_to_world(pose, lens, 40, 30, axes=axes, near=0.5, name="a")
+        np.testing.assert_allclose(made.world_to_camera, camera.world_to_camera, atol=1e-12)
+        assert (made.fx, made.fy, made.cx, made.cy) == intrinsics
+        assert (made.width, made.height, made.near, made.name) == (40, 30, 0.5, "a")
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"matrix": np.eye(3)}, r"matrix must have shape \(3, 4\), got \(3, 3\)"),
+        ({"matrix": None}, "matrix must hold numbers, got a NoneType"),
+        ({"matrix": np.diag([2.0, 2, 2, 1])}, "from camera to world by a rotation and a translation"),
+        ({"matrix": np.diag([1.0, 1, -1, 1])}, "it scales, shears or mirrors"),
+        ({"matrix": np.diag([1.0, 1, 1, 2])}, "its last row being 0 0 0 1"),
+        ({"intrinsics": (1, 2)}, r"intrinsics must have shape \(4,\), got \(2,\)"),
+        ({"intrinsics": [[9, 1, 4], [0, 9, 4], [0, 0, 1]]}, r"intrinsics must be \[\[fx, 0, cx\]"),
+        ({"axes": "blender"}, "axes must be one of opencv, opengl, got 'blender'"),
+    ],
+)
+def test_what_is_no_camera_to_world(changed, message):
+    fitting = {"matrix": np.eye(4), "intrinsics": (9, 9, 4, 4), "width": 8, "height": 8}
+    with pytest.raises((ValueError, TypeError), match=message):
+        Camera.from_camera_to_world(**(fitting | changed))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Camera(np.eye(4), None, 9, 4, 4, 8, 8), "fx must be a number, got None: give one"),
+        (
+            lambda: Camera(np.eye(4), "50", 9, 4, 4, 8, 8),
+            r"fx must be a number, got the text '50': float\(fx\)",
+        ),
+        (
+            lambda: Camera(np.eye(4), 9, 9, 4, 4, 8, 8).within(0),
+            "side must be a number of pixels above 0, got 0",
+        ),
+        (lambda: look_at([0, 0], [0, 0, 0]), r"center must have shape \(3,\), got \(2,\)"),
+        (lambda: look_at("a", [0, 0, 0]), r"center must be a point \(3,\), got the text 'a': three numbers"),
+    ],
+)
+def test_messages_name_the_argument_that_is_wrong(call, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        call()

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from _splats import few_splats
 
 from meshsplats.camera import Camera
 from meshsplats.conversion import PRESETS, ConversionOptions, convert
@@ -250,3 +251,10 @@ def test_up():
     np.testing.assert_allclose(convert(cloud, cameras=[upright]).up, [0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(convert(cloud, cameras=[upright], up=(2, 0, 0)).up, [1, 0, 0])
     np.testing.assert_allclose(convert(cloud).up, [0, -1, 0])
+
+
+def test_whole_numbers_may_be_floats():
+    cloud = few_splats()
+    limited = convert(cloud, max_triangles=1e2)
+    np.testing.assert_array_equal(limited.vertices, convert(cloud, max_triangles=100).vertices)
+    assert len(convert(cloud, max_splats=5.0, sides=6.0).faces) <= 5 * 12

@@ -310,3 +310,9 @@ def test_blocks_are_written_as_the_whole(tmp_path):
         save_gaussian_blocks(parts, tmp_path / "new.spz", 500)
     with pytest.raises(ValueError, match="degree 0 to 3"):
         save_gaussian_blocks(parts, tmp_path / "new.ply", 500, degree=4)
+
+
+def test_blocks_of_too_high_a_degree_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"a\.ply: splats of degree 2 for a file of degree 1: give degree=2"):
+        save_gaussian_blocks([make_scene(200).of_degree(2)], tmp_path / "a.ply", 200, degree=1)
+    assert not list(tmp_path.iterdir())

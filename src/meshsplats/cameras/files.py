@@ -134,6 +134,9 @@ def save_cameras(
     """Writes the JSON list that ``load_cameras`` reads, to the last digit; replaces a file of that name.
 
     Cameras that are relative to the point ``origin`` (3,) of the world are written in the world.
+
+    Raises TypeError for what is no list of cameras, ValueError for an ``origin`` that is not three finite
+    numbers, and OSError if the file cannot be written.
     """
     need_all(Camera, cameras=cameras)
     need_path(path=path)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats._geometry import direction
 from meshsplats._kinds import as_whole, need_array, need_numbers
 from meshsplats.camera import Camera, checked_side
@@ -52,14 +53,15 @@ def look_at(
 
     Raises ValueError if the two points coincide or are not finite, and for a value out of range.
     """
-    need_array(center=center, target=target, up=up)
+    text = {"path": "three numbers say where it is, (0, 0, 1) for one"}
+    need_array(center=center, target=target, up=up, wanted="a point (3,)", instead=text)
     width, height = _checked_lens(width, height, fov)
-    center = np.asarray(center, np.float64)
+    center = checked_array("center", center, np.float64, (3,))
     upward = unit_up(up)
-    forward = np.asarray(target, np.float64) - center
+    forward = checked_array("target", target, np.float64, (3,)) - center
     length = np.linalg.norm(forward)
-    if not (np.isfinite(length) and length > 0):
-        raise ValueError("center and target must be finite and differ")
+    if length == 0:
+        raise ValueError("center and target must differ")
     forward /= length
     right = np.cross(forward, upward)
     if np.linalg.norm(right) < 1e-6:
@@ -129,7 +131,7 @@ def dome(
     Args:
         whole: use the whole sphere.
 
-    The other arguments are those of ``orbit``.
+    The other arguments, and errors, are those of ``orbit``.
     """
     need_scene(scene)
     count = _checked_count(count)
@@ -156,7 +158,7 @@ def look_around(
     Args:
         elevation: degrees above the horizon in which they look.
 
-    The other arguments are those of ``orbit``.
+    The other arguments, and errors, are those of ``orbit``.
     """
     need_scene(scene)
     need_numbers(elevation=elevation, azimuth=azimuth)

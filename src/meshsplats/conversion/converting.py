@@ -59,7 +59,8 @@ def convert(
             (``footprint``), the mean colour if asked for (``colors``) and what is up. Without them, images
             of the whole subject are assumed.
         up: direction that points up, world frame; by default that of the cameras, of the file (``cloud.up``),
-            or (0, -1, 0).
+            of a survey (z, where the coordinates of the cloud are those of one), or (0, -1, 0). Meshes with
+            other ups are not joined.
         threads: at most this many, for splats that are merged and for the images of ``detail='cameras'``;
             all processors by default.
         on_image: called after each of these images, with how many are rendered and how many there will be;

@@ -126,7 +126,9 @@ class ConversionOptions:
             source: Footprint = "cameras" if has_cameras else "framing"
             full = replace(full, footprint=source if self.viewing_distance is None else "distance")
         full._check(given, has_cameras)
-        return full
+        numbers = ("sides", "rings", "max_splats", "max_triangles", "color_degree")
+        whole = {name: int(value) for name in numbers if (value := getattr(full, name)) is not None}
+        return replace(full, **whole)  # type: ignore[arg-type]  # of 1e6, say
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
         check_options(self, given=given)

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshsplats._arrays import check_faces
 from meshsplats._core import library, structures
-from meshsplats._kinds import each, need
+from meshsplats._kinds import each, need, need_numbers
 from meshsplats.camera import Camera
 from meshsplats.choices import Device
 from meshsplats.gaussians import GaussianCloud
@@ -39,6 +39,13 @@ class Rendering:
     median_depth: np.ndarray | None = None
     """(h, w) float32 camera depth z of the fragment that leaves half or less of the light, the mean of the
     samples that have one; infinite in pixels where fewer than half of them have."""
+
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        more = [name for name in ("depth", "median_depth", "normals") if getattr(self, name) is not None]
+        named = [f"attribute {name!r}" for name in self.attributes]
+        size = f"{width} x {height}"
+        return f"Rendering({', '.join([size, f'{self.fragments:,} fragments', *more, *named])})"
 
     def mean_depth(self, *, min_alpha: float = 0.0, empty: float = np.inf) -> np.ndarray:
         """(h, w) float32 mean depth z of the fragments in each pixel, weighted as their colours are.
@@ -220,11 +227,14 @@ def render_splats(
     """The image of the splats themselves, as 3D Gaussian Splatting draws them.
 
     Splats are projected by their local affine approximation (EWA), widened by ``dilation``, and blended
-    whole in the order of their centres' depth. Alpha below 1/255 is skipped and is limited to 0.99; a sample
-    terminates before the splat that would leave a transmittance below 1e-4. Every sample where a splat's
-    alpha reaches 1/255 is drawn, however far from its centre. The cloud's kernel decides the details: '3dgs'
-    as above; 'antialiased' with the opacity lowered by as much as the widening adds; '2dgs' flat splats
-    intersected by the ray (no widening; a low-pass filter of variance 5/3 ``dilation``, so 1/2 px^2).
+    whole in the order of their centres' depth. As in 3DGS, the approximation of a splat whose centre is
+    outside the image by more than 0.15 of its side is that at this distance, so that a ``Camera.window`` of
+    an image may show such splats otherwise than the whole image does. Alpha below 1/255 is skipped and is
+    limited to 0.99; a sample terminates before the splat that would leave a transmittance below 1e-4. Every
+    sample where a splat's alpha reaches 1/255 is drawn, however far from its centre. The cloud's kernel
+    decides the details: '3dgs' as above; 'antialiased' with the opacity lowered by as much as the widening
+    adds; '2dgs' flat splats intersected by the ray (no widening; a low-pass filter of variance 5/3
+    ``dilation``, so 1/2 px^2).
 
     Args:
         cloud: the splats.
@@ -250,6 +260,7 @@ def render_splats(
     options = checked_options(keep, camera, background, samples, threads)
     if sh_degree is not None and sh_degree not in (0, 1, 2, 3):
         raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
+    need_numbers(dilation=dilation)
     if not (np.isfinite(dilation) and dilation >= 0):
         raise ValueError(f"dilation must be a variance in square pixels, >= 0, got {dilation}")
     degree = cloud.sh_degree if sh_degree is None else min(int(sh_degree), cloud.sh_degree)

@@ -34,7 +34,9 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
     ``mesh`` from ``cameras``. It is the same for all of them, so that animations do not flicker.
 
     Fans are the triangles of one splat (``face_splat``); a mesh without them needs 2, one with a low-pass
-    filter (``filter_px2``) 1.
+    filter (``filter_px2``) 1, and so does one that no camera sees, or without cameras.
+
+    Raises TypeError for what is no mesh or no list of cameras.
     """
     need(SplatMesh, mesh=mesh)
     need_all(Camera, cameras=cameras)

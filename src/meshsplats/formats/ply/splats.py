@@ -347,7 +347,7 @@ def write_float_blocks(
         flat: leave out the third scale.
         up: (3,) direction that points up, None if it is not known.
 
-    Raises ValueError if the blocks hold another number of splats.
+    Raises ValueError if the blocks hold another number of splats, or more harmonics.
     """
     k = coefficients
     scale_names = [f"scale_{i}" for i in range(2 if flat else 3)]
@@ -370,6 +370,11 @@ def write_float_blocks(
             for start in range(0, len(cloud), per_chunk):
                 part = slice(start, start + per_chunk)
                 sh = cloud.sh[part]
+                if sh.shape[1] > k:
+                    raise ValueError(
+                        f"{path}: splats of degree {cloud.sh_degree} for a file of degree"
+                        f" {round(k**0.5) - 1}: give degree={cloud.sh_degree}, or block.of_degree(...)"
+                    )
                 rows = np.zeros((len(sh), len(names)), "<f4")
                 rows[:, :3] = cloud.means[part]
                 rows[:, 6:9] = sh[:, 0]
