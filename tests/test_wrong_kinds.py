@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import inspect
 import re
 from collections.abc import Callable
@@ -199,7 +200,8 @@ ELSEWHERE = {
     ),  # plain values
     *("make_config", "train_config"),
     *("Comparison", "FoundCameras", "Interrupted", "Progress", "Rendering", "Report", "Workers"),  # results
-    *("DataWarning", "DivergenceError", "FileFormatError", "MissingDependencyError", "__version__"),
+    *("ClusterError", "DataWarning", "DeviceError", "DivergenceError", "FileFormatError", "OtherRunError"),
+    *("MissingDependencyError", "NoTextureWarning", "__version__"),
 }
 
 
@@ -208,6 +210,15 @@ def test_no_public_function_is_forgotten():
     assert not FUNCTIONS.keys() & ELSEWHERE
     for function, valid, kinds in FUNCTIONS.values():
         assert valid.keys() | kinds.keys() <= inspect.signature(function).parameters.keys()
+
+
+@pytest.mark.parametrize("name", ms.__all__)
+def test_errors_that_are_documented_can_be_caught_by_public_names(name):
+    public = getattr(ms, name)
+    members = vars(public).values() if inspect.isclass(public) else ()
+    text = " ".join(inspect.getdoc(part) or "" for part in (public, *members))
+    for error in set(re.findall(r"\b[A-Z]\w*(?:Error|Warning)\b", text)):
+        assert hasattr(builtins, error) or error in ms.__all__, error
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,10 @@ REFERENCE = {
         *("chains.make_chain", "file_options.ChainOptions"),
         *("prior.planning.save_poses", "prior.planning.pose_files", "inspection.describe"),
     ],
-    "Errors": ["FileFormatError", "MissingDependencyError", "DivergenceError", "DataWarning"],
+    "Errors": [
+        *("FileFormatError", "MissingDependencyError", "DivergenceError", "DeviceError", "ClusterError"),
+        *("OtherRunError", "DataWarning", "NoTextureWarning"),
+    ],
 }
 """Public names by page, and some of modules; names that are not listed come last."""
 

@@ -24,7 +24,16 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.datasets.points import load_points
     from meshsplats.datasets.splat_targets import splat_dataset
     from meshsplats.datasets.views import Dataset, View, ViewImage
-    from meshsplats.errors import DataWarning, DivergenceError, FileFormatError, MissingDependencyError
+    from meshsplats.errors import (
+        ClusterError,
+        DataWarning,
+        DeviceError,
+        DivergenceError,
+        FileFormatError,
+        MissingDependencyError,
+        NoTextureWarning,
+        OtherRunError,
+    )
     from meshsplats.evaluation.backgrounds import find_background
     from meshsplats.evaluation.comparison import Comparison, compare
     from meshsplats.evaluation.metrics import psnr, ssim
@@ -80,7 +89,10 @@ _HOME = {
     "meshsplats.datasets.points": ("load_points",),
     "meshsplats.datasets.splat_targets": ("splat_dataset",),
     "meshsplats.datasets.views": ("Dataset", "View", "ViewImage"),
-    "meshsplats.errors": ("DataWarning", "DivergenceError", "FileFormatError", "MissingDependencyError"),
+    "meshsplats.errors": (
+        *("ClusterError", "DeviceError", "DivergenceError", "FileFormatError", "MissingDependencyError"),
+        *("OtherRunError", "DataWarning", "NoTextureWarning"),
+    ),
     "meshsplats.evaluation.backgrounds": ("find_background",),
     "meshsplats.evaluation.comparison": ("Comparison", "compare"),
     "meshsplats.evaluation.metrics": ("psnr", "ssim"),
@@ -121,10 +133,12 @@ _MODULES = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [
     "BaseMesh",
     "Camera",
+    "ClusterError",
     "Comparison",
     "ConversionOptions",
     "DataWarning",
     "Dataset",
+    "DeviceError",
     "DivergenceError",
     "FileFormatError",
     "FinetuneConfig",
@@ -133,6 +147,8 @@ __all__ = [
     "Interrupted",
     "MeshPrior",
     "MissingDependencyError",
+    "NoTextureWarning",
+    "OtherRunError",
     "PageOptions",
     "Progress",
     "Rendering",
