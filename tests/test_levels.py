@@ -279,6 +279,49 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
     assert (out / "level_1.glb").is_file()
 
 
+def test_levels_of_another_scene_do_not_go_on(splats, tmp_path, capsys, monkeypatch):
+    """The file has another content under the same name."""
+    out, write, kept = tmp_path / "chain", chains.write_json, splats.read_bytes()
+
+    def stops(path, content):
+        write(path, content)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(chains, "write_json", stops)
+        assert run(splats, "-o", out, *QUICK) == 130
+    save_gaussians(make_scene(400, seed=9), splats)
+    assert run(splats, "-o", out, *QUICK, "--resume") == 1
+    assert "level 0 was made of other splats: --resume with the same" in capsys.readouterr().err
+    splats.write_bytes(kept)
+    assert run(splats, "-o", out, *QUICK, "--resume") == 0
+    assert "scene" not in json.loads((out / "levels.json").read_text())["levels"][0]
+
+
+@pytest.mark.parametrize("end", ["levels.json", "name", "records"])
+def test_finished_levels_are_not_made_again(splats, tmp_path, monkeypatch, end):
+    """Whenever the last moments of a chain are cut off."""
+    out, write = tmp_path / "chain", chains.write_json
+
+    def full(*_):
+        raise OSError(28, "full", str(out))
+
+    with monkeypatch.context() as patch:
+        if end == "name":
+            patch.setattr(chains, "replace_folder", full)
+        elif end == "records":
+            patch.setattr(chains.Path, "unlink", full)
+        else:
+            patch.setattr(chains, "write_json", lambda p, c: (full if p.name == end else write)(p, c))
+        assert run(splats, "-o", out, *QUICK) == 4
+    monkeypatch.setattr(chains, "make_level", None)
+    if end != "records":
+        assert run(splats, "-o", out, *QUICK, "--resume") == 0
+    assert len(json.loads((out / "levels.json").read_text())["levels"]) == 2
+    left = {path.name for path in out.iterdir()} - {"level_0.json", "level_1.json"}
+    assert left == {"config.toml", "level_0.glb", "level_1.glb", "levels.json"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("least", [50, 10**6])
 def test_levels_are_merged_from_those_above(splats, tmp_path, monkeypatch, least):

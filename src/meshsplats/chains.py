@@ -15,11 +15,12 @@ from typing import Any
 from meshsplats._files.atomic import replace_folder, write_json
 from meshsplats._kinds import as_path
 from meshsplats.conversion.gaps import without_gaps
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import FileFormatError, OptionValueError
 from meshsplats.evaluation.level_tables import TABLE, load_table
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
 from meshsplats.file_options import ChainOptions
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
+from meshsplats.finetuning.checkpoint import cloud_digest
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs, check_resumption
 from meshsplats.gaussians import GaussianCloud
@@ -117,12 +118,13 @@ def make_chain(
         on_level: entered for each level that is made; what it gives is shown the progress.
 
     Raises Interrupted after Ctrl-C in a level, whose predecessors stay, FileExistsError for a ``folder`` that
-    is no chain, and what ``plan_levels`` raises.
+    is no chain, ValueError where levels of other splats are finished, and what ``plan_levels`` raises.
     """
     folder = as_path("folder", folder)
     _older_levels(folder)  # an error before the work
     chosen, unfinished = options or ChainOptions(), partial_folder(folder)
     chain = planned(chosen, len(cloud))
+    digest = cloud_digest(cloud)
     cloud = without_gaps(cloud, chosen.threads)
     unfinished.mkdir(exist_ok=True)
     rows, records = [], []
@@ -135,8 +137,13 @@ def make_chain(
             with on_level(number, level) as show:
                 row, splats = _made(cloud, splats, waiting, path, chosen, config, place, show)
             waiting = []
-            write_json(records[-1], row)
+            write_json(records[-1], row | {"scene": digest})
         rows.append(json.loads(records[-1].read_text(encoding="utf-8")))
+        if rows[-1].pop("scene", digest) != digest:
+            raise OptionValueError(
+                f"{unfinished}: level {number} was made of other splats: ``resume`` with the same, or begin"
+                " again with ``replace_old``"
+            )
     table = {
         "source": source,
         "splats": len(cloud),
@@ -145,11 +152,12 @@ def make_chain(
         "samples": SAMPLES,
         "levels": rows,
     }
-    for record in records:
-        record.unlink()
     write_json(unfinished / TABLE, table)
-    own = {TABLE, CONFIGURATION, *(row["file"] for row in _older_levels(folder))}
+    older = [Path(row["file"]) for row in _older_levels(folder)]
+    own = {TABLE, CONFIGURATION, *(name for file in older for name in (file.name, f"{file.stem}.json"))}
     replace_folder(unfinished, folder, own.__contains__)
+    for record in records:  # last: without them a run that is interrupted here would begin again
+        (folder / record.name).unlink()
     return table
 
 
