@@ -20,6 +20,7 @@ from _cities import SMALL, digest, write_city
 from _photographs import write_photographs
 
 from meshsplats import (
+    __version__,
     convert,
     load_mesh,
     orbit,
@@ -28,7 +29,7 @@ from meshsplats import (
     stream_gaussians,
 )
 from meshsplats.cli import main
-from meshsplats.cluster import ANY_PORT, Shared, Workers, _with_warnings, open_workers
+from meshsplats.cluster import ANY_PORT, Shared, Workers, _sent, _with_warnings, open_workers
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import ClusterError, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.finetuning.memory import available_memory
@@ -163,6 +164,12 @@ def test_warnings_and_errors_of_tasks_reach_the_user(scheduler):
         with pytest.raises(FileFormatError, match="file 3: broken"):
             dict(workers.run(picky, [3]))
         assert dict(workers.run(squared, [5]))[0][0] == 25  # after an error, too
+
+
+def test_a_worker_of_another_version_is_refused():
+    assert _sent(__version__, squared, 3)[0] == squared(3)
+    with pytest.raises(ClusterError, match=rf"a worker has MeshSplats {__version__}, this .* of 0\.0\.9: "):
+        _sent("0.0.9", squared, 3)
 
 
 def test_tasks_in_threads_of_one_process_keep_their_warnings_apart():

@@ -18,6 +18,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, Generic, TypeVar
 
+from meshsplats import __version__
 from meshsplats._core.library import processors
 from meshsplats.errors import ClusterError, DataWarning, MissingDependencyError
 
@@ -57,7 +58,8 @@ class Workers:
         again: files that it writes must be whole or missing, and the same each time.
 
         Raises:
-            ClusterError: no worker survives a task, or the scheduler is lost.
+            ClusterError: no worker survives a task, one has another version of MeshSplats, or the scheduler
+                is lost.
             Exception: that of a task.
         """
         for i, task in enumerate(tasks):
@@ -171,7 +173,7 @@ class _DaskWorkers(Workers):
 
         def sent(most: int) -> Iterator[Any]:
             for i, task in islice(left, most):
-                future = self._client.submit(partial(_with_warnings, function), task, pure=False)
+                future = self._client.submit(partial(_sent, __version__, function), task, pure=False)
                 indices[future] = i
                 yield future
 
@@ -202,6 +204,16 @@ class _DaskWorkers(Workers):
         except OSError as error:
             raise ClusterError(f"the scheduler was lost: {error}") from None
         return max(0, max(1, WAITING * threads) - running)
+
+
+def _sent(version: str, function: Callable[[Task], Result], task: Task) -> tuple[Result, list[_Warning]]:
+    """``_with_warnings`` in a worker, which must have the ``version`` of MeshSplats of whoever sent it."""
+    if version != __version__:
+        raise ClusterError(
+            f"a worker has MeshSplats {__version__}, this command is of {version}: results of both would be"
+            " mixed; install the same version everywhere"
+        )
+    return _with_warnings(function, task)
 
 
 def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[_Warning]]:
