@@ -331,6 +331,16 @@ def test_neighbours_in_the_order_are_neighbours_in_space():
     assert np.median(step) < 0.2
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_order_of_splats_on_a_line():
+    """Most coordinates are 0."""
+    points = np.zeros((500, 3), np.float32)
+    points[:, 0] = np.random.default_rng(0).uniform(-1000, 1000, 500)
+    placed = points[sorted_in_space(points), 0]
+    assert np.abs(np.diff(placed)).max() < 30
+    assert placed[-1] - placed[0] > 1900
+
+
 # ---- Arguments
 
 

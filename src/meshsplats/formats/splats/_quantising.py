@@ -23,7 +23,8 @@ def sorted_in_space(points: np.ndarray) -> np.ndarray:
     """
     center = np.median(points, axis=0)
     away = points - center
-    usual = max(float(np.median(np.abs(away))), float(np.finfo(np.float32).tiny))
+    least = float(np.finfo(np.float32).tiny)
+    usual = max(float(np.median(np.abs(away))), 1e-30 * float(np.abs(away).max()), least)
     logs = np.sign(away) * np.log1p(np.abs(away) / usual)
     low, high = logs.min(axis=0), logs.max(axis=0)
     side = float((high - low).max()) or 1.0
