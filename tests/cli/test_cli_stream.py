@@ -51,6 +51,17 @@ def test_the_file_is_the_same(splats, tmp_path, capsys, options):
     assert run(splats, "-o", parts, *options, "--stream", "--force") == 0
 
 
+def test_a_warning_about_the_splats_comes_once(tmp_path, capsys):
+    cloud = make_scene(900)
+    save_gaussians(cloud, tmp_path / "scene.ply")
+    data = bytearray((tmp_path / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    data[start : start + 4] = np.float32(np.nan).tobytes()
+    (tmp_path / "scene.ply").write_bytes(data)
+    assert run(tmp_path / "scene.ply", "-o", tmp_path / "mesh.ply", "--stream") == 0
+    assert capsys.readouterr().err.count("1 of 900 splats are unusable") == 1
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -16,7 +16,7 @@ import numpy as np
 from meshsplats._arrays import checked_array
 from meshsplats._kinds import described, need_path, require_path
 from meshsplats._origin import choose_origin, need_detail
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.opening import open_splats, to_y_down
 from meshsplats.formats.ply.activated import Activated
@@ -66,6 +66,8 @@ class SplatStream:
         self.count = 0
         """Splats that the last iteration has given so far."""
         self._found_up: np.ndarray | None = None
+        self._told: set[Path] = set()
+        """Files that have been read to their end, and whose warnings have come."""
 
     @cached_property
     def origin(self) -> np.ndarray:
@@ -83,9 +85,11 @@ class SplatStream:
     def __iter__(self) -> Iterator[GaussianCloud]:
         self.count = 0
         for path in self.paths:
-            for block in self._of(path):
+            blocks = self._of(path)
+            for block in _quietly(blocks) if path in self._told else blocks:
                 self.count += len(block)
                 yield block
+            self._told.add(path)
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[Splats, np.ndarray]]:
@@ -170,7 +174,7 @@ def stream_gaussians(
 
     Returns:
         A stream of clouds, which can be iterated over several times. Errors and warnings of
-        ``load_gaussians`` come while it is read.
+        ``load_gaussians`` come while it is read, warnings the first time.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -196,6 +200,17 @@ def stream_gaussians(
         activated=activated,
         origin=origin,
     )
+
+
+def _quietly(blocks: Iterator[GaussianCloud]) -> Iterator[GaussianCloud]:
+    """``blocks`` without the warnings of reading them."""
+    while True:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            block = next(blocks, None)
+        if block is None:
+            return
+        yield block
 
 
 def _splat_files(path: Path) -> list[Path]:
