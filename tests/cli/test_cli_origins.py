@@ -305,8 +305,9 @@ def test_a_tileset_is_resumed_where_it_stands(scenes, tmp_path, monkeypatch):
     source = stream_gaussians(scenes[1].folder / "splats.ply")
     options = TileOptions(max_triangles=500, alpha="blend")
 
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
+    def stop(phase: str, share: float | None) -> None:
+        if phase == "making the tiles":
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         build_tiles(source, tmp_path / "t", options, on_progress=stop)

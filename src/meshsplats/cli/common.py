@@ -114,8 +114,8 @@ def resumable(record: Path, *, force: bool) -> Iterator[None]:
     """Says how to go on if the block is ended early and unfinished work with its ``record`` is left."""
     try:
         yield
-    except (KeyboardInterrupt, Terminated, OSError, ClusterError):
-        if record.is_file():
+    except (KeyboardInterrupt, Terminated, OSError, ClusterError) as error:
+        if record.is_file() and not isinstance(error, FileExistsError):  # which says what to do itself
             how = "--resume in place of --force" if force else "--resume"
             say(f"what is done stays: the same command with {how} continues")
         raise

@@ -11,8 +11,8 @@ import tyro
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, resumable, say_origin
-from meshsplats.cli.messages import UsageError
-from meshsplats.cli.progress import terminal_bar
+from meshsplats.cli.messages import UsageError, say
+from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.outputs import CONFIGURATION, beside, check_folder_name, check_outputs
 from meshsplats.tiles.options import TileOptions, TilingOptions
@@ -28,7 +28,8 @@ class Tiles(Command):
     """A 3D Tiles tileset of splats of any number: an octree of .glb files, fine ones for near and merged ones
     for far, that viewers and engines (CesiumJS, Unreal, Unity, Omniverse) load as they need them.
 
-    Memory stays below 2 GB for any number of splats. An interrupted run is continued by --resume.
+    Memory stays below 2 GB for any number of splats in most formats (not SOG, glTF, USD, zipped SPZ: see
+    docs/tiles.md). An interrupted run is continued by --resume.
     """
 
     CONFIGURABLE = True
@@ -58,21 +59,17 @@ class Tiles(Command):
         origin = None if isinstance(self.origin, str) else self.origin
         source = self.reading.stream(self.input, origin, up=self.tiles.up, threads=self.threads)
         left = resumable(partial_folder(self.output) / JOURNAL, force=self.force)
-        with left, self.cluster.workers(self.threads) as workers, terminal_bar() as bar:
+        with left, self.cluster.workers(self.threads) as workers, progress_display() as show:
+            how: dict[str, Any] = {"threads": self.threads, "workers": workers, "on_progress": show.phase}
             found = build_tiles(
-                source,
-                self.output,
-                options,
-                resume=self.resume,
-                replace_old=self.force,
-                threads=self.threads,
-                workers=workers,
-                on_progress=None if bar is None else lambda done, total: bar.phase("tiles", done / total),
+                source, self.output, options, resume=self.resume, replace_old=self.force, **how
             )
         write_configuration(config, "tiles", self)
         seconds = time.perf_counter() - start
         if source.origin.any() and not self.json:
             say_origin(source.origin, self.origin)
+            if self.origin == "keep" and not found.on_globe:
+                say("coordinates of a map, not of the globe: docs/tiles.md says how CesiumJS can show them")
         table = self.output / "tileset.json"
         line = found.alpha.in_words() if found.alpha else None
         self.finish(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from meshsplats._files.atomic import FULL
 from meshsplats._geometry import morton_codes
+from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.tiles.journal import Journal
 
@@ -78,6 +79,16 @@ def read_records(paths: Iterable[Path], degree: int) -> np.ndarray:
     return records[np.argsort(records["row"], kind="stable")]
 
 
+def check_size(path: Path, size: int) -> None:
+    """FileFormatError unless the file, which a run has left, has so many bytes: a copy or a power cut can
+    shorten it."""
+    found = path.stat().st_size if path.is_file() else 0
+    if found != size:
+        raise FileFormatError(
+            f"{path}: it has {found:,} bytes, but {size:,} were written: begin again with ``replace_old``"
+        )
+
+
 class Buckets:
     """Files of records of that ``degree`` in a folder, each the splats of a cell, in the order of their
     rows."""
@@ -95,6 +106,8 @@ class Buckets:
             key, size = todo.pop()
             counts = done.get(key)
             if counts is None:
+                if key:
+                    self._check(key, size)
                 counts = self._part(key, self._read(key) if key else records, size)
                 self._journal.add("sorted", key=key, counts=counts)
             if key:
@@ -103,14 +116,7 @@ class Buckets:
 
     def cells(self) -> dict[str, list[str]]:
         """The cells that fit into memory, the largest ones that do, and the files of each; in order."""
-        parted = self._journal.keys("sorted")
-        sizes = {
-            line["key"] + cell: n
-            for line in self._journal.steps
-            if line["step"] == "sorted"
-            for cell, n in line["counts"].items()
-            if line["key"] + cell not in parted
-        }
+        sizes = self._sizes()
         totals: dict[str, int] = {}
         for key, n in sizes.items():
             for length in range(len(key) + 1):
@@ -123,13 +129,32 @@ class Buckets:
             found.setdefault(cell, []).append(key)
         return found
 
-    def paths(self, files: Iterable[str]) -> list[Path]:
-        """The places of ``files`` on the disk, for ``read_records``."""
-        return [self._path(key) for key in files]
+    def paths(self, cells: Mapping[str, Iterable[str]]) -> list[tuple[str, list[Path]]]:
+        """The ``cells``, each with the places of its files on the disk, for ``read_records``.
+        FileFormatError if one of them does not hold the splats that were written."""
+        sizes = self._sizes()
+        for files in cells.values():
+            for key in files:
+                self._check(key, sizes[key])
+        return [(cell, [self._path(key) for key in files]) for cell, files in cells.items()]
 
     def remove(self, files: Iterable[str]) -> None:
         for key in files:
             self._path(key).unlink(missing_ok=True)
+
+    def _sizes(self) -> dict[str, int]:
+        """The splats in each file, by the journal."""
+        parted = self._journal.keys("sorted")
+        return {
+            line["key"] + cell: n
+            for line in self._journal.steps
+            if line["step"] == "sorted"
+            for cell, n in line["counts"].items()
+            if line["key"] + cell not in parted
+        }
+
+    def _check(self, key: str, count: int) -> None:
+        check_size(self._path(key), count * self._type.itemsize)
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.splats"

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -32,17 +31,19 @@ from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey, survey
-from meshsplats.errors import DataWarning, EarlierRunError, OptionValueError
+from meshsplats.errors import DataWarning, EarlierRunError, FileFormatError
 from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
 from meshsplats.formats.gltf.writer import change_alpha
 from meshsplats.formats.outputs import check_resumption
 from meshsplats.formats.streaming import SplatStream
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.buckets import BUCKET, Buckets, Cube, records_of
 from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, harmonics_degree, stored_survey
 from meshsplats.tiles.options import TileOptions
+from meshsplats.tiles.start import need_each_once, need_same_start, start_facts
 from meshsplats.tiles.tileset import (
     Node,
     Tileset,
@@ -55,6 +56,8 @@ from meshsplats.tiles.tileset import (
 
 JOURNAL = Path("work", "journal.jsonl")
 """Inside the folder of an unfinished tileset."""
+Show = Callable[[str, "float | None"], None]
+"""Takes the name of a phase and the share of it that is done, 0 to 1, None where that is not known."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class TilesetSummary:
     """Geometric error of the root, scene units."""
     alpha: AlphaChoice | None
     """The alpha mode of the tiles; None for tiles of splats."""
+    on_globe: bool = False
+    """Whether the transform of its root leads to a place on the Earth, as CesiumJS takes it."""
 
     def in_words(self) -> str:
         """Counts and size."""
@@ -92,7 +97,7 @@ def build_tiles(
     replace_old: bool = False,
     threads: int | None = None,
     workers: Workers | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: Show | None = None,
 ) -> TilesetSummary:
     """Writes the splats of ``source`` as the tileset ``folder``, whole or not at all.
 
@@ -108,13 +113,14 @@ def build_tiles(
         source: the splats.
         folder: of the tileset.
         options: what it should be like.
-        resume: go on with an interrupted run of the same splats and options.
+        resume: go on with an interrupted run of the same splats, options and version of MeshSplats.
         replace_old: replace a tileset that ``build_tiles`` has written, of which files that are none of its
             tiles stay, and begin again where an earlier run left a partial one.
         threads: at most this many; all processors by default.
         workers: build the cells of the octree, each in a task; this process by default. All of them have the
             folder at the same path.
-        on_progress: called with the count of finished splats and that of all.
+        on_progress: called with the name of a phase (passes over the splats, tiles, alpha mode) and the share
+            of it that is done, 0 to 1; None where that is not known.
 
     Returns:
         Counts of the tileset.
@@ -123,7 +129,8 @@ def build_tiles(
         FileExistsError: the folder or a partial one exists, or with ``replace_old`` one of another program.
         FileNotFoundError: there is nothing to resume.
         ValueError: options out of range, or other ones than the interrupted run had; no splat to convert;
-            files that are too far apart for one origin.
+            a file that is given twice; files that are too far apart for one origin.
+        FileFormatError: the interrupted run has lost some of what it had done.
         OSError: a full disk; what is done stays, for ``resume``.
         ClusterError: the workers are lost; what is done stays.
     """
@@ -133,6 +140,7 @@ def build_tiles(
     need(Workers, workers=workers, optional=True)
     check_threads(threads)
     chosen = options or TileOptions()
+    need_each_once(source.paths)
     usual = default_up(source.origin)  # whose errors come before anything is written
     if chosen.up is None:
         up = (usual if source.up is None else source.up).astype(float).tolist()
@@ -151,8 +159,7 @@ def build_tiles(
             if not resume and build.journal.find("survey") is None:
                 shutil.rmtree(unfinished)  # nothing to go on with
             raise
-        replace_folder(unfinished / "tileset", target, is_tile_file)
-        shutil.rmtree(unfinished)
+        build.place(target)
     return summary
 
 
@@ -168,9 +175,12 @@ def _check_folders(target: Path, unfinished: Path, resume: bool, replace_old: bo
             raise FileExistsError(f"{target} is there and holds no tileset.json: give another folder")
         if not is_ours(target):
             raise FileExistsError(f"{target} holds a tileset of another program: give another folder")
-        if not (replace_old or resume):
-            raise EarlierRunError(f"{target} exists: give another folder, or ``replace_old`` to replace it")
+    work = unfinished / JOURNAL.parent
+    if work.is_dir() and all(path.is_dir() for path in unfinished.rglob("*")):
+        shutil.rmtree(unfinished)  # of a run that was killed before its first step
     check_resumption(target, unfinished, JOURNAL, resume=resume, replace_old=replace_old)
+    if target.exists() and not (replace_old or resume):
+        raise EarlierRunError(f"{target} exists: give another folder, or ``replace_old`` to replace it")
     if unfinished.exists() and not resume:
         shutil.rmtree(unfinished)
 
@@ -186,18 +196,42 @@ class _Build:
         conversion: ConversionOptions,
         threads: int | None,
         workers: Workers | None,
-        on_progress: Callable[[int, int], None] | None,
+        on_progress: Show | None,
     ) -> None:
         self._source, self._options, self._conversion = source, options, conversion
-        self._workers, self._on_progress = workers or Workers(threads), on_progress
+        self._workers, self._show = workers or Workers(threads), on_progress or (lambda phase, share: None)
+        self._passes = _Passes(source, self._show)
         self._folder, self._threads = folder, threads
         self._work, self._out = folder / "work", folder / "tileset"
-        for part in (self._work / "done", self._work / "splats", self._out):
-            part.mkdir(parents=True, exist_ok=True)
+        self._work.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(folder / JOURNAL)
 
     def run(self) -> TilesetSummary:
+        """Makes the tileset, beside what the run needs."""
         self._check_start()
+        noted = self.journal.find("finished")
+        if noted is None:
+            summary = self._made()
+            self.journal.add("finished", **asdict(summary))
+            return summary
+        fields = {name: value for name, value in noted.items() if name != "step"}
+        return TilesetSummary(**fields | {"alpha": fields["alpha"] and AlphaChoice(**fields["alpha"])})
+
+    def place(self, target: Path) -> None:
+        """Gives the finished tileset its name, and removes what the run has needed."""
+        if not self._out.is_dir():  # the run was killed after that
+            if not is_ours(target):
+                raise EarlierRunError(
+                    f"{self._folder}: its tileset had become {target}, which is gone: begin again with"
+                    " ``replace_old``"
+                )
+            os.rename(target, self._out)  # for what an older one may still have to hand over
+        replace_folder(self._out, target, is_tile_file)
+        shutil.rmtree(self._folder)
+
+    def _made(self) -> TilesetSummary:
+        for part in (self._work / "done", self._work / "splats", self._out):
+            part.mkdir(exist_ok=True)
         scene = self._survey()
         if self._options.as_splats and scene.kernel == "2dgs":
             text = "SPZ leaves out the kernel '2dgs': the tiles are drawn as '3dgs'"
@@ -206,6 +240,7 @@ class _Build:
         cube = Cube(scene.low, scene.high)
         buckets = Buckets(self._work / "splats", cube, self.journal, BUCKET, degree)
         buckets.fill(self._records(degree), scene.kept)
+        self._show("making the tiles", None)
         cells = buckets.cells()
         done = {line["key"]: line["splats"] for line in self.journal.steps if line["step"] == "cell"}
         finished = 0
@@ -214,12 +249,11 @@ class _Build:
             nonlocal finished
             buckets.remove(cells[cell])
             finished += done[cell]
-            if self._on_progress:
-                self._on_progress(finished, scene.kept)
+            self._show("making the tiles", finished / scene.kept)
 
         for cell in done:
             ended(cell)
-        todo = [(cell, buckets.paths(files)) for cell, files in cells.items() if cell not in done]
+        todo = buckets.paths({cell: files for cell, files in cells.items() if cell not in done})
         build = partial(build_cell, self._tiles(self._workers.threads))
         for i, count in self._workers.run(build, todo):
             cell = todo[i][0]
@@ -236,15 +270,26 @@ class _Build:
                 nodes[fields["key"]] = Node(**fields)
         leaves = [node for node in nodes.values() if not node.children]
         splats = sum(node.splats for node in leaves)
+        self._check_whole(nodes, splats, scene.kept)
         up = unit_up(self._options.up or DEFAULT_UP)
         of_splats = self._options.as_splats
-        axes = self._source.from_file_axes if on_globe(self._origin, up) else None
+        turn = self._source.from_file_axes if self._origin.any() else np.eye(3)
+        axes = turn if on_globe(turn.T @ self._origin, turn.T @ up) else None
         write_tilesets(self._out, nodes, root, up, splats, self._origin, axes, of_splats=of_splats)
         alpha = self._alpha(scene, nodes)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
-        levels = _height(nodes, root)
-        return TilesetSummary(splats, triangles, len(nodes), levels, size, nodes[root].error, alpha)
+        levels, error = _height(nodes, root), nodes[root].error
+        return TilesetSummary(splats, triangles, len(nodes), levels, size, error, alpha, axes is not None)
+
+    def _check_whole(self, nodes: dict[str, Node], splats: int, kept: int) -> None:
+        """FileFormatError where tiles, or some of their splats, are no longer there."""
+        gone = [key for key in nodes if not (self._out / tile_path(key)).is_file()]
+        if gone or splats != kept:
+            what = f"{tile_path(gone[0])} is missing" if gone else f"{splats:,} of {kept:,} splats are left"
+            raise FileFormatError(
+                f"{self._folder}: {what}, though the journal has all: begin again with ``replace_old``"
+            )
 
     def _alpha(self, scene: Survey, nodes: dict[str, Node]) -> AlphaChoice | None:
         """The alpha mode of the tiles, after choosing it if that is asked for. They are written with 'mask',
@@ -255,6 +300,7 @@ class _Build:
             return AlphaChoice(self._options.alpha)
         noted = self.journal.find("alpha")
         if noted is None:
+            self._show("choosing the alpha mode", None)
             choice = self._chosen(scene)
             self.journal.add("alpha", **asdict(choice))
         else:
@@ -295,27 +341,18 @@ class _Build:
 
     def _check_start(self) -> None:
         """Notes what the run is about, or refuses to resume another one."""
-        files = [[str(path), os.stat(path).st_size, os.stat(path).st_mtime_ns] for path in self._source.paths]
-        options = json.loads(json.dumps(asdict(self._options)))
-        facts: dict[str, Any] = {"files": files, "reading": self._source.reading, "options": options}
-        if self._source.origin.any():
-            facts["origin"] = self._source.origin.tolist()
+        facts = start_facts(self._source, self._options)
         before = self.journal.find("start")
         if before is None:
             self.journal.add("start", **facts)
-            return
-        for name, value in facts.items():
-            if before.get(name) != value:
-                raise OptionValueError(
-                    f"{self._work.parent} was started with other {name} ({str(before.get(name))[:200]}):"
-                    " ``resume`` with the same, or begin again with ``replace_old``"
-                )
+        else:
+            need_same_start(before, facts, self._folder)
 
     def _survey(self) -> Survey:
         """The survey of the scene; that of the interrupted run if there is one."""
         path = self._work / SURVEY
         if self.journal.find("survey") is None:
-            found = survey(self._source, self._conversion)
+            found = survey(self._passes.of("surveying the splats", 2), self._conversion)
             with atomic_path(path) as temporary:
                 arrays = {
                     "counts": np.array([found.kept, found.step, found.sh_degree]),
@@ -329,12 +366,36 @@ class _Build:
 
     def _records(self, degree: int) -> Iterator[np.ndarray]:
         passed = 0
-        for block in self._source:
+        for block in self._passes.of("sorting the splats", 1):
             rows = worth_drawing(block, self._conversion)
             yield records_of(block.take(rows), (rows + passed).astype(np.int32), degree)
             passed += len(block)
             if passed > np.iinfo(np.int32).max:
                 raise ValueError(f"{passed:,} splats are more than tiles can number")
+
+
+class _Passes:
+    """The splats of ``source``, passes over which are shown. How many there are is known after the first."""
+
+    def __init__(self, source: SplatStream, show: Show) -> None:
+        self._source, self._show = source, show
+        self._splats = 0
+
+    def of(self, phase: str, count: int) -> _Passes:
+        """These splats for ``count`` passes, which are one ``phase``."""
+        self._phase, self._count, self._past = phase, count, 0
+        self._show(phase, None)
+        return self
+
+    def __iter__(self) -> Iterator[GaussianCloud]:
+        done = 0
+        for block in self._source:
+            yield block
+            done += len(block)
+            if self._splats:
+                self._show(self._phase, (self._past + min(1.0, done / self._splats)) / self._count)
+        self._splats = done
+        self._past += 1
 
 
 def _height(nodes: dict[str, Node], key: str) -> int:

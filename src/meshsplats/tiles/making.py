@@ -25,7 +25,15 @@ from meshsplats.formats.gltf.writer import Alpha
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
-from meshsplats.tiles.buckets import DEPTH, Cube, cloud_of, read_records, record_type, records_of
+from meshsplats.tiles.buckets import (
+    DEPTH,
+    Cube,
+    check_size,
+    cloud_of,
+    read_records,
+    record_type,
+    records_of,
+)
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.options import TileOptions
 from meshsplats.tiles.tileset import Node, tile_path
@@ -235,8 +243,11 @@ class TileWriter:
             for octant in sorted({cell[len(top)] for cell in cells})
         ]
         if top not in journal.keys("above"):
+            below = [self.root_of(place) for place in parts]
+            for place, child in zip(parts, below, strict=True):
+                check_size(self._merged(place), child.splats * self._type.itemsize)
             merged = [np.fromfile(self._merged(place), self._type) for place in parts]
-            node, own = self._inner(top, [self.root_of(place) for place in parts], merged)
+            node, own = self._inner(top, below, merged)
             self.keep(top, [node], own)
             journal.add("above", key=top)
         return top

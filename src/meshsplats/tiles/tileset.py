@@ -20,13 +20,15 @@ import numpy as np
 
 from meshsplats import __version__
 from meshsplats._files.atomic import write_text
+from meshsplats._geometry import away_from_ground
 from meshsplats._json import read_json
 from meshsplats._kinds import need_path
+from meshsplats._origin import FAR
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import tile_frame
 from meshsplats.formats.gltf.splat_tiles import CONTENT
-from meshsplats.formats.gltf.splat_tilesets import GLOBE, axes_of
+from meshsplats.formats.gltf.splat_tilesets import axes_of
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import NAME
@@ -74,7 +76,7 @@ def is_ours(folder: Path) -> bool:
     """Whether ``build_tiles`` has written the tileset.json in ``folder``."""
     try:
         return isinstance(_load(folder / NAME)["extras"]["meshsplats"], dict)
-    except (FileFormatError, KeyError, TypeError):
+    except (FileFormatError, FileNotFoundError, KeyError, TypeError):
         return False
 
 
@@ -103,10 +105,11 @@ def write_tilesets(
         note["origin"] = origin.tolist()
     if axes is not None:
         note["axes"] = axes.tolist()
+    boxes = _boxes(nodes)
     files = [key for key in sorted(nodes) if key != root and _starts_file(key, nodes, root)]
     for key in [*files, root]:
         own = "" if key == root else _group(key)
-        tile = _tile(nodes[key], nodes, own)
+        tile = _tile(nodes[key], nodes, own, boxes)
         box = np.array(nodes[key].high) - np.array(nodes[key].low)
         document: dict[str, Any] = {
             "asset": {"version": "1.1", "generator": f"MeshSplats {__version__}"},
@@ -124,10 +127,11 @@ def write_tilesets(
 
 
 def on_globe(origin: np.ndarray, up: np.ndarray) -> bool:
-    """Whether ``origin`` (3,) is a point on the ground of the Earth, in metres from its middle, where ``up``
-    (3,), a unit vector, points away from that. Of projected coordinates it does not."""
-    radius = float(np.linalg.norm(origin))
-    return GLOBE[0] < radius < GLOBE[1] and bool(origin @ up > 0.99 * radius)
+    """Whether ``origin`` (3,) is a point on the ground of the Earth, in metres from its middle along the axes
+    of the globe (ECEF), not projected coordinates with a height above it: one far from the plane of the
+    equator, or from whose ground ``up`` (3,), a unit vector, points away."""
+    away = away_from_ground(origin)
+    return away is not None and bool(abs(origin[2]) > FAR or away @ up > 0.99)
 
 
 def _transform(up: np.ndarray, origin: np.ndarray, axes: np.ndarray | None) -> list[float]:
@@ -161,10 +165,10 @@ def _above(key: str, nodes: dict[str, Node]) -> str:
     return next(key[:n] for n in range(len(key) - 1, -1, -1) if key[:n] in nodes)
 
 
-def _tile(node: Node, nodes: dict[str, Node], group: str) -> dict[str, Any]:
+def _tile(node: Node, nodes: dict[str, Node], group: str, boxes: dict[str, list[float]]) -> dict[str, Any]:
     """The entry of a tile in the file of the folder ``group``."""
     tile: dict[str, Any] = {
-        "boundingVolume": {"box": _box(node)},
+        "boundingVolume": {"box": boxes[node.key]},
         "geometricError": node.error,
         "content": {"uri": _relative(tile_path(node.key), group)},
         "extras": {"splats": node.splats},
@@ -174,12 +178,12 @@ def _tile(node: Node, nodes: dict[str, Node], group: str) -> dict[str, Any]:
     children = []
     for key in node.children:
         if _group(key) == group or not nodes[key].children:
-            children.append(_tile(nodes[key], nodes, group))
+            children.append(_tile(nodes[key], nodes, group, boxes))
         else:
             uri = _relative("/".join([*_folders(key), NAME]), group)
             children.append(
                 {
-                    "boundingVolume": {"box": _box(nodes[key])},
+                    "boundingVolume": {"box": boxes[key]},
                     "geometricError": nodes[key].error,
                     "content": {"uri": uri},
                 }
@@ -194,12 +198,22 @@ def _relative(path: str, group: str) -> str:
     return path[len(prefix) :]
 
 
-def _box(node: Node) -> list[float]:
-    low, high = np.array(node.low), np.array(node.high)
-    center, half = (low + high) / 2, (high - low) / 2
-    half = half + GROW * max(float(half.max()), float(np.abs(center).max()), 1e-30)
-    axes = np.diag(half)
-    return [float(x) for x in (*center, *axes.ravel())]
+def _boxes(nodes: dict[str, Node]) -> dict[str, list[float]]:
+    """The box of each tile by its key, a little larger than its content; those of its children lie inside."""
+    found: dict[str, list[float]] = {}
+    corners: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for key in sorted(nodes, key=len, reverse=True):  # children first
+        node = nodes[key]
+        low, high = np.array(node.low), np.array(node.high)
+        grow = GROW * max(float((high - low).max()) / 2, float(np.abs(low + high).max()) / 2, 1e-30)
+        below = [corners[child] for child in node.children]
+        low = np.min([low - grow, *(least for least, _ in below)], axis=0)
+        high = np.max([high + grow, *(most for _, most in below)], axis=0)
+        center = (low + high) / 2
+        half = np.nextafter(np.maximum(high - center, center - low), np.inf)  # no corner is rounded inwards
+        corners[key] = center - half, center + half
+        found[key] = [float(x) for x in (*center, *np.diag(half).ravel())]
+    return found
 
 
 # ---- Reading
