@@ -11,6 +11,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from _glb import edit_glb
 from _priors import bumpy
 from _splats import few_splats
 
@@ -23,7 +24,7 @@ from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews, check_photographs
 from meshsplats.edits import EditCallbacks, bake_file, clean_file, simplify_file
-from meshsplats.errors import OptionsError, OptionValueError
+from meshsplats.errors import DataWarning, OptionsError, OptionValueError
 from meshsplats.evaluation.comparison_files import save_comparison
 from meshsplats.evaluation.level_tables import load_table, table_in_words
 from meshsplats.evaluation.mesh_files import MeshFileOptions
@@ -372,6 +373,17 @@ def test_a_file_is_tuned_as_planned(files):
     first = next(iter(result.in_words()))
     assert f"{len(trained.saved.faces):,} triangles): 2 steps in 1.5 s; held out: " in first
     assert first.endswith("(look area, 2 x 2 samples)")
+
+
+def test_a_glb_with_an_animation_is_no_film_and_says_so(tmp_path):
+    ms.save_mesh(ms.bind(bumpy(2)).mesh, tmp_path / "prior.npz")
+    ms.save_base(bumpy(2), tmp_path / "a.glb")
+    edit_glb(
+        tmp_path / "a.glb", lambda document: document.update(animations=[{"channels": [], "samplers": []}])
+    )
+    with pytest.warns(DataWarning, match=r"a\.glb: holds an animation, .* export it as \.usdc"):
+        files = save_poses(tmp_path / "prior.npz", [tmp_path / "a.glb"], tmp_path / "p.npz")
+    assert files == {tmp_path / "p.npz": tmp_path / "a.glb"}
 
 
 def test_priors_need_options_that_agree(tmp_path):

@@ -19,7 +19,6 @@ FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 NOT_OURS = {
     "_foreign.py": {"--load-config", "--output-dir"},  # nerfstudio
     "errors.py": {"--index-url"},  # pip
-    "formats/usd/extraction.py": {"--flatten"},  # usdcat
     "formats/mesh_formats.py": {"--lit"},  # the table of docs/files.md
     "formats/meshes.py": {"--colors"},  # of bake: a whole command to type, whoever says it
     "blender/launch.py": {"--version", "--background", "--factory-startup", "--python-exit-code", "--python"},

@@ -199,6 +199,19 @@ def test_names_on_another_machine_are_looked_for_beside_the_mesh(tmp_path, name)
     np.testing.assert_array_equal(base.face_texture, [0, 0])
 
 
+@pytest.mark.parametrize("through", ["in", "link"])
+def test_whole_paths_below_the_folder_are_inside_it(tmp_path, through):
+    """As flattening writes them; also where a link leads to the folder."""
+    (tmp_path / "in" / "textures").mkdir(parents=True)
+    make_link(tmp_path / "link", tmp_path / "in")
+    write_image(tmp_path / "in" / "textures" / "t.png")
+    image = (tmp_path / through / "textures" / "t.png").as_posix()
+    write_obj(tmp_path / "in", library=f"newmtl painted\nmap_Kd {image}\n")
+    (tmp_path / "in" / "t.png").unlink()
+    base = load_base(tmp_path / through / "m.obj")
+    np.testing.assert_array_equal(base.face_texture, [0, 0])
+
+
 def test_a_link_out_of_the_folder_is_refused(tmp_path):
     (tmp_path / "in").mkdir()
     write_image(tmp_path / "t.png")

@@ -470,13 +470,44 @@ def test_plain_colours_of_materials(tmp_path, parts):
         warnings.simplefilter("error")
         mesh = ms.load_mesh(write(tmp_path, surface=f"{plain}\nfloat inputs:opacity = 0.25"))
     np.testing.assert_allclose(mesh.colors, [[half, 0, 1, 0.25]] * 4, atol=1e-6)
-    painted = "color3f[] primvars:displayColor = [(0, 1, 0)]"
-    mesh = ms.load_mesh(write(tmp_path, surface=plain, mesh=painted))
-    np.testing.assert_array_equal(mesh.colors, [[0, 1, 0, 1]] * 4)
+    painted = "color3f[] primvars:displayColor = [(0, 1, 0)]\nfloat[] primvars:displayOpacity = [0.5]"
+    mesh = ms.load_mesh(write(tmp_path, surface=plain, mesh=painted))  # as renderers have it
+    np.testing.assert_allclose(mesh.colors, [[half, 0, 1, 1]] * 4, atol=1e-6)
+    mesh = ms.load_mesh(strip(tmp_path, PLAIN, surface=plain))
+    np.testing.assert_allclose(mesh.colors[mesh.faces].mean(axis=1)[:, 1], [0, 0, 1, 1, 0])
     mesh = ms.load_mesh(strip(tmp_path, PLAIN, surface=plain))
     np.testing.assert_allclose(mesh.colors[mesh.faces].mean(axis=1)[:, 1], [0, 0, 1, 1, 0])
     with pytest.warns(NoColorsWarning):
         ms.load_mesh(write(tmp_path, surface=""))
+
+
+def test_a_material_may_read_the_colours_of_the_mesh(tmp_path, parts):
+    """And its opacity; in black, too, of which it emits them."""
+    painted = "color3f[] primvars:displayColor = [(0, 1, 0)]\nfloat[] primvars:displayOpacity = [0.5]"
+    link = "Color.connect = </Mat/Primvar.outputs:result>"
+    kind = 'uniform token info:id = "UsdPrimvarReader_float3"'
+    shader = f'def Shader "Primvar" {{ {kind}\nfloat3 outputs:result\n}}'
+    diffuse = f"color3f inputs:diffuse{link}"
+    for surface in (diffuse, f"color3f inputs:emissive{link}\ncolor3f inputs:diffuseColor = (0, 0, 0)"):
+        mesh = ms.load_mesh(write(tmp_path, surface=surface, mesh=painted, shaders=shader))
+        np.testing.assert_array_equal(mesh.colors, [[0, 1, 0, 0.5]] * 4)
+    surface = f"color3f inputs:diffuseColor = (1, 0, 0)\nfloat inputs:opacity.connect = {link.split()[-1]}"
+    mesh = ms.load_mesh(write(tmp_path, surface=surface, mesh=painted, shaders=shader))
+    np.testing.assert_array_equal(mesh.colors, [[1, 0, 0, 0.5]] * 4)
+
+
+def test_colours_of_faces_without_a_material(tmp_path, parts):
+    """They are those of the mesh, if it has any."""
+    path = strip(tmp_path, PLAIN, surface="")
+    green = load_mesh_quietly(path).colors[:, :3]
+    painted = path.read_text().replace(
+        "point3f[] points", "color3f[] primvars:displayColor = [(1, 0, 1)]\npoint3f[] points"
+    )
+    path.write_text(painted)
+    mesh = ms.load_mesh(path)
+    np.testing.assert_array_equal(mesh.colors[mesh.faces[2:4], :3].reshape(-1, 3), [[0, 1, 0]] * 6)
+    np.testing.assert_array_equal(mesh.colors[mesh.faces[[0, 1, 4]], :3].reshape(-1, 3), [[1, 0, 1]] * 9)
+    assert len(mesh.colors) == len(green)
 
 
 def test_plain_colours_beside_a_texture(tmp_path, parts):

@@ -46,7 +46,7 @@ class Deform(Command):
         from meshsplats.formats.outputs import placed
         from meshsplats.prior.planning import by_number, save_poses
 
-        start, count, bases = time.perf_counter(), len(self.base), by_number(self.base)
+        start, bases = time.perf_counter(), by_number(self.base)
         if not self.base:
             raise UsageError("give the edited base with --base")
         triangles = 0
@@ -60,13 +60,14 @@ class Deform(Command):
 
         how: dict[str, Any] = {"lift": self.lift, "place": place, "force": self.force}
         shown = partial(track, label="moving")
-        files = save_poses(self.input, bases, self.output, progress=shown, **how)
+        bases_of = save_poses(self.input, bases, self.output, progress=shown, **how)
         seconds = time.perf_counter() - start
-        more = f" to {files[-1]}" if count > 1 else ""
+        files = list(bases_of)
+        more = f" to {files[-1]}" if len(files) > 1 else ""
         made = f"{files[0]}{more} ({plural(triangles, 'triangle')}, {size_of(files[0])}):"
-        names = {"files": list(map(str, files)), "bases": list(map(str, bases))}
+        names = {"files": list(map(str, files)), "bases": list(map(str, bases_of.values()))}
         self.finish(
             names | {"triangles": triangles, "seconds": round(seconds, 3)},
-            f"{made} {plural(count, 'pose')} in {seconds:.2f} s",
+            f"{made} {plural(len(files), 'pose')} in {seconds:.2f} s",
             indent=None,
         )

@@ -11,11 +11,14 @@ from meshsplats.errors import DataWarning, FileFormatError
 
 
 def file_beside(path: Path, name: bytes) -> Path:
-    """The file ``name`` in the folder of ``path`` or below. Of a name that leads elsewhere, as on the machine
-    of whoever made the file, the last part counts; FileFormatError if no such file is there."""
+    """The file ``name``, also a whole path, in the folder of ``path`` or below. Of a name that leads
+    elsewhere, as on the machine of whoever made the file, the last part counts; FileFormatError if no such
+    file is there."""
     clean = os.fsdecode(name).replace("\\", "/")
     if "\0" not in clean and 0 < len(clean) <= 1000:
-        folder, parts = Path(os.path.realpath(path)).parent, PurePosixPath(clean).parts
+        folder = Path(os.path.realpath(path)).parent
+        clean = _below(clean, Path(os.path.abspath(path)).parent, folder)
+        parts = PurePosixPath(clean).parts
         leads_out = clean.startswith("/") or ".." in parts or bool(PureWindowsPath(clean).drive)
         target = Path(os.path.realpath(folder.joinpath(*(parts[-1:] if leads_out else parts))))
         if folder in target.parents and (not leads_out or target.is_file()):
@@ -23,6 +26,14 @@ def file_beside(path: Path, name: bytes) -> Path:
     raise FileFormatError(
         f"{path}: refers to {shown_name(name)!r} outside its folder; refused. Put it beside the mesh"
     )
+
+
+def _below(name: str, *folders: Path) -> str:
+    """``name``, relative to the first of the ``folders`` that it begins with; by the text alone."""
+    for folder in folders:
+        if Path(name).is_absolute() and Path(name).is_relative_to(folder):
+            return Path(name).relative_to(folder).as_posix()
+    return name
 
 
 def shown_name(name: bytes) -> str:

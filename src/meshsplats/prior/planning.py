@@ -17,7 +17,7 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.views import Dataset
-from meshsplats.errors import DataWarning, OptionsError
+from meshsplats.errors import AnimationWarning, DataWarning, OptionsError
 from meshsplats.finetuning.checkpoint import Checkpoint, as_begun
 from meshsplats.finetuning.config import FinetuneConfig, worthwhile_views
 from meshsplats.finetuning.plans import Plan, Trained, over_background
@@ -25,9 +25,12 @@ from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.base_meshes import load_base
+from meshsplats.formats.content import Content
+from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
+from meshsplats.formats.usd.reader import usd_frames
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.agreement import warn_of_contradictions
 from meshsplats.prior.laying import bind
@@ -137,9 +140,11 @@ def save_poses(
     place: Callable[[SplatMesh], SplatMesh] = lambda mesh: mesh,
     force: bool = False,
     progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda poses, count: poses,
-) -> list[Path]:
-    """Writes the splats of the prior in the file ``source`` on each of the edited ``bases``, to
-    ``pose_files(output, len(bases))``, which are returned.
+) -> dict[Path, Path]:
+    """Writes the splats of the prior in the file ``source`` on each of the edited ``bases``, and of those
+    that are USD files with an animation, on each of its time samples.
+
+    Returns ``pose_files`` of ``output``, each with the base that it shows.
 
     Args:
         lift: distance between layers, scene units. By default that of the prior; for coplanar layers 0 in
@@ -157,24 +162,45 @@ def save_poses(
     source, output = as_path("source", source), as_path("output", output)
     edited = [as_path(f"bases[{i}]", base) for i, base in enumerate(bases)]
     check_mesh_suffix(output)
-    targets = pose_files(output, len(edited))
-    check_outputs(targets, force, inputs=[source, *edited])
+    check_outputs(pose_files(output, len(edited)), force, inputs=[source, *edited])
     prior = load_prior(source)
-    loaded = [load_base(path, textures=False, origin=prior.mesh.origin) for path in edited]
+    loaded = [(path, base) for path in edited for base in _frames(path, prior.mesh.origin)]
+    shown = [path for path, _ in loaded]
+    targets = pose_files(output, len(loaded))
+    check_outputs(targets, force, inputs=[source, *edited])
     poses = []
-    for path, base in zip(edited, loaded, strict=True):
+    for path, base in loaded:
         try:
             poses.append(prior.vertices_of(base))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-    poses = _upright(prior, edited, loaded, poses)
+    poses = _upright(prior, shown, [base for _, base in loaded], poses)
     if lift is None and output.suffix.lower() != ".npz" and not prior.lift:
         lift = prior.export_lift
     for pose, target in progress(zip(poses, targets, strict=True), len(targets)):
         mesh = place(prior.pose(pose, lift=lift))
         # Formats without a place for the binding would warn of it.
         save_mesh(mesh if keeps(target, "binding") else replace(mesh, binding=None), target)
-    return targets
+    return dict(zip(targets, shown, strict=True))
+
+
+def _frames(path: Path, origin: np.ndarray) -> list[BaseMesh]:
+    """The base in a file, relative to ``origin``; of a USD file with an animation, at each of its times."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        base = load_base(path, textures=False, origin=origin)
+    moving = [each for each in caught if issubclass(each.category, AnimationWarning)]
+    for each in caught:
+        if each not in moving:
+            warnings.warn(each.message, stacklevel=4)
+    if not moving:
+        with Content(path) as content:
+            if content.container in ("glb", "json") and GltfDocument(path).items("animations"):
+                message = f"{path}: holds an animation, of which only the pose without it was read"
+                message += ": export it as .usdc, or each frame as a file of its own"
+                warnings.warn(message, DataWarning, stacklevel=4)
+        return [base]
+    return [replace(base, vertices=vertices) for vertices in usd_frames(path, base.origin)]
 
 
 def _upright(

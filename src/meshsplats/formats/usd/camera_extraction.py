@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.formats._orientation import up_rotation
-from meshsplats.formats.usd.opening import is_visible, main, opened, visible_meshes
+from meshsplats.formats.usd.motion import in_metres
+from meshsplats.formats.usd.opening import main, metres, opened, visible_prims, visible_shapes
 from meshsplats.formats.usd.own_notes import is_own_placement, our_note
 
 _MOST = 20_000
@@ -29,13 +30,13 @@ def extract_cameras(file: Path, result: Path, origin: np.ndarray | None) -> dict
 
     stage, now = opened(file), Usd.TimeCode.EarliestTime()
     to_mesh = np.eye(4)  # the root of a mesh of ours has turned it, and its place in the world with it
-    meshes, _ = visible_meshes(stage)
+    meshes, unit = visible_shapes(stage).meshes, metres(stage)
     note = our_note(meshes[0]) if len(meshes) == 1 else {}
-    if note and is_own_placement(np.array(meshes[0].ComputeLocalToWorldTransform(now)), note):
+    if note and unit == 1 and is_own_placement(np.array(meshes[0].ComputeLocalToWorldTransform(now)), note):
         to_mesh[:3, :3] = up_rotation(np.array(note["up"])).T
     found: list[list[Any]] = []
-    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
-        if not prim.IsA(UsdGeom.Camera) or not is_visible(prim) or len(found) == _MOST:
+    for prim in visible_prims(stage):
+        if not prim.IsA(UsdGeom.Camera) or len(found) == _MOST:
             continue
         lens = UsdGeom.Camera(prim).GetCamera(now)
         if lens.projection != type(lens).Perspective:
@@ -43,7 +44,7 @@ def extract_cameras(file: Path, result: Path, origin: np.ndarray | None) -> dict
         wide, high, focal = lens.horizontalAperture, lens.verticalAperture, lens.focalLength
         angle = 2 * math.atan2(high, 2 * focal)
         shape = wide / high if high else math.inf
-        matrix = to_mesh @ np.array(lens.transform).T
+        matrix = to_mesh @ in_metres(unit) @ np.array(lens.transform).T
         name = prim.GetDisplayName() or prim.GetName()
         found.append([angle, shape, matrix.tolist(), name[:100]])
     np.savez(result)

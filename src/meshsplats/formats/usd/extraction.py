@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,47 +20,60 @@ from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.usd.looks import GREY, Looks
-from meshsplats.formats.usd.opening import BLENDER, main, opened, visible_meshes
+from meshsplats.formats.usd.motion import placements, sample_times, vertices_at
+from meshsplats.formats.usd.opening import BLENDER, main, metres, opened, say_units, visible_shapes
 from meshsplats.formats.usd.own_notes import is_own_placement, our_note, restored
 from meshsplats.formats.usd.polygons import Polygons, polygons_of, primvar
+from meshsplats.formats.usd.skeletons import pose
 from meshsplats.spherical_harmonics import moved_harmonics
 
 
-def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
-    """Writes the arrays; returns warnings, up direction, origin, blending, names of attributes and whether
-    there are textures. Raises FileFormatError."""
-    from pxr import Usd, UsdGeom
+class Piece(NamedTuple):
+    """One mesh."""
+
+    arrays: dict[str, np.ndarray]
+    """Vertices, triangles, linear colours, and normals if it has any, in its own frame."""
+    rows: np.ndarray | slice
+    """The points of the mesh that its vertices are."""
+
+
+def extract_meshes(
+    file: Path, result: Path, origin: np.ndarray | None, *, frames: bool = False
+) -> dict[str, Any]:
+    """Writes the arrays; returns warnings, up direction, origin, blending, names of attributes, whether there
+    are textures, and the times at which meshes have values. ``frames`` adds (t, v, 3) float32 ``frames``, the
+    vertices at each of these. Raises FileFormatError."""
+    from pxr import UsdGeom
 
     stage = opened(file)
-    shapes, others = visible_meshes(stage)
+    times, warnings = pose(stage, whole=frames)
+    shown = visible_shapes(stage)
+    shapes = shown.meshes
     if not shapes:
-        raise FileFormatError(
-            "the stage holds no visible mesh" + (f", but {others:,} other shapes" if others else "")
-        )
-    report: dict[str, Any] = {"warnings": [], "attributes": [], "blending": "display"}
-    if others:
-        report["warnings"].append(f"{others:,} shapes that are no meshes were left out")
-    budget = Budget(file)
+        others = f", but {shown.left_out}" if shown.left_out else ""
+        raise FileFormatError(f"the stage holds no visible mesh{others}")
+    report: dict[str, Any] = {"warnings": warnings, "attributes": [], "blending": "display"}
+    if shown.left_out:
+        warnings.append(f"{shown.left_out} were left out")
+    budget, unit = Budget(file), metres(stage)
+    warnings += say_units(unit)
     note = our_note(shapes[0]) if len(shapes) == 1 else {}
-    places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
-    matrices, own = [], False
-    for shape in shapes:
-        matrix = np.array(places.GetLocalToWorldTransform(shape.GetPrim()))
-        if note and is_own_placement(matrix, note):
-            report["up"], own = note["up"], True
-            matrix = np.eye(4)
-        matrices.append(matrix)
+    matrices = placements(shapes, unit)
+    own = bool(note) and unit == 1 and is_own_placement(matrices[0], note)
+    back = np.linalg.inv(matrices[0]) if own else np.eye(4)
+    if own:
+        report["up"], matrices = note["up"], [np.eye(4)]
     looks = Looks()
     pieces = [_piece(shape, budget, looks) for shape in shapes]
     if own:
         origin = np.array(note["origin"])
     elif origin is None:
-        origin = _chosen_origin(pieces, matrices, report)
+        origin = _chosen_origin([piece.arrays for piece in pieces], matrices, report)
     for piece, matrix in zip(pieces, matrices, strict=True):
-        _put(piece, matrix, zero_origin() if own else origin, exact=bool(note))
+        _put(piece.arrays, matrix, zero_origin() if own else origin, exact=bool(note))
     report["origin"] = origin.tolist()
     report.setdefault("up", [0, 0, 1] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else [0, 1, 0])
-    arrays = _joined(pieces)
+    arrays = _joined([piece.arrays for piece in pieces])
     if note:
         report["blending"] = note["blending"]
         arrays |= restored(shapes[0], note, arrays, report)
@@ -69,6 +82,14 @@ def extract_meshes(file: Path, result: Path, origin: np.ndarray | None) -> dict[
     if note.get("normals") == "computed":
         arrays.pop("normals", None)
     report["textured"] = looks.textured
+    report["times"] = sorted(times | sample_times(shapes))
+    if frames:
+        budget.spend(12 * len(report["times"]) * len(arrays["vertices"]), "its frames")
+        rows, shift = [piece.rows for piece in pieces], zero_origin() if own else origin
+        arrays["frames"] = np.empty((len(report["times"]), *arrays["vertices"].shape), np.float32)
+        for time, frame in zip(report["times"], arrays["frames"], strict=True):
+            moved = [matrix @ back for matrix in placements(shapes, unit, time)]
+            frame[:] = vertices_at(time, shapes, rows, moved) - shift
     np.savez(result, **arrays)  # type: ignore[arg-type]
     return report
 
@@ -104,21 +125,20 @@ def _put(piece: dict[str, np.ndarray], matrix: np.ndarray, origin: np.ndarray, *
         piece["normals"] = normals.astype(np.float32)
 
 
-def _piece(shape: Any, budget: Budget, looks: Looks) -> dict[str, np.ndarray]:
-    """Arrays of one mesh in its own frame."""
+def _piece(shape: Any, budget: Budget, looks: Looks) -> Piece:
     polygons = polygons_of(shape, budget)
     points, corners, n = polygons.points, polygons.corners, len(polygons.lengths)
     color, color_kind = primvar(shape, "displayColor", 3, polygons)
     opacity, opacity_kind = primvar(shape, "displayOpacity", 1, polygons)
-    if color is None and shape.GetPrim().HasAttribute(BLENDER + "lit"):
+    from_blender = color is None and shape.GetPrim().HasAttribute(BLENDER + "lit")
+    if from_blender:
         color, color_kind, opacity, opacity_kind = _from_blender(shape, polygons)
     look = looks.of_faces(shape, n)
-    if color is None and not our_note(shape):
-        rgba, color_kind = looks.colors(look)
-        if rgba is not None:
-            color = rgba[:, :3]
-            if opacity is None:
-                opacity, opacity_kind = rgba[:, 3:], color_kind
+    rgba, kind = looks.colors(look)
+    if rgba is not None and not from_blender and not our_note(shape):
+        color, color_kind = _over(rgba[:, :3], kind, color, color_kind, GREY, polygons)
+        opacity, opacity_kind = _over(rgba[:, 3:], kind, opacity, opacity_kind, 1.0, polygons)
+    rows: np.ndarray | slice = slice(None)
     linear = np.ones((len(points), 4 if color is not None or opacity is not None else 0), np.float32)
     normals, kind = primvar(shape, "normals", 3, polygons)
     if kind not in ("vertex", "varying"):
@@ -126,7 +146,8 @@ def _piece(shape: Any, budget: Budget, looks: Looks) -> dict[str, np.ndarray]:
     if "uniform" in (color_kind, opacity_kind) or "faceVarying" in (color_kind, opacity_kind):
         # Colours differ between corners of a vertex: each corner becomes a vertex of its own.
         budget.spend(64 * len(corners), f"mesh {polygons.at}")
-        points, normals = points[corners], None if normals is None else normals[corners]
+        rows = corners
+        points, normals = points[rows], None if normals is None else normals[rows]
         color = None if color is None else polygons.at_corners(color, color_kind)
         opacity = None if opacity is None else polygons.at_corners(opacity, opacity_kind)
         linear = np.ones((len(corners), 4), np.float32)
@@ -138,7 +159,26 @@ def _piece(shape: Any, budget: Budget, looks: Looks) -> dict[str, np.ndarray]:
             linear[:, columns] = values
     faces = corners[polygons.cut].astype(np.int32)
     piece = {"vertices": points, "faces": faces, "linear": linear}
-    return piece if normals is None else piece | {"normals": normals}
+    return Piece(piece if normals is None else piece | {"normals": normals}, rows)
+
+
+def _over(
+    values: np.ndarray,
+    kind: str,
+    others: np.ndarray | None,
+    other_kind: str,
+    fallback: float,
+    polygons: Polygons,
+) -> tuple[np.ndarray, str]:
+    """The ``values`` (k, columns) of a material, and where it leaves them open (NaN), those of a primvar, or
+    the ``fallback``; and their interpolation."""
+    left = np.isnan(values)
+    if others is None or not left.any():
+        return np.where(left, np.float32(fallback), values), kind
+    if left.all():
+        return others, other_kind
+    first, second = polygons.at_corners(values, kind), polygons.at_corners(others, other_kind)
+    return np.where(np.isnan(first), second, first), "faceVarying"
 
 
 def _from_blender(shape: Any, polygons: Polygons) -> tuple[np.ndarray | None, str, np.ndarray | None, str]:

@@ -46,6 +46,7 @@ class Look(NamedTuple):
     color: tuple[float, float, float] | None = None
     """Linear RGB; None if there is a texture, or the material names no colour."""
     opacity: float = 1.0
+    """NaN: the material leaves it to the mesh."""
     texture: TextureUse | None = None
 
 
@@ -80,12 +81,15 @@ class Looks:
 
     def colors(self, number: np.ndarray) -> tuple[np.ndarray | None, str]:
         """Linear RGBA and its interpolation, as of a primvar, of faces that show the looks ``number`` (n,);
-        (None, '') where none of them is a plain colour."""
+        NaN of those without a plain colour, (None, '') where none of them has one."""
         shown = np.unique(number).tolist()
         plain = [self.found[i] if i >= 0 else Look() for i in shown]
         if all(look.color is None for look in plain):
             return None, ""
-        rows = np.array([[*(look.color or 3 * (GREY,)), look.opacity] for look in plain], np.float32)
+        rows = np.array(
+            [4 * (math.nan,) if look.color is None else (*look.color, look.opacity) for look in plain],
+            np.float32,
+        )
         return (rows, "constant") if len(rows) == 1 else (rows[np.searchsorted(shown, number)], "uniform")
 
     def _number(self, bindings: Any) -> int:
@@ -110,13 +114,15 @@ class Looks:
         if not texture and color == (0, 0, 0):  # an unlit material: all light is its own
             shown = "emissiveColor"
             texture = _upstream(surface, shown, _TEXTURE)
-            color = _numbers(surface, shown, color)
+            color = _numbers(surface, shown, 3 * (math.nan,) if _is_connected(surface, shown) else color)
         (opacity,) = _numbers(surface, "opacity", (1.0,))
         if cutoff > 0:
             opacity = float(opacity >= cutoff)
         if texture:
             return Look(texture=self._use(surface, texture, opacity, cutoff))
-        return Look(None if math.isnan(color[0]) else color, opacity)
+        if math.isnan(color[0]):
+            return Look()
+        return Look(color, math.nan if _is_connected(surface, "opacity") else opacity)
 
     def _use(self, surface: Any, texture: Any, opacity: float, cutoff: float) -> TextureUse:
         file = _file(texture)
@@ -173,14 +179,22 @@ def _producer(shader: Any, name: str) -> Any:
     return found[0] if found else None
 
 
+def _is_connected(shader: Any, name: str) -> bool:
+    """Whether an input takes the output of a shader."""
+    from pxr import UsdShade
+
+    attribute = _producer(shader, name)
+    return bool(attribute) and UsdShade.Output.IsOutput(attribute)
+
+
 def _upstream(shader: Any, name: str, kind: str, outputs: tuple[str, ...] = ()) -> Any:
     """The shader of this ``kind`` whose output, one of ``outputs`` if any are named, an input takes; else
     None."""
     from pxr import UsdShade
 
-    attribute = _producer(shader, name)
-    if not attribute or not UsdShade.Output.IsOutput(attribute):
+    if not _is_connected(shader, name):
         return None
+    attribute = _producer(shader, name)
     node = UsdShade.Shader(attribute.GetPrim())
     if not node or node.GetShaderId() != kind:
         return None
@@ -189,10 +203,10 @@ def _upstream(shader: Any, name: str, kind: str, outputs: tuple[str, ...] = ()) 
 
 def _value(shader: Any, name: str) -> Any:
     """The constant that an input has; None without any."""
-    from pxr import Usd, UsdShade
+    from pxr import Usd
 
     attribute = _producer(shader, name)
-    if not attribute or UsdShade.Output.IsOutput(attribute):
+    if not attribute or _is_connected(shader, name):
         return None
     return attribute.Get(Usd.TimeCode.EarliestTime())
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -90,7 +91,9 @@ def _refuse_references(layer: Any) -> None:
     if others or clips:
         named = ", ".join(others[:3])[:200] if others else f"value clips of {clips[0][:100]}"
         raise FileFormatError(
-            f"refers to other files ({named}), which are not opened; put all into one: usdcat --flatten"
+            f'refers to other files ({named}), which are not opened; put all into one: python -c "from pxr'
+            " import Usd; Usd.Stage.Open('old.usda').Flatten().Export('new.usdc')\", with new.usdc in the"
+            " folder of its textures or above"
         )
 
 
@@ -99,21 +102,67 @@ def _has_clips(layer: Any, at: Any) -> bool:
     return prim is not None and prim.HasInfo("clips")
 
 
-def visible_meshes(stage: Any) -> tuple[list[Any], int]:
-    """The visible meshes, and the count of other visible shapes."""
+class Shapes(NamedTuple):
+    """What a stage shows."""
+
+    meshes: list[Any]
+    """UsdGeom.Mesh of each that is visible."""
+    others: int
+    """Other visible shapes."""
+    instancers: int
+    """Visible point instancers, which draw copies of what is below them."""
+
+    @property
+    def left_out(self) -> str:
+        """The shapes that are not read, in words; empty if there are none."""
+        said = [f"{self.others:,} shapes that are no meshes"] if self.others else []
+        if self.instancers:
+            said.append(f"{self.instancers:,} point instancers (make their copies meshes before the export)")
+        return " and ".join(said)
+
+
+def visible_prims(stage: Any) -> Iterator[Any]:
+    """The prims that renderers draw, but for copies of point instancers."""
     from pxr import Usd, UsdGeom
 
-    meshes, others = [], 0
-    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
-        if not is_visible(prim):
-            continue
+    prims = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
+    for prim in prims:
+        if prim.IsA(UsdGeom.PointInstancer):
+            prims.PruneChildren()  # models of the copies, not drawn where they stand
+        if is_visible(prim):
+            yield prim
+
+
+def visible_shapes(stage: Any) -> Shapes:
+    """The shapes that renderers draw."""
+    from pxr import UsdGeom
+
+    meshes, others, instancers = [], 0, 0
+    for prim in visible_prims(stage):
         if prim.GetParent().HasAttribute(BLENDER + "stand_in"):
             continue  # only takes light in Blender
         if prim.IsA(UsdGeom.Mesh):
             meshes.append(UsdGeom.Mesh(prim))
-        elif prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer):
-            others += 1
-    return meshes, others
+        instancers += prim.IsA(UsdGeom.PointInstancer)
+        others += prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
+    return Shapes(meshes, others, instancers)
+
+
+def metres(stage: Any) -> float:
+    """Metres in a unit of a stage that states them, else 1."""
+    from pxr import UsdGeom
+
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        return 1.0
+    stated = float(f"{UsdGeom.GetStageMetersPerUnit(stage):.6g}")  # of float32, too
+    return stated if 0 < stated < math.inf else 1.0
+
+
+def say_units(unit: float) -> list[str]:
+    """A warning of a stage in other units than metres; none for ``unit`` 1."""
+    if unit == 1:
+        return []
+    return [f"its unit is {unit:g} m: read in metres, coordinates times {unit:g}"]
 
 
 def is_visible(prim: Any) -> bool:

@@ -22,7 +22,13 @@ from typing import Any
 import numpy as np
 
 from meshsplats.colors import linear_to_srgb
-from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, NoTextureWarning
+from meshsplats.errors import (
+    AnimationWarning,
+    DataWarning,
+    FileFormatError,
+    MissingDependencyError,
+    NoTextureWarning,
+)
 from meshsplats.formats._validation import Budget, checked, straight_colors
 from meshsplats.formats.content import Content
 from meshsplats.mesh import MAX_COLOR, SplatMesh
@@ -36,18 +42,23 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     """The mesh in a `.usdc`, `.usda` or `.usd` file, or in the layer that a `.usdz` package is read by.
 
     Our own files give back positions and extra arrays exactly, and colours within 1e-6. From other programs'
-    files, all visible meshes are joined, in the units and the frame of the stage, at the first time that has
-    values: polygons are cut into triangles around their first corner, subdivision surfaces become their
-    control cage. Colours are displayColor (linear) and displayOpacity, or else the plain colours of
-    UsdPreviewSurface; textures are left out, with a NoTextureWarning (``usd_textures`` reads them). A
-    DataWarning counts other shapes, which are left out, too. Positions are relative to ``origin``; by default
-    to that of our files, or to one that suits those of others, whose transforms are applied in float64.
+    files, all visible meshes are joined, in metres (a DataWarning says where the stage has other units) and
+    the frame of the stage, at the first time that has values (an AnimationWarning says where there are more),
+    as skeletons and blend shapes move them; subdivision surfaces become their control cage. Colours are the
+    plain ones of UsdPreviewSurface, or else displayColor (linear) and displayOpacity; textures are left out,
+    with a NoTextureWarning (``usd_textures`` reads them). A DataWarning counts other shapes, which are left
+    out, too. Positions are relative to ``origin``; by default to that of our files, or to one that suits
+    those of others, whose transforms are applied in float64.
 
     Raises:
         MissingDependencyError: usd-core is missing.
         FileFormatError: the file is broken, or refers to other files, which are not opened.
     """
     report, arrays = extracted(path, "meshsplats.formats.usd.extraction", origin)
+    if len(times := report["times"]) > 1:
+        span = f"{len(times):,} time samples, {times[0]:g} to {times[-1]:g}"
+        message = f"{path}: holds an animation ({span}), of which the first was read"
+        warnings.warn(message, AnimationWarning, stacklevel=3)
     for message in report["warnings"]:
         warnings.warn(f"{path}: {message}", DataWarning, stacklevel=3)
     if report["textured"]:
@@ -76,6 +87,13 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         attributes=attributes,
         **arrays,
     )
+
+
+def usd_frames(path: Path, origin: np.ndarray) -> np.ndarray:
+    """(t, v, 3) float32 vertices of ``read_usd``, relative to ``origin`` (3,), at each of the t times at
+    which a skeleton, blend shapes, points or transforms have values. Errors as ``read_usd``, and
+    FileFormatError for points that change in number."""
+    return extracted(path, "meshsplats.formats.usd.frame_extraction", origin)[1]["frames"]
 
 
 def extracted(

@@ -18,7 +18,8 @@ from meshsplats._geometry import rotation_rows
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.usd.opening import is_visible, main, opened
+from meshsplats.formats.usd.motion import in_metres
+from meshsplats.formats.usd.opening import main, metres, opened, say_units, visible_prims
 from meshsplats.formats.usd.splats_writer import PRIM, turn_of
 from meshsplats.gaussians import Kernel
 
@@ -33,22 +34,18 @@ def extract_splats(file: Path, result: Path, _origin: np.ndarray | None) -> dict
     from pxr import Usd, UsdGeom
 
     stage = opened(file)
-    prims = [
-        prim
-        for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
-        if prim.GetTypeName() == PRIM and is_visible(prim)
-    ]
+    prims = [prim for prim in visible_prims(stage) if prim.GetTypeName() == PRIM]
     if not prims:
         raise FileFormatError(f"the stage holds no visible splats ({PRIM})")
-    budget = Budget(file)
+    budget, unit = Budget(file), metres(stage)
     places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     arrays: dict[str, np.ndarray] = {}
-    report: dict[str, Any] = {"warnings": [], "fields": []}
+    report: dict[str, Any] = {"warnings": say_units(unit), "fields": []}
     report["z_up"] = bool(UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z)
     for i, prim in enumerate(prims):
         found, degree = _arrays(prim, budget, report["warnings"])
         arrays |= {f"{name}_{i}": array for name, array in found.items()}
-        matrix = np.array(places.GetLocalToWorldTransform(prim)).T
+        matrix = in_metres(unit) @ np.array(places.GetLocalToWorldTransform(prim)).T
         note = _own_note(prim, matrix) if len(prims) == 1 else {}
         space = prim.GetAttribute("colorSpace:name")
         report["fields"].append(

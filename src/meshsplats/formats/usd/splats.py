@@ -1,7 +1,7 @@
 """Splats of Universal Scene Description: prims of the type ParticleField3DGaussianSplat.
 
 Needs the optional package usd-core, which runs in a process of its own (``splat_extraction``). All visible
-fields of a stage are joined, in its units. Colours are display values unless ColorSpaceAPI says that they are
+fields of a stage are joined, in metres. Colours are display values unless ColorSpaceAPI says that they are
 linear: those of converters without a mark are as they were trained.
 """
 

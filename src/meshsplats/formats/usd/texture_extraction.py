@@ -18,8 +18,9 @@ import numpy as np
 
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.usd.looks import Looks
-from meshsplats.formats.usd.opening import main, opened, visible_meshes
+from meshsplats.formats.usd.opening import main, opened, visible_shapes
 from meshsplats.formats.usd.polygons import polygons_of, primvar
+from meshsplats.formats.usd.skeletons import pose
 
 _PRIMVAR = "st"
 """Texture coordinates of faces without a texture, on which users may put one."""
@@ -28,8 +29,8 @@ _PRIMVAR = "st"
 def extract_textures(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
     """Raises FileFormatError. ``origin`` has no effect."""
     budget, looks, stage = Budget(file), Looks(), opened(file)
-    shapes, _ = visible_meshes(stage)
-    parts = [_coordinates(shape, budget, looks) for shape in shapes]
+    pose(stage)
+    parts = [_coordinates(shape, budget, looks) for shape in visible_shapes(stage).meshes]
     uses = [(i, look.texture) for i, look in enumerate(looks.found) if look.texture is not None]
     texture = np.full(len(looks.found) + 1, -1, np.int32)  # the last one for -1
     texture[[i for i, _ in uses]] = np.arange(len(uses))
