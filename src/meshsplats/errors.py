@@ -71,17 +71,17 @@ class DataWarning(NamingOptions, UserWarning):
     """Some of the data was left out or altered; the message counts it."""
 
 
+_INSIDE = ("meshsplats", "dataclasses")
+
+
 def warn_of_data(message: str) -> None:
     """A DataWarning with ``message``, unless it is empty, at the line that called this package, be it through
     ``dataclasses.replace``."""
     if not message:
         return
     frame, level = sys._getframe(1), 2
-    while frame.f_back and frame.f_back.f_globals["__name__"].partition(".")[0] in (
-        "meshsplats",
-        "dataclasses",
-    ):
-        frame, level = frame.f_back, level + 1
+    while (back := frame.f_back) and str(back.f_globals.get("__name__")).partition(".")[0] in _INSIDE:
+        frame, level = back, level + 1
     warnings.warn(message, DataWarning, stacklevel=level + 1)
 
 
