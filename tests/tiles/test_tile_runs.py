@@ -137,6 +137,19 @@ def test_a_run_that_was_ended_before_its_first_step_is_none(splats, tileset, tmp
     assert digest(tmp_path / "tiles") == digest(tileset)
 
 
+@pytest.mark.parametrize("calls", range(4))
+def test_a_folder_that_is_half_removed_is_known(splats, tmp_path, calls):
+    out, rmtree = tmp_path / "tiles", shutil.rmtree
+    end_after("above", splats, out)
+    left = iter([rmtree] * calls)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building.shutil, "rmtree", lambda *a, **o: next(left, ended)(*a, **o))
+        with pytest.raises(KeyboardInterrupt):
+            build_tiles(ms.stream_gaussians(splats), out, OPTIONS, replace_old=True)
+    build_tiles(ms.stream_gaussians(splats), out, OPTIONS, replace_old=True)
+
+
 # ---- What a run has lost
 
 
@@ -256,6 +269,18 @@ def test_a_file_is_taken_once(splats, tmp_path):
     with pytest.raises(ValueError, match=r"city\.ply and .*link\.ply are one file"):
         build_tiles(ms.stream_gaussians([splats, link]), tmp_path / "tiles", OPTIONS)
     assert [path.name for path in tmp_path.iterdir()] == ["link.ply"]
+
+
+def test_one_scene_in_two_formats_is_told_of(splats, tmp_path, recwarn):
+    cloud = ms.load_gaussians(splats)
+    for name in ("a.ply", "a.spz", "b.ply"):
+        ms.save_gaussians(cloud, tmp_path / name)
+    ms.save_gaussians(cloud.transformed(np.eye(3) * 2), tmp_path / "b.spz")
+    build_tiles(ms.stream_gaussians(tmp_path), tmp_path / "tiles", OPTIONS)
+    told = [str(warning.message) for warning in recwarn if "in two formats" in str(warning.message)]
+    assert len(told) == 1
+    assert "a.ply and " in told[0]
+    assert "a.spz look like one scene in two formats" in told[0]
 
 
 # ---- What is shown

@@ -76,11 +76,16 @@ class SplatStream:
         origin = self._given_origin
         if len(self.paths) == 1:
             return self._looked_at(self.paths[0], alone=True) if origin is None else origin
-        samples = {path: self._looked_at(path, alone=False) for path in self.paths}
+        samples = self.world_samples
         if origin is None:
             origin = choose_origin(np.concatenate([np.empty((0, 3)), *samples.values()]))
         need_detail(samples, origin)
         return origin
+
+    @cached_property
+    def world_samples(self) -> dict[Path, np.ndarray]:
+        """A sample (k, 3) float64 of the positions in the world of each file, with y down."""
+        return {path: self._looked_at(path, alone=False) for path in self.paths}
 
     def __iter__(self) -> Iterator[GaussianCloud]:
         self.count = 0

@@ -43,7 +43,7 @@ from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, harmonics_degree, stored_survey
 from meshsplats.tiles.options import TileOptions
-from meshsplats.tiles.start import need_each_once, need_same_start, start_facts
+from meshsplats.tiles.start import need_each_once, need_same_start, start_facts, warn_of_copies
 from meshsplats.tiles.tileset import (
     Node,
     Tileset,
@@ -141,6 +141,7 @@ def build_tiles(
     check_threads(threads)
     chosen = options or TileOptions()
     need_each_once(source.paths)
+    warn_of_copies(source)
     usual = default_up(source.origin)  # whose errors come before anything is written
     if chosen.up is None:
         up = (usual if source.up is None else source.up).astype(float).tolist()
@@ -182,7 +183,14 @@ def _check_folders(target: Path, unfinished: Path, resume: bool, replace_old: bo
     if target.exists() and not (replace_old or resume):
         raise EarlierRunError(f"{target} exists: give another folder, or ``replace_old`` to replace it")
     if unfinished.exists() and not resume:
-        shutil.rmtree(unfinished)
+        _remove(unfinished)
+
+
+def _remove(unfinished: Path) -> None:
+    """Removes the folder of a run; the journal, by which it is known, last."""
+    for part in ("tileset", "work/done", "work/splats"):
+        shutil.rmtree(unfinished / part, ignore_errors=True)
+    shutil.rmtree(unfinished)
 
 
 class _Build:
@@ -227,7 +235,7 @@ class _Build:
                 )
             os.rename(target, self._out)  # for what an older one may still have to hand over
         replace_folder(self._out, target, is_tile_file)
-        shutil.rmtree(self._folder)
+        _remove(self._folder)
 
     def _made(self) -> TilesetSummary:
         for part in (self._work / "done", self._work / "splats", self._out):

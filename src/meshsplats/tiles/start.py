@@ -5,17 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
+
 from meshsplats import __version__
 from meshsplats._json import read_json
 from meshsplats._origin import in_words
 from meshsplats._words import plural
-from meshsplats.errors import FileFormatError, OptionValueError
+from meshsplats.errors import DataWarning, FileFormatError, OptionValueError
+from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.tiles.options import TileOptions
 
@@ -34,6 +38,30 @@ def need_each_once(paths: Sequence[Path]) -> None:
         if other is not path:
             names = f"{path} is given twice" if other == path else f"{other} and {path} are one file"
             raise ValueError(f"{names}: its splats would lie upon themselves; name it once")
+
+
+def warn_of_copies(source: SplatStream) -> None:
+    """A DataWarning for files of one name and folder, in different formats, with splats in the same places:
+    one scene, which a folder of files has twice."""
+    seen: dict[tuple[Path, str], Path] = {}
+    for path in source.paths:
+        other = seen.setdefault((path.parent, subject_name(path)), path)
+        if other is not path and _in_one_place(source.world_samples[other], source.world_samples[path]):
+            warnings.warn(
+                f"{other} and {path} look like one scene in two formats: the tiles have the splats of both;"
+                " name the one to take",
+                DataWarning,
+                stacklevel=3,
+            )
+
+
+def _in_one_place(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two samples (n, 3) of positions are spread in the same way, but for chance."""
+    finite = [part[np.isfinite(part).all(axis=1)] for part in (one, other)]
+    if not all(map(len, finite)):
+        return False
+    first, second = (np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in finite)
+    return bool((np.abs(first - second) <= 0.05 * np.linalg.norm(first[2] - first[0])).all())
 
 
 def start_facts(source: SplatStream, options: TileOptions) -> dict[str, Any]:
