@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Deform(Command):
     """Moves splats with the mesh that they are bound to; nothing is trained.
 
-    Several bases, such as the frames of an animation, give a file each.
+    Several bases, such as the frames of an animation, give a file each, as do the time samples of a USD file.
     """
 
     input: tyro.conf.Positional[Path]
