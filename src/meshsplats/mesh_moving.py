@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._geometry import affine_parts
-from meshsplats._origin import loses_detail, lost_by_rounding
+from meshsplats._origin import loses_detail, lost_by_rounding, sampled
 from meshsplats.errors import DataWarning, warn_of_data
 from meshsplats.spherical_harmonics import moved_harmonics, turned_harmonics
 
@@ -40,12 +40,12 @@ def moved_mesh(mesh: Mesh, vertices: ArrayLike, normals: ArrayLike | None, bindi
 def transformed_mesh(mesh: Mesh, matrix: ArrayLike, origin: ArrayLike | None) -> Mesh:
     """``SplatMesh.transformed``."""
     a, shift = affine_parts(np.asarray(matrix))
-    point = a @ mesh.origin + 0.0
+    point, some = a @ mesh.origin + 0.0, sampled(mesh.vertices)
     if origin is not None:
         given = checked_array("origin", origin, np.float64, (3,))
         point, shift = given, shift + (point - given)
-        warn_of_data(lost_by_rounding("vertices", mesh.vertices @ a.T + shift))
-    elif shift.any() and loses_detail(mesh.vertices @ a.T, shift):
+        warn_of_data(lost_by_rounding("vertices", some @ a.T + shift))
+    elif shift.any() and loses_detail(some @ a.T, shift):
         point, shift = point + shift, np.zeros(3)
     u, stretch, vt = np.linalg.svd(a)
     mirrors = np.linalg.det(a) < 0
