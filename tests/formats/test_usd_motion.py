@@ -173,6 +173,25 @@ def test_deform_takes_every_time_of_an_animation(tmp_path, kind):
     assert set(files.values()) == {path}
 
 
+def test_a_film_of_a_base_that_we_wrote(tmp_path):
+    """Its up, and its place far from that of the prior's origin, are those of one pose."""
+    grid = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    base = ms.BaseMesh(grid, [[0, 1, 2]], up=(0, 0, 1), origin=(5000, 0, 0))
+    path = tmp_path / "film.usda"
+    ms.save_base(base, path)
+    ms.save_mesh(ms.bind(base.relative_to([5010, 0, 0])).mesh, tmp_path / "prior.npz")
+    text = path.read_text()
+    at = text.index("point3f[] points = ") + len("point3f[] points = ")
+    first = text[at : text.index("]", at) + 1]
+    moved = first.replace("(0, 1, 0)", "(0, 1, 4)")
+    path.write_text(text.replace(f" = {first}", f".timeSamples = {{ 1: {first}, 2: {moved} }}", 1))
+    one, two = (ms.load_mesh(file) for file in save_poses(tmp_path / "prior.npz", [path], tmp_path / "o.npz"))
+    assert one.origin.tolist() == two.origin.tolist() == [5010, 0, 0]
+    for mesh, height in ((one, 0), (two, 4)):
+        expected = grid - [10, 0, 0] + [[0, 0, 0], [0, 0, 0], [0, 0, height]]
+        np.testing.assert_allclose(mesh.binding.base_vertices, expected, atol=1e-5)
+
+
 def test_points_that_change_in_number_are_no_film(tmp_path):
     samples = f"point3f[] points.timeSamples = {{1: [{SQUARE}], 2: [{SQUARE}, (5, 5, 5)]}}"
     path = write(tmp_path / "film.usda", MESH.format(points=samples, more=""))

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._origin import relative
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import (
     AnimationWarning,
@@ -93,7 +94,10 @@ def usd_frames(path: Path, origin: np.ndarray) -> np.ndarray:
     """(t, v, 3) float32 vertices of ``read_usd``, relative to ``origin`` (3,), at each of the t times at
     which a skeleton, blend shapes, points or transforms have values. Errors as ``read_usd``, and
     FileFormatError for points that change in number."""
-    return extracted(path, "meshsplats.formats.usd.frame_extraction", origin)[1]["frames"]
+    report, arrays = extracted(path, "meshsplats.formats.usd.frame_extraction", origin)
+    return relative(
+        arrays["frames"], np.array(report["origin"]), origin
+    )  # files of ours have one of their own
 
 
 def extracted(
