@@ -43,10 +43,13 @@ def need_each_once(paths: Sequence[Path]) -> None:
 def warn_of_copies(source: SplatStream) -> None:
     """A DataWarning for files of one name and folder, in different formats, with splats in the same places:
     one scene, which a folder of files has twice."""
-    seen: dict[tuple[Path, str], Path] = {}
+    seen: dict[tuple[Path, str], list[Path]] = {}
     for path in source.paths:
-        other = seen.setdefault((path.parent, subject_name(path)), path)
-        if other is not path and _in_one_place(source.world_samples[other], source.world_samples[path]):
+        alike = seen.setdefault((path.parent, subject_name(path)), [])
+        same = (one for one in alike if _in_one_place(source.world_samples[one], source.world_samples[path]))
+        other = next(same, None)
+        alike.append(path)
+        if other is not None:
             warnings.warn(
                 f"{other} and {path} look like one scene in two formats: the tiles have the splats of both;"
                 " name the one to take",
