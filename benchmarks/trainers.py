@@ -96,7 +96,7 @@ Drawn = Callable[[ms.Camera], np.ndarray]
 
 def scores(drawn: Drawn, data: ms.Dataset) -> tuple[str, str]:
     """PSNR, with its median, and SSIM of the held-out photographs."""
-    pairs = [(drawn(view.camera), view.load().color) for view in data.test]
+    pairs = [(drawn(view.camera), view.image) for view in data.test]
     psnr = [ms.psnr(*pair) for pair in pairs]
     return f"{np.mean(psnr):.2f} ({np.median(psnr):.2f})", f"{np.mean([ms.ssim(*p) for p in pairs]):.3f}"
 
@@ -107,7 +107,7 @@ def as_nerfstudio(data: ms.Dataset, photographs: Path, project: Path) -> Path:
     frames = []
     for number, view in enumerate(data.train):
         camera, file = view.camera, f"images/{number:04d}.png"
-        ms.save_image(project / file, view.load().color)
+        ms.save_image(project / file, view.image)
         pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
         frames.append(
             {
