@@ -6,6 +6,7 @@ import json
 import struct
 import zlib
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def test_images_check_themselves(arrays, message):
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 def test_colours_that_are_not_times_alpha_are_refused(kind):
     white = 255 if kind == np.uint8 else 1
-    alpha = np.tile(np.linspace(0, 1, 64), (8, 1))
+    alpha = np.tile(np.linspace(-0.2, 1, 64).clip(0), (8, 1))
     straight = np.broadcast_to([0.3, 0.4, 0.5], (8, 64, 3))
     for brightness in (1, 6):  # as of splats that are brighter than white
         ViewImage(
@@ -77,12 +78,33 @@ def test_colours_that_are_not_times_alpha_are_refused(kind):
         ViewImage((straight * white).astype(kind), (alpha * white).astype(kind))
 
 
-@pytest.mark.parametrize("kind", [np.float16, np.float32])
-def test_floats_from_0_to_255_are_refused(kind):
+def test_colours_on_black_that_spread_beyond_their_alpha_are_taken():
+    alpha = np.zeros((64, 64), np.uint8)
+    alpha[19:45, 19:45] = 255
+    with BytesIO() as file:
+        Image.fromarray(np.repeat(alpha[..., None], 3, axis=2)).save(file, "JPEG", quality=50)
+        color = np.array(Image.open(file))
+    assert color[alpha == 0].max() > 10
+    ViewImage(color, alpha)
+    resized = Image.fromarray(alpha.astype(np.float32) / 255).resize((14, 14), Image.Resampling.LANCZOS)
+    shares = np.array(resized)
+    assert (shares < -0.01).mean() > 0.1
+    ViewImage(np.repeat(shares[..., None], 3, axis=2), shares)
+
+
+def test_floats_from_0_to_255_are_refused():
     with pytest.raises(
         ValueError, match="color must hold values from 0 to 1, got up to 200: divide bytes by 255"
     ):
-        ViewImage(np.full((8, 8, 3), 200, kind))
+        ViewImage(np.full((8, 8, 3), 200, np.float32))
+
+
+def test_views_of_splats_may_be_far_brighter_than_white():
+    cloud = cloud_at(np.random.default_rng(0).normal(size=(400, 3)), 0.3)
+    cloud = replace(cloud, sh=cloud.sh + 62 * (np.arange(4) == 0)[None, :, None])
+    cameras = [look_at((0, 0, z), (0, 0, 0), width=16, height=16) for z in (-1.5, 1.5)]
+    image = splat_dataset(cloud, cameras=cameras, test=1, width=16).train[0].load()
+    assert np.median(image.color) > 16
 
 
 def test_a_view_checks_that_its_image_has_the_cameras_size():
