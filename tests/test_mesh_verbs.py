@@ -343,7 +343,7 @@ def test_moved_checks_positions_and_leaves_the_base():
     posed = mesh.moved(mesh.vertices, binding=mesh.binding, normals=mesh.normals)
     assert posed.binding is mesh.binding
     assert posed.normals is mesh.normals
-    for wrong in (mesh.vertices[1:], np.full_like(mesh.vertices, np.nan)):
+    for wrong in (mesh.vertices[1:], np.zeros(3), np.full_like(mesh.vertices, np.nan)):
         with pytest.raises(ValueError, match="vertices must"):
             mesh.moved(wrong)
 

@@ -25,8 +25,8 @@ Mesh = TypeVar("Mesh", bound=Any)
 
 def moved_mesh(mesh: Mesh, vertices: ArrayLike, normals: ArrayLike | None, binding: Any) -> Mesh:
     """``SplatMesh.moved``."""
-    warn_of_data(lost_by_rounding("vertices", vertices))
-    vertices = checked_array("vertices", vertices, np.float32, (len(mesh.vertices), 3))
+    given, vertices = vertices, checked_array("vertices", vertices, np.float32, (len(mesh.vertices), 3))
+    warn_of_data(lost_by_rounding("vertices", given))
     harmonics = mesh.harmonics
     old = mesh.normals if normals is None else None
     if old is not None or harmonics is not None:
