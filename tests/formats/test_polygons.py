@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from meshsplats import load_base
+from meshsplats.formats import _polygons
 from meshsplats.formats._polygons import cut_polygons
 
 L = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 2], [0, 2]], float)
@@ -59,6 +60,26 @@ def test_other_polygons_stay_fans():
     crossing = np.random.default_rng(0).random((50, 3))
     assert len(cut_polygons(np.array([50]), crossing)[0]) == 48
     assert cut_polygons(np.array([2, 1, 0]), np.zeros((3, 3)))[0].shape == (0, 3)
+
+
+@pytest.mark.parametrize(("count", "corners"), [(1, 50_000), (1, 2000), (300, 12)])
+def test_polygons_that_cross_themselves_take_no_endless_time(monkeypatch, count, corners):
+    looks = []
+    whole = _polygons._is_ear
+    monkeypatch.setattr(_polygons, "_is_ear", lambda *given: looks.append(1) or whole(*given))
+    monkeypatch.setattr(_polygons, "_WORK", 1 << 20)
+    places = np.random.default_rng(0).random((count * corners, 3))
+    cut, owner = cut_polygons(np.full(count, corners), places)
+    assert len(cut) == len(owner) == count * (corners - 2)
+    assert (np.bincount(cut.ravel(), minlength=len(places)) > 0).all()
+    assert len(looks) * corners <= 1 << 20
+
+
+def test_looking_for_ears_ends_where_there_are_none(monkeypatch):
+    looks = []
+    monkeypatch.setattr(_polygons, "_is_ear", lambda *_: looks.append(1) and False)
+    cut_polygons(np.array([50]), np.random.default_rng(0).random((50, 3)))
+    assert len(looks) <= 50
 
 
 @pytest.mark.parametrize(

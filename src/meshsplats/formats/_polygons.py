@@ -8,8 +8,10 @@ _FOLD = 1e-5
 """Share of a polygon's area: a triangle that covers more of it from behind is folded back."""
 _TURNS = 16
 """Most corners around which a fan is tried."""
-_STEPS = 64
-"""Corners that ``_ears`` looks at, for each corner of a polygon; what is left becomes a fan."""
+_STEP = 500
+"""What it takes to look at a corner for an ear, in comparisons with other corners..."""
+_WORK = 1 << 27
+"""... of which a file may take so many, some 20 seconds. What is left then becomes fans."""
 
 
 def cut_polygons(lengths: np.ndarray, places: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +45,7 @@ def _unfold(
     fans, polygon = cut[of_wide], owner[of_wide]
     normals = _normals(places, fans)
     whole = np.stack([np.bincount(polygon, column, len(lengths)) for column in normals.T], axis=1)
-    folded = np.unique(polygon[_behind(normals, whole[polygon])])
+    folded, work = np.unique(polygon[_behind(normals, whole[polygon])]), _WORK
     for n in np.unique(lengths[folded]).tolist():
         left = folded[lengths[folded] == n]
         fan = np.stack([np.zeros(n - 2, np.int64), np.arange(1, n - 1), np.arange(2, n)], axis=1)
@@ -54,7 +56,9 @@ def _unfold(
             left = left[~better]
         for number in left.tolist() if n > 4 else ():
             begin = int(first[number])
-            ears = _ears(_flat(places[begin : begin + n].astype(np.float64), whole[number]))
+            flat = _flat(places[begin : begin + n].astype(np.float64), whole[number])
+            ears, steps = _ears(flat, work // (_STEP + n))
+            work -= steps * (_STEP + n)
             _put(cut, owner, np.array([number]), begin + ears[None])
 
 
@@ -81,21 +85,22 @@ def _flat(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return flat if normal[axis] > 0 else flat * [-1, 1]
 
 
-def _ears(flat: np.ndarray) -> np.ndarray:
+def _ears(flat: np.ndarray, most: int) -> tuple[np.ndarray, int]:
     """(n - 2, 3) the triangles of a polygon (n, 2), counterclockwise: corners whose triangle holds no other
-    corner are cut off, one after the other. Where there are none, as it crosses itself, the rest is a fan."""
-    left, triangles, at = np.arange(len(flat)), list[np.ndarray](), 0
-    for _ in range(_STEPS * len(flat)):
-        if len(left) == 3:
-            break
+    corner are cut off, one after the other. Where there are none, as it crosses itself, or ``most`` corners
+    have been looked at, the rest is a fan. Also how many were."""
+    left, triangles, at, steps, in_vain = np.arange(len(flat)), list[np.ndarray](), 0, 0, 0
+    while len(left) > 3 and in_vain < len(left) and steps < most:
+        steps += 1
         corner = left.take([at - 1, at, at + 1], mode="wrap")
         if _is_ear(flat[corner], flat):
             triangles.append(corner)
             left = np.delete(left, at)
-            at = (at - 1) % len(left)
+            at, in_vain = (at - 1) % len(left), 0
         else:
-            at = (at + 1) % len(left)
-    return np.array([*triangles, *([left[0], left[i], left[i + 1]] for i in range(1, len(left) - 1))])
+            at, in_vain = (at + 1) % len(left), in_vain + 1
+    rest = np.stack([np.full(len(left) - 2, left[0]), left[1:-1], left[2:]], axis=1)
+    return np.concatenate([*(corner[None] for corner in triangles), rest]), steps
 
 
 def _is_ear(triangle: np.ndarray, corners: np.ndarray) -> bool:
@@ -105,8 +110,8 @@ def _is_ear(triangle: np.ndarray, corners: np.ndarray) -> bool:
     if _turn(a, b, c) <= 0:
         return False
     near = corners[((corners >= triangle.min(axis=0)) & (corners <= triangle.max(axis=0))).all(axis=1)]
-    held = (_turn(a, b, near) >= 0) & (_turn(b, c, near) >= 0) & (_turn(c, a, near) >= 0)
-    return not (held & (near[:, None] != triangle).any(axis=2).all(axis=1)).any()
+    held = near[(_turn(a, b, near) >= 0) & (_turn(b, c, near) >= 0) & (_turn(c, a, near) >= 0)]
+    return not (held[:, None] != triangle).any(axis=2).all(axis=1).any()
 
 
 def _turn(a: np.ndarray, b: np.ndarray, points: np.ndarray) -> np.ndarray:
