@@ -21,6 +21,9 @@ THICK = 0.002
 """Thickness of parts that are flat, relative to the diagonal of the surface's box."""
 _PLACES = (0.25, 0.5, 0.75)
 """Where along each axis a part of a solid may be cut."""
+_FACE = 0.01
+"""What a cut costs, as the thickness of a layer over it, relative to the diagonal of the part's box: slices
+off the flat sides of a ring gain a little each, and close its hole."""
 _TRIED = 2000
 """Points whose hulls tell how good a cut is."""
 
@@ -134,8 +137,8 @@ class _Part(NamedTuple):
 
 
 def _parts_of_solid(solid: _Solid, thick: float, count: int) -> list[Hull]:
-    """The part whose hull is too large by most is cut where the hulls of both sides are smallest, until all
-    together are hardly larger than the solid."""
+    """The part whose hull is too large by most is cut where the hulls of both sides and the cut are smallest,
+    until all together are hardly larger than the solid."""
     allowed, numbers = EXCESS * solid.volume(*solid.box), itertools.count()
     # Planes and rays a little aside hit no edges of models that lie on a grid.
     aside = np.array([0.73205, 0.61803, 0.41421]) * 1e-7 * np.ptp(solid.box, axis=0).max()
@@ -158,8 +161,10 @@ def _parts_of_solid(solid: _Solid, thick: float, count: int) -> list[Hull]:
 
 
 def _cuts(solid: _Solid, part: _Part, aside: np.ndarray, thick: float) -> list[tuple[float, list[_Part]]]:
-    """Cuts of a part along planes across the axes: about the volume of the hulls of both sides, and these."""
+    """Cuts of a part along planes across the axes: about the volume of the hulls of both sides, with what the
+    cut costs, and these."""
     low, high = part.points.min(axis=0) + aside, part.points.max(axis=0) + aside
+    layer = _FACE * float(np.linalg.norm(high - low))
     ends, column = np.stack([low, high]), solid.column(low, high)
     box = np.array(list(itertools.product(*ends.T)))
     held = column.holds(box)
@@ -174,7 +179,8 @@ def _cuts(solid: _Solid, part: _Part, aside: np.ndarray, thick: float) -> list[t
             for surface, end in zip(_cut(part.surface, axis, value), ends[:, axis], strict=True)
         ]
         if all(len(half.points) for half in halves):
-            found.append((_roughly(halves[0], thick) + _roughly(halves[1], thick), halves))
+            face = layer * float(np.prod(np.delete(high - low, axis)))
+            found.append((face + sum(_roughly(half, thick) for half in halves), halves))
     return found
 
 
