@@ -69,9 +69,11 @@ def lost_detail(positions: np.ndarray) -> str:
 
 def lost_between(positions: np.ndarray, size: float) -> str:
     """As ``lost_detail``, where there are steps enough across the scene, but larger ones than what is there:
-    splats or triangles of that ``size``."""
+    splats or triangles of that ``size``. What is smaller than the steps of a scene around zero is a point."""
     found = _spread(positions)
-    if found is None or not 0 < size < _step(found[2]) or _coarse(positions) is not None:
+    if found is None or not 0 < size < _step(found[2]) or size < _step(found[1]):
+        return ""
+    if _coarse(positions) is not None:
         return ""
     near, step = in_words(np.round(found[0])), _step(found[2])
     where = f"positions near {near} are stored as float32, in steps of {step:g}"

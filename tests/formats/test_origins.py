@@ -128,6 +128,16 @@ def test_splats_that_are_smaller_than_the_steps_of_their_file_are_named(tmp_path
         placed(load_gaussians(tmp_path / "double.ply"), (0, 0, 0))
 
 
+def test_points_near_zero_have_lost_nothing(tmp_path):
+    """Splats of programs that give points no size: no origin would be of use."""
+    values, _ = splats(at=(0, 0, 0))
+    for axis in "xyz":
+        values[f"scale_{'xyz'.index(axis)}"] = np.full(300, -20.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_gaussians(write_ply(tmp_path / "a.ply", [splat_table(values, {})]))
+
+
 def test_up_is_away_from_the_ground_for_coordinates_from_the_middle_of_the_earth():
     """48.79 north, 2.3 east by the formulas of WGS 84, and a place in a UTM zone that is as far from zero."""
     north, east, height = np.radians(48.79), np.radians(2.3), 120.0
