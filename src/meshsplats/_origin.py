@@ -22,7 +22,7 @@ are left for places in the scene, half a millimetre in 60 m."""
 FAR = 10_000.0
 """Least distance across, and greatest height, of the coordinates of a survey, in metres or feet. Those that
 were turned to y up have a northing for a height."""
-FEWEST_STEPS = 1 << 13
+FEWEST_STEPS = 1 << 10
 """Steps across a scene below which what a float32 file itself has lost shows in images."""
 SAMPLE = 1 << 12
 """Positions that the choice of an origin looks at, about."""

@@ -35,9 +35,9 @@ from meshsplats import (
     save_mesh,
     stream_gaussians,
 )
-from meshsplats._origin import choose_origin, in_words
+from meshsplats._origin import choose_origin, in_words, need_detail
 from meshsplats.cameras.framing import default_up
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats.gaussians import save_gaussian_blocks
@@ -147,6 +147,8 @@ def test_up_is_away_from_the_ground_for_coordinates_from_the_middle_of_the_earth
     place = (bend + height) * normal - [0, 0, squared * bend * np.sin(north)]
     np.testing.assert_allclose(default_up(np.round(place)), normal, atol=1e-6)
     assert default_up(np.array([500_000, 6_350_000, 120])).tolist() == [0, 0, 1]
+    for survey in ([500_000, -120, 6_350_000], [770_000, 120, -6_280_000]):  # turned to y up, or y down
+        assert default_up(np.array(survey)).tolist() == [0, -1, 0]
     assert default_up(2 * place).tolist() == [0, -1, 0]
 
 
@@ -374,6 +376,18 @@ def test_a_file_that_would_lose_its_detail_beside_others_is_refused(tmp_path, gi
     with pytest.raises(ValueError, match=message):
         build_tiles(stream_gaussians(paths, origin=given), tmp_path / "tiles", TileOptions(up=(0, 0, 1)))
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+
+
+def test_a_small_file_far_from_a_large_one_is_taken(tmp_path):
+    """1.5 m at 3 km, where steps are a quarter of a millimetre."""
+    rng = np.random.default_rng(0)
+    low = rng.uniform(-0.75, 0.75, (400, 3))
+    need_detail({"large": 1000 * low, "small": low + np.array([3000, 0, 0])}, np.zeros(3))
+    turns, sh = np.tile([1, 0, 0, 0], (400, 1)), np.zeros((400, 1, 3))
+    cloud = GaussianCloud(low, turns, np.full((400, 3), 0.01), np.ones(400), sh)
+    placed(cloud, (-3000, 0, 0))
+    with pytest.raises(OptionsError, match="too far from the scene"):
+        placed(cloud, (-300_000, 0, 0))
 
 
 def test_files_side_by_side_are_refused_far_from_the_origin_that_is_given(tmp_path):

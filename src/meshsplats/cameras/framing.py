@@ -29,6 +29,9 @@ SURROUNDINGS = 4.0
 """Points farther from the centre than this many median distances are surroundings, not the subject. Splats of
 a single object reach about 2 (surface of a ball: 1; filled ball: 1.26; longest object measured: 3.9)."""
 
+_EASTING = 1.5e6
+"""Easting of surveys, at most, metres."""
+
 APART = 0.15
 """Parts of the subject that are farther than this many radii from the rest are separate..."""
 FLOATER = 0.01
@@ -311,7 +314,8 @@ def default_up(origin: np.ndarray) -> np.ndarray:
     middle of the Earth (ECEF) the normal of its ellipsoid."""
     if np.hypot(*origin[:2]) >= FAR > abs(origin[2]):
         return np.array(SURVEY_UP)
-    away = away_from_ground(origin)
+    turned = abs(origin[1]) < FAR and abs(origin[0]) < _EASTING  # a survey with y up, or a pole of the globe
+    away = None if turned else away_from_ground(origin)
     return np.array(DEFAULT_UP) if away is None else away
 
 

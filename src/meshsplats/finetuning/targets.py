@@ -66,8 +66,7 @@ class Targets:
     """Without ``data``: direction that points up, an axis (-y, z, ...) or x,y,z."""
     look: Look | None = None
     """Images of splats. area: means over pixels, right at every size (with several samples: Blender, MSAA).
-    splats: as in a 3DGS viewer, for this renderer. Default: area, without the gaps between splats that
-    are smaller than these; of the other presets: splats."""
+    splats: as in a 3DGS viewer, for this renderer. Default: area, gaps closed; other presets: splats."""
     sh_degree: int | None = None
     """Without ``data``: render the splats with spherical harmonics up to this degree. Default: all that are
     stored."""

@@ -80,10 +80,12 @@ def warn_of_lost_detail(sample: np.ndarray, where: object) -> None:
         warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 
-def warn_of_coarse_steps(means: np.ndarray, scales: np.ndarray, origin: np.ndarray, where: object) -> None:
-    """A DataWarning if splats of a file that stores positions as float32 are smaller than its steps there.
-    ``means`` and ``scales`` (n, 3) are some of them, relative to ``origin``."""
-    if len(means) and (lost := lost_between(sampled(means) + origin, float(np.median(scales.max(axis=1))))):
+def warn_of_coarse_steps(sample: np.ndarray, scales: np.ndarray, where: object) -> None:
+    """A DataWarning if splats of a file are smaller than the steps of float32 at their positions, of which
+    this is a ``sample`` (k, 3). ``scales``: (n, 3)."""
+    if len(sample) and (
+        lost := lost_between(sample, float(np.median(scales.max(axis=1).astype(np.float64))))
+    ):
         warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 

@@ -124,7 +124,7 @@ def _size_of(scene: GaussianCloud | SplatMesh | BaseMesh) -> float:
     from meshsplats.gaussians import GaussianCloud
 
     if isinstance(scene, GaussianCloud):
-        return float(np.median(scene.scales.max(axis=1))) if len(scene) else 0.0
+        return float(np.median(sampled(scene.scales).max(axis=1))) if len(scene) else 0.0
     if not len(scene.faces):
         return 0.0
     a, b, _ = sampled(scene.faces).astype(int).T

@@ -26,7 +26,8 @@ def sizes_of(scales: np.ndarray) -> np.ndarray:
     """(n,) float32 sizes of splats: the geometric mean of their two larger standard deviations (n, 3)."""
     most = largest(scales)
     middle = scales.sum(axis=1) - most + largest(-scales)
-    return np.sqrt(np.maximum(middle, 0) * most) + np.finfo(np.float32).tiny
+    with np.errstate(over="ignore"):  # of splats that no image shows
+        return np.sqrt(np.maximum(middle, 0) * most) + np.finfo(np.float32).tiny
 
 
 def without_harmonics(cloud: GaussianCloud, rows: slice | np.ndarray) -> GaussianCloud:

@@ -18,6 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from meshsplats._geometry import away_from_ground
 from meshsplats._json import json_object
 from meshsplats._origin import choose_origin, sampled
 from meshsplats.errors import DataWarning, FileFormatError
@@ -41,7 +42,6 @@ _PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
 _LOOKED_AT = 8
 """Tiles that tell whether a tileset is one of splats."""
 _LEGACY = {b"b3dm", b"i3dm", b"pnts", b"cmpt", b"subt"}
-GLOBE, _FLATTENING = (6.3e6, 6.45e6), 1.0067394967  # metres from its middle; (a / b)^2 of WGS 84
 
 
 class _Tile(NamedTuple):
@@ -104,10 +104,8 @@ class _Tree:
         name, length = ("sphere", 4) if "sphere" in volume else ("box", 12)
         center = self._numbers(volume.get(name), length, f"a {name}", self._path)[:3]
         place = (self._matrix(tile, self._path) @ [*center, 1])[:3]
-        if not GLOBE[0] < np.linalg.norm(place) < GLOBE[1]:
-            return np.array([0.0, 0, 1])
-        normal: np.ndarray = place * [1, 1, _FLATTENING]
-        return normal / np.linalg.norm(normal)
+        away = away_from_ground(place)
+        return np.array([0.0, 0, 1]) if away is None else away
 
     def _below(
         self, tile: dict[str, Any], file: Path, matrix: np.ndarray, refine: str, depth: int

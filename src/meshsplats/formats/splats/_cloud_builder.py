@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, zero_origin
+from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget, warn_of_coarse_steps, warn_of_lost_detail
 from meshsplats.formats.opened import Splats
@@ -118,8 +118,10 @@ class SplatReader(Splats):
         yield block
 
     def _check_steps(self, cloud: GaussianCloud) -> None:
+        sample = sampled(cloud.means)
         if self.float32 and self.origin is None:
-            warn_of_coarse_steps(cloud.means, cloud.scales, cloud.origin, self.where)
+            sample += cloud.origin
+        warn_of_coarse_steps(sample, cloud.scales, self.where)
 
     def _builder(self, origin: np.ndarray, capacity: int | None = None) -> CloudBuilder:
         flat = self.kernel == "2dgs"
