@@ -26,6 +26,8 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.rendering.previews import save_preview
+from meshsplats.viewpoints.sheet import contact_sheet
 
 
 def cloud_at(points: np.ndarray, scale: float = 0.02) -> GaussianCloud:
@@ -99,12 +101,14 @@ def test_floats_from_0_to_255_are_refused():
         ViewImage(np.full((8, 8, 3), 200, np.float32))
 
 
-def test_views_of_splats_may_be_far_brighter_than_white():
+def test_views_of_splats_may_be_far_brighter_than_white(tmp_path):
     cloud = cloud_at(np.random.default_rng(0).normal(size=(400, 3)), 0.3)
     cloud = replace(cloud, sh=cloud.sh + 62 * (np.arange(4) == 0)[None, :, None])
     cameras = [look_at((0, 0, z), (0, 0, 0), width=16, height=16) for z in (-1.5, 1.5)]
     image = splat_dataset(cloud, cameras=cameras, test=1, width=16).train[0].load()
     assert np.median(image.color) > 16
+    assert save_preview(cloud, tmp_path / "a.png", cameras[0])
+    assert contact_sheet(cloud, cameras).max() == 1
 
 
 def test_a_view_checks_that_its_image_has_the_cameras_size():

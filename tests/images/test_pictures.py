@@ -15,6 +15,7 @@ from meshsplats.images.writing import (
     amplified_error,
     encode_array,
     encode_depth_png,
+    encode_image,
     save_animation,
     save_image,
     straight_rgba,
@@ -80,6 +81,12 @@ def test_bytes_are_not_taken_for_values_from_0_to_1(tmp_path, kind):
     glint = np.full((4, 4, 3), 0.5)
     glint[0, 0] = 40
     save_image(tmp_path / "x.png", glint)
+
+
+def test_splats_far_brighter_than_white_are_white():
+    bright = np.full((4, 4, 3), 20.0)
+    assert strip([bright]).max() == 1
+    assert encode_image("x.png", bright) == encode_image("x.png", np.ones((4, 4, 3)))
 
 
 def test_straight_alpha_composes_to_the_same_image():

@@ -40,14 +40,13 @@ CAPTION = 22
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """uint8 array of the same shape: ``round(255 * clip(image, 0, 1))``. TypeError for whole numbers,
-    ValueError for values not finite, or from 0 to 255."""
+    ValueError for values not finite."""
     kind = np.asarray(image).dtype
     if kind.kind in "iu":
         raise TypeError(f"an image must hold float values from 0 to 1, got {kind}: divide bytes by 255")
     image = np.asarray(image, np.float32)
     if not np.isfinite(image).all():
         raise ValueError("an image holds values that are not finite")
-    check_units("an image", image)
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
@@ -76,11 +75,14 @@ def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
     """
     need_path(path=path, instead={"ndarray": "the path comes first, save_image(path, image)"})
     need_array(image=image)
-    write_bytes(path, encode_image(path, image))
+    content = encode_image(path, image)
+    check_units("an image", np.asarray(image))
+    write_bytes(path, content)
 
 
 def encode_image(path: str | os.PathLike[str], image: np.ndarray) -> bytes:
-    """The content of the file that ``save_image`` writes to ``path``; its errors."""
+    """The content of the file that ``save_image`` writes to ``path``; its errors, but for values from
+    0 to 255: images of splats may be as bright."""
     from PIL import Image
 
     encoder = _ENCODERS.get(Path(path).suffix.lower())
@@ -163,7 +165,8 @@ def _encoded(image: Image.Image, **options: Any) -> bytes:
 
 
 def strip(images: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndarray:
-    """(h', w', 3) float32: ``images`` (h, w, 3) of one size side by side on white, each below its caption."""
+    """(h', w', 3) float32 in [0, 1]: ``images`` (h, w, 3) of one size side by side on white, each below its
+    caption."""
     height, width = np.shape(images[0])[:2]
     if any(np.shape(image) != (height, width, 3) for image in images):
         raise ValueError(f"the images of a strip must have one shape, got {[np.shape(i) for i in images]}")
@@ -171,7 +174,7 @@ def strip(images: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndar
     sheet = np.ones((top + height + GAP, GAP + len(images) * (width + GAP), 3), np.float32)
     for i, image in enumerate(images):
         left = GAP + i * (width + GAP)
-        sheet[top : top + height, left : left + width] = image
+        sheet[top : top + height, left : left + width] = np.clip(image, 0, 1)
     if captions:
         sheet[:top] = _text(captions, width + GAP, sheet.shape[1])
     return sheet

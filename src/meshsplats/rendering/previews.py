@@ -59,5 +59,5 @@ def save_preview(
         how: dict[str, Any] = {"samples": samples, "threads": threads, "listing": listing}
         save_image(path, image_of(scene, small, (1, 1, 1), **how)[0])
     else:
-        save_image(path, render_splats(scene, small, threads=threads).color)
+        save_image(path, render_splats(scene, small, threads=threads).color.clip(0, 1))
     return True

@@ -31,5 +31,5 @@ def contact_sheet(
     sheet = np.ones((rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), np.float32)
     for i, image in enumerate(images):
         top, left = i // columns * (height + GAP), i % columns * (width + GAP)
-        sheet[top : top + height, left : left + width] = image
+        sheet[top : top + height, left : left + width] = image.clip(0, 1)
     return sheet
