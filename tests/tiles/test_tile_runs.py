@@ -348,6 +348,8 @@ def test_which_origins_are_of_the_globe():
     assert on_globe(np.array(PARIS), -up)
     assert on_globe(np.array([6.378e6, 0, 0]), np.array([1.0, 0, 0]))
     assert not on_globe(np.array([500_000, 6_370_000, 120.0]), up)  # of a map, as far from its middle
+    assert not on_globe(np.array([600_000, 120, -6_280_000.0]), np.array([0, 1.0, 0]))  # turned to y up
+    assert on_globe(np.array([600_000, 120, -6_280_000.0]), np.array([0.09, 0, -1]))  # at the south pole
     assert not on_globe(np.array([0, 0, 0.0]), up)
 
 

@@ -314,9 +314,14 @@ def default_up(origin: np.ndarray) -> np.ndarray:
     middle of the Earth (ECEF) the normal of its ellipsoid."""
     if np.hypot(*origin[:2]) >= FAR > abs(origin[2]):
         return np.array(SURVEY_UP)
-    turned = abs(origin[1]) < FAR and abs(origin[0]) < _EASTING  # a survey with y up, or a pole of the globe
-    away = None if turned else away_from_ground(origin)
+    away = None if has_northing_along_z(origin) else away_from_ground(origin)
     return np.array(DEFAULT_UP) if away is None else away
+
+
+def has_northing_along_z(origin: np.ndarray) -> bool:
+    """Whether ``origin`` (3,), whose z is large, is one of a survey that was turned to y up; on the globe it
+    would be near a pole."""
+    return bool(abs(origin[1]) < FAR and abs(origin[0]) < _EASTING)
 
 
 def _up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:

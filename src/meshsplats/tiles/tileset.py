@@ -25,6 +25,7 @@ from meshsplats._json import read_json
 from meshsplats._kinds import need_path
 from meshsplats._origin import FAR
 from meshsplats.camera import Camera
+from meshsplats.cameras.framing import has_northing_along_z
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import tile_frame
 from meshsplats.formats.gltf.splat_tiles import CONTENT
@@ -129,9 +130,11 @@ def write_tilesets(
 def on_globe(origin: np.ndarray, up: np.ndarray) -> bool:
     """Whether ``origin`` (3,) is a point on the ground of the Earth, in metres from its middle along the axes
     of the globe (ECEF), not projected coordinates with a height above it: one far from the plane of the
-    equator, or from whose ground ``up`` (3,), a unit vector, points away."""
+    equator and the poles, or from whose ground ``up`` (3,), a unit vector, points away."""
     away = away_from_ground(origin)
-    return away is not None and bool(abs(origin[2]) > FAR or away @ up > 0.99)
+    if away is None:
+        return False
+    return bool(away @ up > 0.99 or (abs(origin[2]) > FAR and not has_northing_along_z(origin)))
 
 
 def _transform(up: np.ndarray, origin: np.ndarray, axes: np.ndarray | None) -> list[float]:
