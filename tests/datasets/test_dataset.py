@@ -107,7 +107,8 @@ def test_views_of_splats_may_be_far_brighter_than_white(tmp_path):
     cameras = [look_at((0, 0, z), (0, 0, 0), width=16, height=16) for z in (-1.5, 1.5)]
     image = splat_dataset(cloud, cameras=cameras, test=1, width=16).train[0].load()
     assert np.median(image.color) > 16
-    assert save_preview(cloud, tmp_path / "a.png", cameras[0])
+    for scene in (cloud, ms.convert(cloud)):
+        assert save_preview(scene, tmp_path / "a.png", cameras[0])
     assert contact_sheet(cloud, cameras).max() == 1
 
 

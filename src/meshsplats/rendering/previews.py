@@ -57,7 +57,8 @@ def save_preview(
         return False
     if isinstance(scene, SplatMesh):
         how: dict[str, Any] = {"samples": samples, "threads": threads, "listing": listing}
-        save_image(path, image_of(scene, small, (1, 1, 1), **how)[0])
+        image = image_of(scene, small, (1, 1, 1), **how)[0]
     else:
-        save_image(path, render_splats(scene, small, threads=threads).color.clip(0, 1))
+        image = render_splats(scene, small, threads=threads).color
+    save_image(path, image.clip(0, 1))  # some splats are far brighter than white
     return True
