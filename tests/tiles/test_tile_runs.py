@@ -153,11 +153,12 @@ def test_a_folder_that_is_half_removed_is_known(splats, tmp_path, calls):
 # ---- What a run has lost
 
 
-def test_tiles_that_are_gone_are_missed(splats, tmp_path):
+@pytest.mark.parametrize("lose", [Path.unlink, lambda path: os.truncate(path, 0)], ids=["gone", "empty"])
+def test_tiles_that_are_gone_are_missed(splats, tmp_path, lose):
     end_after("above", splats, tmp_path / "tiles")
     tiles = sorted((tmp_path / "tiles.partial" / "tileset").glob("*.glb"))
-    tiles[0].unlink()
-    with pytest.raises(FileFormatError, match=rf"{tiles[0].name} is missing, though .* begin again with"):
+    lose(tiles[0])
+    with pytest.raises(FileFormatError, match=rf"{tiles[0].name} is missing or empty, though .* begin"):
         build_tiles(ms.stream_gaussians(splats), tmp_path / "tiles", OPTIONS, resume=True)
 
 

@@ -83,9 +83,7 @@ def warn_of_lost_detail(sample: np.ndarray, where: object) -> None:
 def warn_of_coarse_steps(sample: np.ndarray, scales: np.ndarray, where: object) -> None:
     """A DataWarning if splats of a file are smaller than the steps of float32 at their positions, of which
     this is a ``sample`` (k, 3). ``scales``: (n, 3)."""
-    if len(sample) and (
-        lost := lost_between(sample, float(np.median(scales.max(axis=1).astype(np.float64))))
-    ):
+    if len(sample) and (lost := lost_between(sample, float(np.median(sampled(scales).max(axis=1))))):
         warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 

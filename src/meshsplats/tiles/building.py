@@ -291,10 +291,12 @@ class _Build:
         return TilesetSummary(splats, triangles, len(nodes), levels, size, error, alpha, axes is not None)
 
     def _check_whole(self, nodes: dict[str, Node], splats: int, kept: int) -> None:
-        """FileFormatError where tiles, or some of their splats, are no longer there."""
-        gone = [key for key in nodes if not (self._out / tile_path(key)).is_file()]
+        """FileFormatError where tiles, or some of their splats, are no longer there. A power cut leaves files
+        empty."""
+        gone = [key for key in nodes if not _holds_data(self._out / tile_path(key))]
         if gone or splats != kept:
-            what = f"{tile_path(gone[0])} is missing" if gone else f"{splats:,} of {kept:,} splats are left"
+            what = f"{splats:,} of {kept:,} splats are left"
+            what = f"{tile_path(gone[0])} is missing or empty" if gone else what
             raise FileFormatError(
                 f"{self._folder}: {what}, though the journal has all: begin again with ``replace_old``"
             )
@@ -404,6 +406,10 @@ class _Passes:
                 self._show(self._phase, (self._past + min(1.0, done / self._splats)) / self._count)
         self._splats = done
         self._past += 1
+
+
+def _holds_data(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
 
 
 def _height(nodes: dict[str, Node], key: str) -> int:
