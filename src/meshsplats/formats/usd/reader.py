@@ -95,9 +95,8 @@ def usd_frames(path: Path, origin: np.ndarray) -> np.ndarray:
     which a skeleton, blend shapes, points or transforms have values. Errors as ``read_usd``, and
     FileFormatError for points that change in number."""
     report, arrays = extracted(path, "meshsplats.formats.usd.frame_extraction", origin)
-    return relative(
-        arrays["frames"], np.array(report["origin"]), origin
-    )  # files of ours have one of their own
+    own = np.array(report["origin"])  # of files of ours
+    return relative(arrays["frames"], own, origin).astype(np.float32, copy=False)
 
 
 def extracted(
