@@ -206,6 +206,15 @@ def test_the_start_fills_the_budget():
     assert train_config(max_splats=1).first_splats(True) == 1
 
 
+def test_large_sets_of_photographs_have_more_fans():
+    counts = {
+        pixels: train_config().for_pixels(pixels).max_splats for pixels in (0, 5 * 10**7, 75 * 10**6, 10**9)
+    }
+    assert list(counts.values()) == [100_000, 100_000, 150_000, 200_000]
+    assert train_config(max_splats=7).for_pixels(10**9).max_splats == 7
+    assert train_config().first_splats(masked=False) == 100_000
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("scene", "other"), [("ball", 15), ("room", 13)])
 def test_a_photograph_with_a_wrong_camera_is_named(scene, other, request):

@@ -113,9 +113,11 @@ class PhotographOptions:
         from meshsplats.datasets.points import load_points
         from meshsplats.finetuning.plans import Plan, Trained
         from meshsplats.training.as_splats import FITTED_SHARE
-        from meshsplats.training.run import check_training_memory, train
+        from meshsplats.training.run import check_training_memory, train, with_number_of_fans
 
         dataset, background = self.load(folder, config)
+        # Splats of more fans were not measured.
+        config = config.for_pixels(0) if as_splats else with_number_of_fans(config, dataset.train)
         mask = dataset.train[0].mask
         if mask is not None and mask.mean() < 0.5:
             say(
@@ -133,6 +135,6 @@ class PhotographOptions:
             return Trained(mesh, mesh, counts, made)
 
         needed = check_training_memory(dataset, config, cache_bytes=self.cache_bytes)
-        summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
+        summary = f"up to {config.most_splats:,} fans of {config.sides} triangles; {known}"
         reserve = 60 * FITTED_SHARE * (config.minutes or 0) if as_splats else 0.0
         return Plan(None, dataset, summary, background, optimise, reserve=reserve, needed=needed)

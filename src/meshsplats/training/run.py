@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import reduced_views
 from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_masked
-from meshsplats.datasets.views import Dataset, ImageCache
+from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal, claimed
@@ -98,7 +98,7 @@ def train(
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
     dataset = with_clear_pixels_masked(dataset).scorable()
-    config = for_views(config, dataset.train)
+    config = for_views(with_number_of_fans(config, dataset.train), dataset.train)
     engine(run.device, run.threads).check()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
     with claimed(run, (START, SO_FAR, COVERAGE)):
@@ -158,9 +158,18 @@ def train(
     return mesh
 
 
+def with_number_of_fans(config: TrainConfig, views: Sequence[View]) -> TrainConfig:
+    """``config`` with a ``max_splats`` that suits training ``views``."""
+    if config.max_splats is not None:
+        return config
+    masked = has_silhouettes(views)
+    return config.for_pixels(0 if masked else sum(view.camera.width * view.camera.height for view in views))
+
+
 def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
     """Estimated peak memory in bytes of a process that trains. MemoryError if there is less."""
-    fans = config.max_splats
+    config = with_number_of_fans(config, dataset.train)
+    fans = config.most_splats
     vertices = fans * (1 + config.sides)
     needed = estimate_bytes(vertices, fans * config.sides, dataset, cache_bytes)
     if config.sh_degree:
@@ -170,7 +179,7 @@ def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes:
     reduced = [*reduced_views(views, 0.25, store), *reduced_views(views, 0.5, store)]
     needed += min(sum(view.source.nbytes for view in reduced), cache_bytes // REDUCED_PART)
     needed += max(matching_bytes(views), carving_bytes(views, config.first_splats(masked=True)))
-    what = f"training {config.max_splats:,} fans on {len(dataset.views):,} images"
+    what = f"training {fans:,} fans on {len(dataset.views):,} images"
     check_bytes(needed, what, "allow fewer fans (``max_splats``)")
     return needed
 
@@ -180,6 +189,7 @@ def starting_fans(
 ) -> SplatMesh:
     """The fans that a training starts from, coloured from the training views; see ``train``."""
     views = dataset.train
+    config = with_number_of_fans(config, views)
     count = config.first_splats(has_silhouettes(views))
     patches, shell = starting_patches(views, count, points, threads)
     parts = [part for part in (patches, shell) if part is not None]
@@ -187,7 +197,7 @@ def starting_fans(
         raise ValueError("the photographs have nothing in common that a mesh could start from")
     joined = Patches.joined(*parts)
     found = len(joined.points)
-    chosen = np.linspace(0, found - 1, min(found, config.max_splats)).astype(int)
+    chosen = np.linspace(0, found - 1, min(found, config.most_splats)).astype(int)
     mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
     up = guess_up(cameras=[view.upright for view in views])
     harmonics = None

@@ -23,6 +23,6 @@ def events_passed(config: TrainConfig, fraction: float) -> int:
 
 def budget(config: TrainConfig, event: int, first: int) -> int:
     """Largest number of fans after growth event ``event`` (from 1) of a run that began with ``first``: each
-    event multiplies it by the same factor, up to ``max_splats``."""
+    event multiplies it by the same factor, up to ``most_splats``."""
     share = event / config.growth_events
-    return min(round(first * (config.max_splats / first) ** share), config.max_splats)
+    return min(round(first * (config.most_splats / first) ** share), config.most_splats)
