@@ -12,7 +12,7 @@ _SPACING_LEVELS = 20
 STRAYS = 1024
 """Extent of a scene, as a multiple of that of 98 % of its points, from which on the others are strays."""
 
-GLOBE = (6.3e6, 6.45e6)
+_GLOBE = (6.3e6, 6.45e6)
 """Distances of the ground from the middle of the Earth, metres."""
 _FLATTENING = 1.0067394967
 """(a / b)^2 of the ellipsoid of WGS 84."""
@@ -21,7 +21,7 @@ _FLATTENING = 1.0067394967
 def away_from_ground(place: np.ndarray) -> np.ndarray | None:
     """(3,) unit normal of the Earth's ellipsoid below ``place`` (3,), metres from its middle (ECEF); None for
     a place that is not on the ground."""
-    if not GLOBE[0] < np.linalg.norm(place) < GLOBE[1]:
+    if not _GLOBE[0] < np.linalg.norm(place) < _GLOBE[1]:
         return None
     normal: np.ndarray = place * [1, 1, _FLATTENING]
     return normal / np.linalg.norm(normal)

@@ -71,13 +71,19 @@ def lost_between(positions: np.ndarray, size: float) -> str:
     """As ``lost_detail``, where there are steps enough across the scene, but larger ones than what is there:
     splats or triangles of that ``size``. What is smaller than the steps of a scene around zero is a point."""
     found = _spread(positions)
-    if found is None or not 0 < size < _step(found[2]) or size < _step(found[1]):
+    if found is None:
         return ""
-    if _coarse(positions) is not None:
+    center, extent, farthest = found
+    step = _step(farthest)
+    if not 0 < size < step or size < _step(extent) or _is_coarse(extent, farthest):
         return ""
-    near, step = in_words(np.round(found[0])), _step(found[2])
-    where = f"positions near {near} are stored as float32, in steps of {step:g}"
+    where = f"positions near {in_words(np.round(center))} are stored as float32, in steps of {step:g}"
     return f"{where}, of what is {size:.2g} large: {_LOST}"
+
+
+def usual_size(scales: np.ndarray) -> float:
+    """The median of the largest standard deviations (n, 3) of splats, of a sample of them."""
+    return float(np.median(sampled(scales).max(axis=1)))
 
 
 def lost_by_rounding(name: str, exact: ArrayLike) -> str:
@@ -104,7 +110,7 @@ def need_detail(samples: Mapping[Any, np.ndarray], origin: np.ndarray) -> None:
     has fewer than ``FEWEST_STEPS`` float32 steps across it relative to their one ``origin``."""
     found = {name: spread for name, sample in samples.items() if (spread := _spread(sample - origin))}
     for name, (center, extent, farthest) in found.items():
-        if not 0 < extent < FEWEST_STEPS * _step(farthest):
+        if not _is_coarse(extent, farthest):
             continue
         other = max(found, key=lambda place: float(np.linalg.norm(found[place][0] - center)))
         at, beside = (in_words(choose_origin(samples[place])) for place in (name, other))
@@ -128,11 +134,15 @@ def _coarse(positions: np.ndarray) -> str | None:
     if found is None:
         return None
     center, extent, farthest = found
-    step = _step(farthest)
-    if extent == 0 or extent >= FEWEST_STEPS * step:
+    if not _is_coarse(extent, farthest):
         return None
-    near = in_words(np.round(center))
+    near, step = in_words(np.round(center)), _step(farthest)
     return f"near {near} are stored as float32, in steps of {step:g} across an extent of {extent:.3g}"
+
+
+def _is_coarse(extent: float, farthest: float) -> bool:
+    """Whether fewer than ``FEWEST_STEPS`` steps are left across an ``extent`` that reaches so far."""
+    return 0 < extent < FEWEST_STEPS * _step(farthest)
 
 
 def _step(farthest: float) -> float:

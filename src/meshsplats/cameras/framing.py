@@ -23,14 +23,13 @@ DEFAULT_UP = (0.0, -1.0, 0.0)
 """Splats trained from COLMAP cameras have the y axis pointing down."""
 SURVEY_UP = (0.0, 0.0, 1.0)
 """Surveys have eastings, northings and heights."""
+_EASTING = 1.5e6
+"""Easting of surveys, at most, metres."""
 SAMPLE = 20_000
 """Largest number of points to measure: more do not change the quantiles visibly."""
 SURROUNDINGS = 4.0
 """Points farther from the centre than this many median distances are surroundings, not the subject. Splats of
 a single object reach about 2 (surface of a ball: 1; filled ball: 1.26; longest object measured: 3.9)."""
-
-_EASTING = 1.5e6
-"""Easting of surveys, at most, metres."""
 
 APART = 0.15
 """Parts of the subject that are farther than this many radii from the rest are separate..."""

@@ -14,7 +14,7 @@ import numpy as np
 from meshsplats._arrays import spread_indices
 from meshsplats._geometry import spacing
 from meshsplats.camera import Camera, hiding_near_plane
-from meshsplats.cameras.framing import SAMPLE
+from meshsplats.cameras.framing import SAMPLE, guess_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
@@ -291,6 +291,16 @@ class SceneViews:
             cameras = self._given if self._options.footprint == "cameras" else self._measuring
             raise ValueError(_none_seen(cameras, self._scene.sample.means, self._scene.kept))
         return np.float32(np.median(seen))
+
+
+def usual_pixels(cloud: GaussianCloud, cameras: Sequence[Camera] | None = None) -> np.ndarray:
+    """(n,) float32 size of a pixel at each splat of ``cloud`` in scene units: in images of ``cameras``, else
+    in those of 'framing'."""
+    source = ConversionOptions(footprint="cameras" if cameras else "framing")
+    views = SceneViews(SceneSample.of(cloud), source, cameras, guess_up(cloud, cameras), whole=True)
+    pixel = views.pixel_sizes(cloud.means)
+    assert pixel is not None
+    return pixel
 
 
 def _none_seen(cameras: Sequence[Camera], means: np.ndarray, count: int) -> str:

@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.cameras.framing import guess_up
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, SceneSample, SceneViews, widen
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, usual_pixels, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
@@ -75,10 +74,7 @@ def without_gaps(cloud: GaussianCloud, threads: int | None = None, hint: str = "
     if gap_share(cloud, threads) < _SHARE:
         return cloud
     _warn(hint)
-    framing = ConversionOptions(footprint="framing")
-    views = SceneViews(SceneSample.of(cloud), framing, None, guess_up(cloud), whole=True)
-    pixel = views.pixel_sizes(cloud.means)
-    return replace(cloud, scales=widen(cloud.scales, pixel, DRAWN_PX2, "3dgs"))
+    return replace(cloud, scales=widen(cloud.scales, usual_pixels(cloud), DRAWN_PX2, "3dgs"))
 
 
 def _warn(hint: str) -> None:

@@ -23,12 +23,10 @@ from meshsplats._core.library import check_threads, processors
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up
-from meshsplats.conversion.footprint import SceneSample, SceneViews, widen
+from meshsplats.conversion.footprint import usual_pixels, widen
 from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
-from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import GaussianCloud
 
@@ -260,11 +258,7 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
     px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
-    source = ConversionOptions(footprint="cameras" if cameras else "framing")
-    views = SceneViews(SceneSample.of(cloud), source, cameras, guess_up(cloud, cameras), whole=True)
-    pixel = views.pixel_sizes(cloud.means)
-    assert pixel is not None
-    return np.sqrt(px2) * pixel.astype(np.float64)
+    return np.sqrt(px2) * usual_pixels(cloud, cameras).astype(np.float64)
 
 
 def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:

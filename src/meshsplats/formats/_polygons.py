@@ -14,6 +14,12 @@ _WORK = 1 << 27
 """... of which a file may take so many, some 20 seconds. What is left then becomes fans."""
 
 
+def corner_places(points: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+    """(k, 3) the ``points`` (v, 3) at the ``corners`` (k,) of polygons; None where one is not among them."""
+    known = corners.min(initial=0) >= 0 and corners.max(initial=-1) < len(points)
+    return points[corners] if known else None
+
+
 def cut_polygons(lengths: np.ndarray, places: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Polygons with ``lengths`` (n,) corners each, one after the other, as triangles.
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, lost_between, lost_detail, sampled
+from meshsplats._origin import choose_origin, lost_between, lost_detail, sampled, usual_size
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
 from meshsplats.mesh import SplatMesh
 
@@ -83,7 +83,7 @@ def warn_of_lost_detail(sample: np.ndarray, where: object) -> None:
 def warn_of_coarse_steps(sample: np.ndarray, scales: np.ndarray, where: object) -> None:
     """A DataWarning if splats of a file are smaller than the steps of float32 at their positions, of which
     this is a ``sample`` (k, 3). ``scales``: (n, 3)."""
-    if len(sample) and (lost := lost_between(sample, float(np.median(sampled(scales).max(axis=1))))):
+    if len(sample) and (lost := lost_between(sample, usual_size(scales))):
         warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 

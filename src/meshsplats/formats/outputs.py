@@ -120,11 +120,11 @@ def _size_of(scene: GaussianCloud | SplatMesh | BaseMesh) -> float:
     """Usual size of a splat or a triangle, scene units; of a sample of them."""
     import numpy as np
 
-    from meshsplats._origin import sampled
+    from meshsplats._origin import sampled, usual_size
     from meshsplats.gaussians import GaussianCloud
 
     if isinstance(scene, GaussianCloud):
-        return float(np.median(sampled(scene.scales).max(axis=1))) if len(scene) else 0.0
+        return usual_size(scene.scales) if len(scene) else 0.0
     if not len(scene.faces):
         return 0.0
     a, b, _ = sampled(scene.faces).astype(int).T

@@ -168,7 +168,6 @@ def with_number_of_fans(config: TrainConfig, views: Sequence[View]) -> TrainConf
 
 def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
     """Estimated peak memory in bytes of a process that trains. MemoryError if there is less."""
-    config = with_number_of_fans(config, dataset.train)
     fans = config.most_splats
     vertices = fans * (1 + config.sides)
     needed = estimate_bytes(vertices, fans * config.sides, dataset, cache_bytes)

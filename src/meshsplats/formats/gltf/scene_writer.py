@@ -115,8 +115,7 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
     normals = smooth_normals(base) if lit else None
     relief: dict[str, Any] = {}
     if lit and base.normal_map is not None and base.textured and base.uv is not None:
-        frames = corner_frames(base.vertices, base.faces, base.uv, base.up)
-        tangents = np.concatenate([frames.tangents, frames.signs[..., None]], axis=2, dtype=np.float32)
+        tangents = corner_frames(base.vertices, base.faces, base.uv, base.up).signed
         relief = {"normalTexture": {"index": 0}}
         images.append(_image(chunk, normal_file(base)[1]))
         samplers.append(_sampler(base.textures[0]))

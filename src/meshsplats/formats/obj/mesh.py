@@ -21,7 +21,7 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._orientation import up_rotation
-from meshsplats.formats._polygons import cut_polygons
+from meshsplats.formats._polygons import corner_places, cut_polygons
 from meshsplats.formats._validation import checked, local_positions, straight_colors
 from meshsplats.formats.mesh_formats import FileSize, MeshCodec
 from meshsplats.mesh import SplatMesh
@@ -166,11 +166,6 @@ def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         up=up,
         origin=at,
     )
-
-
-def corner_places(points: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
-    """(k, 3) the ``points`` (v, 3) at the ``corners`` (k,) of polygons; None where one is not among them."""
-    return points[corners] if corners.max(initial=0) < len(points) else None
 
 
 def _turned(words: list[bytes]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from meshsplats.errors import FileFormatError
-from meshsplats.formats._polygons import cut_polygons
+from meshsplats.formats._polygons import corner_places, cut_polygons
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.header import Element, PlyHeader, Property
 
@@ -51,11 +51,7 @@ def read_faces(
     data = file.read()
     polygons = (_ascii if header.encoding == "ascii" else _binary)(data, header, face, index, keep, path)
     lengths, corners, values = polygons
-    if not len(corners) or (lengths == 3).all() or corners.min() < 0 or corners.max() >= len(points):
-        places = None  # no need for them, or an error of the mesh
-    else:
-        places = points[corners]
-    cut, owner = cut_polygons(lengths, places)
+    cut, owner = cut_polygons(lengths, None if (lengths == 3).all() else corner_places(points, corners))
     return corners[cut], {p.name: v[owner] for p, v in zip(keep, values, strict=True)}
 
 

@@ -54,8 +54,7 @@ def corners_of(base: BaseMesh) -> Corners:
     tangents = None
     if base.normal_map is not None:
         frames = corner_frames(base.vertices, base.faces, base.uv, base.up)
-        every = np.concatenate([frames.tangents, frames.signs[..., None]], axis=2, dtype=np.float32)
-        tangents = every.reshape(-1, 4)[first[order]]
+        tangents = frames.signed.reshape(-1, 4)[first[order]]
     return Corners(
         base.vertices[rows],
         normals[rows],

@@ -19,6 +19,11 @@ class Frames(NamedTuple):
     signs: np.ndarray
     """(...) float64: 1, or -1 in charts that are mirror images."""
 
+    @property
+    def signed(self) -> np.ndarray:
+        """(..., 4) float32 tangents with their signs, as glTF has them."""
+        return np.concatenate([self.tangents, self.signs[..., None]], axis=-1, dtype=np.float32)
+
 
 def corner_frames(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, fallback: np.ndarray | None = None
