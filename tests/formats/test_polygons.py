@@ -122,3 +122,18 @@ def test_an_l_in_a_file_with_its_texture(tmp_path, suffix):
     assert found.sum() == pytest.approx(4)
     placed = base.vertices[base.faces][..., :2] / 3
     np.testing.assert_allclose(base.uv, placed * [1, -1] + [0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["uchar", "ushort", "uint", "char", "short", "int"])
+def test_corners_of_a_ply_in_any_integer_type(tmp_path, kind):
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 6\n"
+    head += "".join(f"property float {name}\n" for name in "xyz")
+    head += f"element face 1\nproperty list uchar {kind} vertex_indices\nend_header\n"
+    stored = {"char": "i1", "short": "<i2", "int": "<i4", "uchar": "u1", "ushort": "<u2", "uint": "<u4"}[kind]
+    points = np.column_stack([np.roll(L, 1, axis=0), np.zeros(6)]).astype("<f4")
+    path = tmp_path / "m.ply"
+    path.write_bytes(head.encode() + points.tobytes() + b"\6" + np.arange(6).astype(stored).tobytes())
+    mesh = load_base(path)
+    found = areas(mesh.vertices, mesh.faces)
+    assert found.min() > 0
+    assert found.sum() == pytest.approx(4)

@@ -16,7 +16,7 @@ _WORK = 1 << 27
 
 def corner_places(points: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     """(k, 3) the ``points`` (v, 3) at the ``corners`` (k,) of polygons; None where one is not among them."""
-    known = corners.min(initial=0) >= 0 and corners.max(initial=-1) < len(points)
+    known = len(corners) > 0 and corners.min() >= 0 and corners.max() < len(points)
     return points[corners] if known else None
 
 
