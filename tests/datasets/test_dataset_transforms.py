@@ -297,7 +297,9 @@ def test_few_missing_images_are_left_out(tmp_path):
     with pytest.raises(FileFormatError, match=r"1 of 4 images are missing \(images/f2\.png\)"):
         load_dataset(folder, missing="error")
     (tmp_path / "images/f1.png").unlink()  # half of them
-    refused(folder, r"2 of 4 images are missing \(images/f1\.png, images/f2\.png\)")
+    refused(
+        folder, r"2 of 4 images are missing \(images/f1\.png, images/f2\.png\); missing skip leaves them out"
+    )
     with pytest.warns(DataWarning, match="2 images are missing"):
         assert len(load_dataset(folder, missing="skip").views) == 2
     # The same where their size would have been asked of them.

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _datasets import simple_colmap
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
@@ -15,7 +16,7 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DataWarning
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.benchmarks import BENCHMARKS, Benchmark, find_input, run_benchmark
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.evaluation.report import (
@@ -315,6 +316,19 @@ def test_a_scenes_input_is_found_by_name(tmp_path):
     assert find_input(tmp_path, "room") == tmp_path / "room"
     (tmp_path / "room.npz").touch()
     assert find_input(tmp_path, "room") == tmp_path / "room.npz"
+
+
+def test_a_benchmark_needs_every_photograph_before_it_scores_any(tmp_path):
+    """The second scene lacks one image of nine."""
+    benchmark = Benchmark("Two scenes", {"one": 1, "two": 1}, {})
+    for name in benchmark.scenes:
+        simple_colmap(tmp_path / "data" / name, count=9)
+        (tmp_path / "models" / name).mkdir(parents=True)
+    (tmp_path / "data" / "two" / "images" / "p03.png").unlink()
+    scored: list[str] = []
+    with pytest.raises(FileFormatError, match=r"two.*: 1 of 9 images are missing \(images/p03\.png\)$"):
+        run_benchmark(benchmark, tmp_path / "models", tmp_path / "data", load=scored.append)
+    assert not scored
 
 
 @pytest.mark.filterwarnings(

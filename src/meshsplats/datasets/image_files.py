@@ -312,9 +312,10 @@ class Album:
             what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
             raise FileFormatError(f"{where}: {what}")
         if self.missing and refused:
+            remedy = "" if self.on_missing == "error" else "; ``missing`` skip leaves them out"
             raise FileFormatError(
                 f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
-                f" ({first_names(self.missing)}){self._near()}; ``missing`` skip leaves them out"
+                f" ({first_names(self.missing)}){self._near()}{remedy}"
             )
         near = self._near() if self.missing else ""
         for names, text in (
