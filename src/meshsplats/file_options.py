@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from meshsplats._options import check_options
+from meshsplats._options import changed, check_options
 from meshsplats._words import optional_color
 from meshsplats.choices import Look
 from meshsplats.datasets.scene_files import SceneReading
@@ -139,6 +139,12 @@ class LevelTuning:
         return make_config("default", minutes=MINUTES if self.minutes is None else self.minutes)
 
 
+_OF_SPLATS = ("cameras", "look", "sh_degree")
+"""Options of scores against images of splats..."""
+_OF_PHOTOGRAPHS = ("downscale", "test_every")
+"""... and against photographs, beside those that ``check_photographs`` knows."""
+
+
 @dataclass(frozen=True)
 class ScoringOptions:
     """What is scored, against what, and how."""
@@ -199,16 +205,19 @@ class ScoringOptions:
         optional_color(self.background)
         if self.amplify <= 0 or self.strips < 0:
             raise OptionValueError("``amplify`` must be positive and ``strips`` >= 0")
+        given = changed(self)
+        if "network" in given and not self.lpips:
+            raise OptionsError("``network`` has no effect without ``lpips``")
         if self.protocol is not None:
             if self.data is None or len(meshes) != 1:
                 raise OptionsError(
                     "``protocol`` needs a folder of meshes or models, and ``data`` with the scenes"
                 )
-            for name in ("before", "splats", "images", "cameras", "sh_degree", "order"):
-                if getattr(self, name) is not None:
-                    raise OptionsError(f"``{name}`` has no effect with ``protocol``")
-            if self.missing != "few":
+            if "missing" in given:
                 raise OptionsError("``missing`` has no effect with ``protocol``, which needs every image")
+            for name in (*_OF_SPLATS, "before", "splats", "images", "order", "test_every", "masks"):
+                if name in given:
+                    raise OptionsError(f"``{name}`` has no effect with ``protocol``")
             return
         if self.tune is not None:
             raise OptionsError(
@@ -220,10 +229,8 @@ class ScoringOptions:
             raise OptionsError("nothing to score: give a mesh, ``images``, or ``splats`` with ``data``")
         if self.data is None and self.splats is None:
             raise OptionsError("nothing to compare with: give ``data``, or ``splats``")
-        of_splats = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
-        for name, value in of_splats.items():
-            if self.data is not None and value is not None:
-                raise OptionsError(f"``{name}`` has no effect with ``data``")
-        if self.data is None and self.downscale is not None:
-            raise OptionsError("``downscale`` has no effect without ``data``")
+        useless, how = (_OF_PHOTOGRAPHS, "without") if self.data is None else (_OF_SPLATS, "with")
+        for name in useless:
+            if name in given:
+                raise OptionsError(f"``{name}`` has no effect {how} ``data``")
         check_photographs(self.data, self.missing, masks=self.masks)

@@ -41,6 +41,9 @@ def scene(tmp_path_factory):
     return folder
 
 
+PROTOCOL = ["models", "--data", "d", "--protocol", "mipnerf360"]
+
+
 def run(*arguments) -> int:
     return main(["evaluate", *map(str, arguments)])
 
@@ -170,9 +173,16 @@ def test_a_protocol_converts_splats(scene, tmp_path):
         ([], 2, "nothing to score"),
         (["mesh.npz"], 2, "nothing to compare with"),
         (["mesh.npz", "--data", "d", "--sh-degree", "0"], 2, "no effect with --data"),
-        (["mesh.npz", "--splats", "scene.ply", "--downscale", "2"], 2, "no effect without --data"),
+        (["mesh.npz", "--splats", "scene.ply", "--downscale", "2"], 2, "--downscale has no effect without"),
+        (["mesh.npz", "--splats", "scene.ply", "--test-every", "4"], 2, "--test-every has no effect without"),
+        (["mesh.npz", "--data", "d", "--network", "alex"], 2, "--network has no effect without --lpips"),
         (["mesh.npz", "--splats", "scene.ply", "--tune", "paper"], 2, "--tune is for --protocol"),
         (["mesh.npz", "--protocol", "mipnerf360"], 2, "--data with the scenes"),
+        ([*PROTOCOL, "--test-every", "4"], 2, "--test-every has no effect with --protocol"),
+        ([*PROTOCOL, "--masks", "subject"], 2, "--masks has no effect with --protocol"),
+        ([*PROTOCOL, "--missing", "skip"], 2, "--missing has no effect with --protocol, which needs every"),
+        ([*PROTOCOL, "--look", "splats"], 2, "--look has no effect with --protocol"),
+        ([*PROTOCOL, "--network", "alex"], 2, "--network has no effect without --lpips"),
         (["scene.ply", "--splats", "scene.ply"], 1, "splats, not a mesh"),
         (["mesh.npz", "--splats", "mesh.npz"], 1, "a mesh, not splats"),
         (["mesh.npz", "--data", "nowhere"], 1, "no such data set"),
