@@ -34,7 +34,10 @@ def photographs(scene, tmp_path) -> Path:
 
 @pytest.mark.parametrize(
     ("minutes", "threads", "factor"),
-    [(4, 1, 1), (1, 4, 1), (1, 1, 2), (0.25, 1, 4), (1e-9, 1, 48), (None, 1, 1), (1, None, 1)],
+    [
+        *[(4, 1, 1), (1, 4, 1), (1, 1, 2), (0.25, 1, 4), (1e-9, 1, 48), (None, 1, 1), (1, None, 1)],
+        *[(4 / 1.49**2, 1, 1), (4 / 1.51**2, 1, 2)],  # the nearest factor
+    ],
 )
 def test_more_minutes_and_threads_make_larger_images(photographs, monkeypatch, minutes, threads, factor):
     monkeypatch.setattr(image_sizes, "PIXELS_PER_MINUTE", SIDE**2 / 4)
