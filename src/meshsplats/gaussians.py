@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Kernel = Literal["3dgs", "antialiased", "2dgs"]
+
+LOW_PASS_PX2: Mapping[Kernel, float] = {"3dgs": 0.3, "antialiased": 0.3, "2dgs": 0.5}
+"""Variance in square pixels of the low-pass filter that splats of each kernel are drawn with, at any size of
+the image."""
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""

@@ -15,8 +15,9 @@ from _cities import digest
 import meshsplats as ms
 from meshsplats.cli import main
 from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.merging import merge
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.tiles import building, is_tileset
+from meshsplats.tiles import building, is_tileset, making
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.options import TileOptions
 from meshsplats.tiles.tileset import Tileset
@@ -189,6 +190,27 @@ def test_a_kernel_that_spz_does_not_know_is_said_once(cloud, tmp_path):
     with pytest.warns(DataWarning, match="SPZ leaves out the kernel '2dgs'") as found:
         build_tiles(ms.stream_gaussians(tmp_path / "a.ply"), tmp_path / "tiles", OPTIONS)
     assert len(found) == 1
+
+
+@pytest.mark.filterwarnings("ignore:.*SPZ leaves out the kernel")
+@pytest.mark.parametrize(("kernel", "variance"), [("3dgs", 0.3), ("2dgs", 0.5)])
+def test_merging_widens_splats_as_their_kernel_does(cloud, tmp_path, monkeypatch, kernel, variance):
+    """By pixels as large as the error of the finer tiles."""
+    flat = replace(cloud, kernel=kernel, scales=cloud.scales * np.array([1, 1, 0], np.float32))
+    ms.save_gaussians(flat, tmp_path / "a.ply")
+    widths = []
+
+    def watched(cloud, count, low_pass, threads):
+        widths.append(low_pass)
+        return merge(cloud, count, low_pass, threads)
+
+    monkeypatch.setattr(making, "merge", watched)
+    options = replace(OPTIONS, max_triangles=60)
+    build_tiles(ms.stream_gaussians(tmp_path / "a.ply"), tmp_path / "tiles", options, threads=1)
+    root = json.loads((tmp_path / "tiles/tileset.json").read_text())["root"]
+    finest = max(child["geometricError"] for child in root["children"])
+    assert finest > 0
+    np.testing.assert_allclose(widths[-1], np.sqrt(variance) * finest, rtol=1e-6)
 
 
 def test_harmonics_are_kept_as_asked(cloud, tmp_path):

@@ -28,10 +28,7 @@ from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import GaussianCloud
-
-FILTER_PX2 = 0.3
-"""Variance in square pixels of the low-pass filter of splat renderers."""
+from meshsplats.gaussians import LOW_PASS_PX2, GaussianCloud, Kernel
 
 MIN_OPACITY = 1 / 255
 """Opacity below which 3DGS draws nothing."""
@@ -256,9 +253,14 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
     return optical_depth(opacity), opacity
 
 
+def low_pass_of(kernel: Kernel, pixels: np.ndarray) -> np.ndarray:
+    """(n,) float64 standard deviations of the low-pass filter that splats of this ``kernel`` are drawn with,
+    where pixels are as large as ``pixels`` (n,)."""
+    return np.sqrt(LOW_PASS_PX2[kernel]) * pixels.astype(np.float64)
+
+
 def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
-    px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
-    return np.sqrt(px2) * usual_pixels(cloud, cameras).astype(np.float64)
+    return low_pass_of(cloud.kernel, usual_pixels(cloud, cameras))
 
 
 def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:

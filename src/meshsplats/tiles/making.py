@@ -15,7 +15,7 @@ from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
 from meshsplats.cluster import Shared
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import SceneViews
-from meshsplats.conversion.merging import FILTER_PX2, merge
+from meshsplats.conversion.merging import low_pass_of, merge
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey
 from meshsplats.formats._orientation import tile_frame
@@ -152,7 +152,7 @@ class TileWriter:
         if not finest:
             own = self._views.pixel_sizes(cloud.means)
             pixel = np.zeros_like(pixel) if own is None else own
-        result = merge(cloud, count, np.sqrt(FILTER_PX2) * pixel.astype(np.float64), threads=self._threads)
+        result = merge(cloud, count, low_pass_of(self._kernel, pixel), threads=self._threads)
         first = np.unique(result.group, return_index=True)[1]
         rows = below["row"][first]
         merged = _merged_from(records_of(result.cloud, rows, self.degree))
