@@ -153,6 +153,20 @@ def test_the_page_of_options_is_that_of_the_source():
     assert module.PAGE.read_text(encoding="utf-8") == module.page(), "run tools/options_page.py"
 
 
+def test_every_option_without_a_flag_is_on_the_page():
+    """As ``sh_degree`` of surfaces, which is another than that of the training."""
+    pytest.importorskip("tyro")
+    module = script("tools/options_page.py")
+    text = module.page()
+    for command in module.COMMANDS:
+        kind = module._command(command)
+        for name, option in module.options_of(kind).items():
+            if not option.has_flag:
+                help_text = module._setting(kind, option.path).help
+                assert f"| `{name}` |" in text, command
+                assert module._plain(help_text) in text, (command, name)
+
+
 def test_options_that_differ_from_their_defaults_are_changed():
     assert changed(Baking()) == []
     assert changed(Baking(heat=200, glaze=True, loaves=1)) == ["heat", "glaze"]

@@ -80,14 +80,18 @@ def _rows(known: dict[str, Setting], command: str, presets: dict[str, Any]) -> I
 
 def _others() -> Iterator[list[str]]:
     """The options without a flag that belong to commands alone."""
-    elsewhere = {*settings(ConversionOptions), *settings(TrainConfig)}
+    elsewhere = {
+        (name, setting.help)
+        for kind in (ConversionOptions, FinetuneConfig, TrainConfig)
+        for name, setting in settings(kind).items()
+    }
     found: dict[str, tuple[list[str], Setting]] = {}
     for command in COMMANDS:
         kind = _command(command)
         for name, option in options_of(kind).items():
-            alone = command == "convert" and name == "cutoff"
-            if not option.has_flag and (alone or name not in elsewhere):
-                found.setdefault(name, ([], _setting(kind, option.path)))[0].append(command)
+            setting = _setting(kind, option.path)
+            if not option.has_flag and (name, setting.help) not in elsewhere:
+                found.setdefault(name, ([], setting))[0].append(command)
     for name, (commands, setting) in found.items():
         values, default = _values(setting), _shown(setting.default)
         yield [f"`{name}`", ", ".join(commands), values, default, _plain(setting.text)]

@@ -199,6 +199,7 @@ def test_what_cannot_be_done():
         ({"resolution": 4}, "resolution must be"),
         ({"resolution": 600}, "resolution must be"),
         ({"faces": 3}, "faces must be"),
+        ({"sh_degree": 4}, "sh_degree must be a whole number from 0 to 3, got 4"),
         ({"views": 2}, "views must be"),
         ({"texture": 32}, "texture must be 64"),
         ({"shape": "round"}, "shape must be one of"),

@@ -49,7 +49,7 @@ class SurfaceOptions:
     rounds: Annotated[int, Range(0, 1000)] = 3
     """How often shape and texture are compared with each image; 0: the surface stays as fused, and has the
     mean colours of the images."""
-    sh_degree: Annotated[int | None, Range(0, 4), Advanced] = None
+    sh_degree: Annotated[int | None, Range(0, 3), Advanced] = None
     """Largest degree of the splats' view-dependent colour in the images; None: all."""
     move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 0.5
     """Step of the vertices, relative to the length of an edge."""
