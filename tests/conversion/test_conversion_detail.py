@@ -47,7 +47,7 @@ def cameras(count: int = 3) -> list:
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
-@given(shares, st.integers(3, 90), st.floats(1e-3, 1e3))
+@given(shares, st.integers(3, 90), st.integers(0, 10).map(lambda power: 4.0**power))
 def test_levels(shown, mean, factor):
     """Within the budget, and not wasteful; who shows more has no less; only ratios count."""
     budget = mean * len(shown)
@@ -61,8 +61,7 @@ def test_levels(shown, mean, factor):
     could_rise = (shown > 0) & (levels < len(LEVELS) - 1)
     if could_rise.any():
         assert budget - TRIANGLES[levels].sum() < np.diff(TRIANGLES).max()
-    if len(set(shown)) == len(shown) and shown.min() > 1e-3:
-        np.testing.assert_allclose(levels, choose_levels(shown * factor, budget), atol=1)
+    np.testing.assert_array_equal(levels, choose_levels(shown * factor, budget))  # its root rounds nothing
 
 
 def test_levels_of_a_hand_worked_case():
