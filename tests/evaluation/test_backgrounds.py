@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _datasets import simple_colmap
 from _photographs import write_photographs
 
 from meshsplats import _toml as toml
@@ -24,6 +25,8 @@ from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.rendering import render_splats
 from meshsplats.rendering.looks import image_of
+from meshsplats.training.config import TrainConfig
+from meshsplats.training.photographs import PhotographOptions
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -96,6 +99,13 @@ def test_what_is_named_and_given_goes_before_with_a_warning_where_it_matters(clo
     mixed = Dataset(photographs(cloud, (0, 0, 0)).train + photographs(painted, (1, 1, 1)).train * 2)
     with pytest.warns(DataWarning, match="the mesh scores"):
         find_background(mixed, {"splats": cloud, "mesh": painted}, given=(0, 0, 0))
+
+
+def test_a_training_says_whose_choice_its_background_is(tmp_path):
+    folder = simple_colmap(tmp_path, 4)
+    for name, expected in (("mixed", "black, which fans cover"), ("white", "white, as given")):
+        _, found = PhotographOptions().load(folder, TrainConfig(background=name))
+        assert found.describe() == expected
 
 
 def test_alpha_goes_over_white_unless_something_else_is_said(cloud):

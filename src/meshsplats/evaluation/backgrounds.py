@@ -44,7 +44,13 @@ _BLOCKS = 24
 _MAX_POINTS = 20_000
 """Points of a scene that are looked for in the images."""
 
-Reason = Literal["given", "model folder", "usual", "best for"]
+Reason = Literal["given", "model folder", "usual", "covered", "best for"]
+_IN_WORDS = {
+    "given": "as given",
+    "model folder": "as the model folder says",
+    "usual": "as usual",
+    "covered": "which fans cover",
+}
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,9 @@ class Background:
     color: tuple[float, float, float]
     """Display RGB in [0, 1]."""
     reason: Reason
-    """given: by the caller. model folder: named by it. usual: white, for images with alpha. best for: that of
-    black and white over which ``judge`` is closer to the photographs."""
+    """given: by the caller. model folder: named by it. usual: white, for images with alpha. covered: it
+    hardly matters, as a training covers it by its fans. best for: that of black and white over which
+    ``judge`` is closer to the photographs."""
     judge: str = ""
     """Name of the scene that was scored first."""
     psnr: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -83,8 +90,7 @@ class Background:
     def describe(self) -> str:
         """The background and its reason in a few words."""
         if self.reason != "best for":
-            reasons = {"given": "as given", "model folder": "as the model folder says", "usual": "as usual"}
-            return f"{self.name}, {reasons[self.reason]}"
+            return f"{self.name}, {_IN_WORDS[self.reason]}"
         other = next(name for name in CANDIDATES if name != self.name)
         scores = self.psnr[self.judge]
         return (

@@ -104,7 +104,7 @@ class PhotographOptions:
         elif has_silhouettes(dataset.train):
             found = Background((1.0, 1.0, 1.0), "usual")
         else:
-            found = Background(BLACK, "given")  # covered by the fans themselves
+            found = Background(BLACK, "covered")
         return dataset.over(found.color), found
 
     def plan(self, folder: Path, config: TrainConfig, *, as_splats: bool = False, say: Say) -> Plan:
