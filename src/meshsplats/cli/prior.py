@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 # Layers on a base share a depth, which only the order of fragments knows.
-@tuning_options(lambda name: f"(default: {getattr(prior_config(), name)})", without=("order",))
+@tuning_options({"default": prior_config()}, without=("order",))
 class PriorTuningOptions(FinetuneConfig):
     """The optimisation."""
 

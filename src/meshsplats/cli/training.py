@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
@@ -46,14 +46,14 @@ _CHANGEABLE = {
 
 
 def tuning_options(
-    default_of: Callable[[str], str], without: Sequence[str] = ()
+    presets: Mapping[str, object], without: Sequence[str] = ()
 ) -> Callable[[type[Config]], type[Config]]:
-    """``as_cli_options`` for the configuration of an optimisation. ``default_of``: the end of an option's
-    help; ``without``: options that the command lacks."""
-    return as_cli_options(without=("preset", *LENGTHS, *without), defaults=default_of, checked=False)
+    """``as_cli_options`` for the configuration of an optimisation. The help of an option ends with its values
+    in ``presets``; ``without``: options that the command lacks."""
+    return as_cli_options(without=("preset", *LENGTHS, *without), defaults=of_presets(presets), checked=False)
 
 
-@tuning_options(of_presets(PRESETS))
+@tuning_options(PRESETS)
 class TuningOptions(FinetuneConfig):
     """In parentheses: the values of the presets."""
 

@@ -37,7 +37,8 @@ gains 0.8 to 1.5 and 0.3 to 1.1. Never a multiple of four entries (reason: ``ZOO
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """All options that change the result. The defaults are those of the preset 'default'.
+    """All options that change the result. The defaults are those of the preset 'default'; None stands for the
+    one that the text of an option names.
 
     Each step compares one rendered image with its target. The loss is ``(1 - ssim_weight) * L1 + ssim_weight
     * (1 - SSIM) + l2_weight * L2``, where L1 and L2 are the mean absolute and mean squared difference, and
@@ -60,7 +61,7 @@ class FinetuneConfig:
     """Adam's learning rate of the vertex positions, in ``position_unit``. 0: positions are fixed."""
     harmonics_rate: Annotated[float | None, Range(0, 1), Advanced] = None
     """Adam's learning rate of the spherical harmonics of splats, where the mesh has them. It falls as that of
-    colours does. 0: they stay. None: 0.02 for images of splats, 0.005 for photographs, which are few: what
+    colours does. 0: they stay. Default: 0.02 for images of splats, 0.005 for photographs, which are few: what
     they alone show, held-out ones do not."""
     position_unit: Annotated[Unit, Advanced] = "splat"
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
@@ -101,7 +102,7 @@ class FinetuneConfig:
     surfaces fades, and what is hidden behind others gets gradients. For opacity 'blended'."""
     exposure: Annotated[bool | None, With(opacity="blended")] = False
     """For photographs: fit a gain and an offset per colour channel for each training image, so that exposure
-    differences are not baked into the mesh. Their means over all images stay 1 and 0. None, for ``train``:
+    differences are not baked into the mesh. Their means over all images stay 1 and 0. Default of ``train``:
     where photographs are found to differ."""
     exposure_rate: Annotated[float, Range(1e-9, 1), With("exposure"), Advanced] = 0.002
     """Adam's learning rate of these gains and offsets."""
@@ -118,8 +119,8 @@ class FinetuneConfig:
     tracers draw. splat: whole splats by their centres, for programs that sort those; faster. file: as a .glb
     lists them, for web viewers and engines that sort nothing."""
     samples: Annotated[int | None, Range(1, 16)] = None
-    """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
-    photographs; 1 for images of a splat viewer (``Dataset.look``)."""
+    """Samples along each side of a pixel. Default: 2 for images that are means over each pixel's area, also
+    photographs; 1 for those of a splat viewer (``look`` splats)."""
     opacity: Literal["blended", "cutoff"] = "blended"
     """blended: translucent triangles. cutoff: opaque ones, for game engines."""
     cutoff: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 0.2
@@ -131,8 +132,8 @@ class FinetuneConfig:
     of images in which each fragment is opaque with its opacity as probability. It makes layers agree with the
     target one by one, not only in their mean."""
     settle_share: Annotated[float | None, Range(0, 1), With(opacity="cutoff"), Advanced] = None
-    """Before this last fraction of the run, triangles that the training views do not show are removed. None:
-    0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
+    """Before this last fraction of the run, triangles that the training views do not show are removed.
+    Default: 0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
     hidden_hits: Annotated[int, Range(0, 10**9), With(opacity="cutoff"), Advanced] = 1
     """Triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples a pixel, are
     removed. 0: none."""
@@ -151,17 +152,17 @@ class FinetuneConfig:
     pixel without averaging. 0: train on means only."""
     one_sample_share: Annotated[float | None, Range(0, 1), Advanced] = None
     """For photographs: for this initial fraction of the run, draw one sample per pixel, which takes half the
-    time. None: 0.85, or 0 for photographs with alpha, whose sharp outlines before a plain background lose by
-    it, and for opacity 'cutoff'."""
+    time. Default: 0.85, or 0 for photographs with alpha, whose sharp outlines before a plain background lose
+    by it, and for opacity 'cutoff'."""
     by_splat_share: Annotated[float | None, Range(0, 1), With(opacity="blended"), Advanced] = None
     """For this initial fraction of the run, splats are blended whole, by their centres, which takes two
-    thirds of the time of exact order; then they are in the order of the result. None: 0.6 for photographs,
+    thirds of the time of exact order; then they are in the order of the result. Default: 0.6 for photographs,
     0 for images of splats, where exact order is better in the same time. No difference with order 'splat'
     or 'file', and for meshes that do not know their splats."""
     dropout: Annotated[float | None, Range(0, 0.5), With(opacity="blended"), Advanced] = 0.0
     """Share of the splats that each step leaves out, at random, once each view was seen forty times; none
     until it was seen ten times. The others are more opaque by as much. Few photographs are learnt by heart
-    else. None: 0.15 for up to thirty photographs, less for more, and 0 from sixty on."""
+    else. Default of ``train``: 0.15 for up to thirty photographs, less for more, and 0 from sixty on."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of the order of the views, of random backgrounds and of what is left out. The same seed gives the
     same bits, with any number of threads, unless the length is given in minutes."""

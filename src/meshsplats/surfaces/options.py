@@ -27,11 +27,11 @@ class SurfaceOptions:
     """The options of ``make_surface``."""
 
     faces: Annotated[int | None, Range(0, 10_000_000)] = None
-    """Approximate largest number of triangles; 0: as many as the voxels give. None: 20,000 of closed
+    """Approximate largest number of triangles; 0: as many as the voxels give. Default: 20,000 of closed
     surfaces, 60,000 of open ones, or as many as an atlas can be made of."""
     texture: Annotated[int | None, Range(0, MAX_TEXTURE)] = None
-    """Side of the texture in texels; 0: colours of vertices instead. None: 2048 for closed surfaces, 4096 for
-    open ones."""
+    """Side of the texture in texels; 0: colours of vertices instead. Default: 2048 for closed surfaces, 4096
+    for open ones."""
     normal_map: Annotated[bool, With("texture")] = True
     """Keep the relief of the finest triangles as a normal map, of a quarter of the texture's side."""
     shape: Shape = "auto"
@@ -39,9 +39,9 @@ class SurfaceOptions:
     images see, for rooms, streets and gardens. floor: open, but for the ground below and between the views,
     for walking. auto: closed for objects, open for places."""
     resolution: Annotated[int | None, Range(8, MAX_RESOLUTION)] = None
-    """Voxels along the longest side, from whose surface triangles are made. Memory grows with its cube. None:
-    256; of open surfaces up to 512, where one sees much less far than they reach, as in the rooms of a
-    flat."""
+    """Voxels along the longest side, from whose surface triangles are made. Memory grows with its cube.
+    Default: 256; of open surfaces up to 512, where one sees much less far than they reach, as in the rooms of
+    a flat."""
     views: Annotated[int, Range(4, 1000)] = 64
     """Images that are made of the scene, from all around or, of a place, from within."""
     size: Annotated[int, Range(16, 4096)] = 800
@@ -50,7 +50,7 @@ class SurfaceOptions:
     """How often shape and texture are compared with each image; 0: the surface stays as fused, and has the
     mean colours of the images."""
     sh_degree: Annotated[int | None, Range(0, 3), Advanced] = None
-    """Largest degree of the splats' view-dependent colour in the images; None: all."""
+    """Largest degree of the splats' view-dependent colour in the images. Default: all."""
     move: Annotated[float, Range(0, 10), With("rounds"), Advanced] = 0.5
     """Step of the vertices, relative to the length of an edge."""
     stiffness: Annotated[float, Range(0, 1000), With("rounds"), Advanced] = 2.0

@@ -50,7 +50,7 @@ class TrainConfig(FinetuneConfig):
     exposure_rate: float = 0.01
     max_splats: Annotated[int | None, Range(1, 10**7)] = None
     """Largest number of fans. Default: 100,000; of large sets of unmasked photographs up to 200,000, one for
-    every 500 pixels."""
+    every 500 pixels, but not with ``as_splats``."""
     start_splats: Annotated[int | None, Range(1, 10**7)] = None
     """About the number of fans at the start, at most max_splats, which is the default. For masked
     photographs it is 40 % of it: growth puts the others where they are needed."""
