@@ -27,9 +27,13 @@ if TYPE_CHECKING:
 
 Kernel = Literal["3dgs", "antialiased", "2dgs"]
 
-LOW_PASS_PX2: Mapping[Kernel, float] = {"3dgs": 0.3, "antialiased": 0.3, "2dgs": 0.5}
-"""Variance in square pixels of the low-pass filter that splats of each kernel are drawn with, at any size of
-the image."""
+DILATION = 0.3
+"""Variance in square pixels that 3DGS adds to the projected covariance of splats, at any size of the
+image."""
+LOW_PASS_PX2: Mapping[Kernel, float] = {"3dgs": DILATION, "antialiased": DILATION, "2dgs": 0.5}
+"""Variance of the low-pass filter that splats of each kernel are drawn with, likewise."""
+LEAST_OPACITY = 1 / 255
+"""Opacity below which 3DGS draws nothing."""
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""

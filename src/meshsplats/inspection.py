@@ -28,7 +28,7 @@ from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_paths import splat_file
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import is_tileset
 
@@ -177,7 +177,7 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
         **({} if cloud.up is None else {"up": _rounded(cloud.up)}),
         **_extent(cloud.means, scene_bounds(cloud), cloud.origin),
         "opacity_5_50_95_percent": _quantiles(cloud.opacities),
-        "faint_splats": int((cloud.opacities < 1 / 255).sum()),
+        "faint_splats": int((cloud.opacities < LEAST_OPACITY).sum()),
         "scale_5_50_95_percent": _quantiles(ordered.mean(axis=1)),
         "flatness_median": float(np.float32(np.median(flatness))),
         "estimated_triangles": round(len(tried.faces) * share),

@@ -49,7 +49,7 @@ SCORED_TRIANGLES = 2_000_000
 """Triangles of a level that is only converted, times the views by which it is scored. Two splats of the
 ground truth count as a triangle."""
 
-FOOTPRINTS_PX2 = (0.05, 0.1, 0.2, 0.3)
+FOOTPRINTS_PX2 = (FILTER_PX2["area"]["3dgs"], 0.1, 0.2, 0.3)
 """Variances of the low-pass filter of coarse levels, square pixels, ascending: merged splats of about a pixel
 leave gaps without it. The first is that of ``convert``."""
 

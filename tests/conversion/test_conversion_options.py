@@ -10,7 +10,7 @@ from _splats import few_splats
 
 from meshsplats.camera import Camera
 from meshsplats.conversion import PRESETS, ConversionOptions, convert
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud
 
 CAMERA = Camera(np.eye(4), 100, 100, 32, 32, 64, 64)
 
@@ -243,6 +243,10 @@ def test_presets_state_every_choice():
             stated = getattr(preset, field.name)
             if stated is not None:
                 assert getattr(resolved, field.name) == stated
+
+
+def test_what_3dgs_never_draws_is_left_out_by_default():
+    assert PRESETS["default"].min_opacity == LEAST_OPACITY
 
 
 def test_up():

@@ -16,7 +16,6 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import ConversionOptions, convert
-from meshsplats.conversion.footprint import DRAWN_PX2
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
@@ -32,6 +31,7 @@ from meshsplats.finetuning.initial import (
 )
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
+from meshsplats.gaussians import DILATION
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
 from meshsplats.training import train_config
@@ -438,7 +438,7 @@ def test_splats_begin_as_wide_as_in_the_photographs():
         return views
 
     options = ConversionOptions()
-    assert for_photographs(options, cloud, photographs(48, 0.3)).footprint_px2 == DRAWN_PX2
+    assert for_photographs(options, cloud, photographs(48, 0.3)).footprint_px2 == DILATION
     smaller = photographs(48, 0.3 / 16)
     assert for_photographs(options, cloud, smaller) == options
     for other in (ConversionOptions(footprint_px2=0.1), ConversionOptions(footprint="none")):

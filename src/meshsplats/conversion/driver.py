@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from meshsplats.conversion.fan_sizes import Fans
-from meshsplats.conversion.footprint import DRAWN_PX2, SceneViews
+from meshsplats.conversion.footprint import SceneViews
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import within
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.gaussians import DILATION, GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 
 
@@ -38,7 +38,7 @@ def filter_of(kernel: Kernel, options: ConversionOptions) -> float:
             f"footprint='filter' draws as 3DGS does, but these splats are of kernel {kernel!r}, which"
             " filters in another way: choose another footprint, or none"
         )
-    return DRAWN_PX2 if options.footprint_px2 is None else float(options.footprint_px2)
+    return DILATION if options.footprint_px2 is None else float(options.footprint_px2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,13 +26,10 @@ FILTER_PX2: dict[str, dict[str, float]] = {
     "area": {"3dgs": 0.05, "antialiased": 0.05, "2dgs": 0.05},
     "splats": {"3dgs": 0.5, "antialiased": 0.4, "2dgs": 0.3},
 }
-"""Variance of the filter in square pixels, by look and kernel. 3DGS and its antialiased kernel add 0.3, 2DGS
-has 0.5; the values for 'splats' are the best from the distances of the given cameras to eight times as far.
-Means over a pixel's area need a filter only because a pixel has few samples: 0.03 to 0.08 gain 0.6 dB over
-none, and 0.5 loses 2 to 3 dB."""
-
-DRAWN_PX2 = 0.3
-"""Variance that 3DGS adds at any size of the image; that of the filter of a mesh that is drawn with one."""
+"""Variance of the filter in square pixels, by look and kernel. Splats are drawn with ``LOW_PASS_PX2``; the
+values for 'splats' are the best from the distances of the given cameras to eight times as far. Means over a
+pixel's area need a filter only because a pixel has few samples: 0.03 to 0.08 gain 0.6 dB over none, and 0.5
+loses 2 to 3 dB."""
 
 MAX_CAMERAS = 32
 """Of more cameras this many are used, evenly spaced in their order."""

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, usual_pixels, widen
+from meshsplats.conversion.footprint import FILTER_PX2, usual_pixels, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import DILATION, GaussianCloud
 from meshsplats.rendering.api import render_splats
 from meshsplats.rendering.layers import affordable
 from meshsplats.rendering.previews import preview_camera
@@ -39,7 +39,7 @@ def gap_share(cloud: GaussianCloud, threads: int | None = None) -> float:
         return 0.0
     shown, exact = (
         render_splats(cloud, camera, sh_degree=0, dilation=variance, threads=threads).alpha
-        for variance in (DRAWN_PX2, FILTER_PX2["area"][cloud.kernel])
+        for variance in (DILATION, FILTER_PX2["area"][cloud.kernel])
     )
     solid = shown > _SOLID
     inner = solid.copy()  # without outlines, which the filter moves
@@ -74,7 +74,7 @@ def without_gaps(cloud: GaussianCloud, threads: int | None = None, hint: str = "
     if gap_share(cloud, threads) < _SHARE:
         return cloud
     _warn(hint)
-    return replace(cloud, scales=widen(cloud.scales, usual_pixels(cloud), DRAWN_PX2, "3dgs"))
+    return replace(cloud, scales=widen(cloud.scales, usual_pixels(cloud), DILATION, "3dgs"))
 
 
 def _warn(hint: str) -> None:

@@ -28,10 +28,7 @@ from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import LOW_PASS_PX2, GaussianCloud, Kernel
-
-MIN_OPACITY = 1 / 255
-"""Opacity below which 3DGS draws nothing."""
+from meshsplats.gaussians import LEAST_OPACITY, LOW_PASS_PX2, GaussianCloud, Kernel
 
 BLOCK = 1 << 16
 """Splats that ``simplify_in_blocks`` merges at a time."""
@@ -138,7 +135,7 @@ def simplify_in_blocks(
     masses = _masses(cloud, low_pass)
     counted = pixels_of(cloud, masses, cameras, threads) if cameras else masses
     blocks = _blocks(cloud.means, np.arange(len(cloud)), block)
-    visible = np.array([(cloud.opacities[rows] >= MIN_OPACITY).sum() for rows in blocks])
+    visible = np.array([(cloud.opacities[rows] >= LEAST_OPACITY).sum() for rows in blocks])
     wanted = np.array([counted[rows].sum() for rows in blocks]) if cameras else visible
     shares = _shares(wanted, visible, max(count, FEWEST_OF_BLOCK * len(blocks)))
 
@@ -224,7 +221,7 @@ def _checked_width(low_pass: float | np.ndarray, n: int) -> np.ndarray:
 def _masses(cloud: GaussianCloud, low_pass: np.ndarray) -> np.ndarray:
     """(n,) float64 masses of splats, 0 for those that are never drawn."""
     area = mean_shadow(disc_areas(_drawn(cloud.scales, low_pass, cloud.kernel)))
-    return np.where(cloud.opacities < MIN_OPACITY, 0, optical_depth(cloud.opacities) * area)
+    return np.where(cloud.opacities < LEAST_OPACITY, 0, optical_depth(cloud.opacities) * area)
 
 
 def optical_depth(opacity: np.ndarray) -> np.ndarray:
@@ -314,7 +311,7 @@ def _merged(
     depth = _depths(mass, _drawn(scales, width, cloud.kernel))
     dense = depth > DENSE
     if dense.any():
-        inside = groups.order[dense[own[groups.order]] & (part.opacities[groups.order] >= MIN_OPACITY)]
+        inside = groups.order[dense[own[groups.order]] & (part.opacities[groups.order] >= LEAST_OPACITY)]
         filtered = 0.0 if cloud.kernel == "antialiased" else np.square(low_pass[rows[inside]])
         parts = Parts(
             (np.cumsum(dense) - 1)[own[inside]],

@@ -13,12 +13,12 @@ from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.detail import OnImage
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverage
+from meshsplats.conversion.footprint import FILTER_PX2, CameraCoverage
 from meshsplats.conversion.options import FLAT_SIDES, make_options
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.config import FinetuneConfig, is_long
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import DILATION, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.order import Order, checked_order
 from meshsplats.rendering import render_splats
@@ -103,7 +103,7 @@ def for_photographs(
 ) -> ConversionOptions:
     """``options`` with the footprint by which ``cloud`` looks most like ``views``, if these are photographs.
 
-    3DGS widens splats by ``DRAWN_PX2`` in the photographs that it trains on: their own size is too small
+    3DGS widens splats by ``DILATION`` in the photographs that it trains on: their own size is too small
     there, and right where these photographs are much smaller than those. Options that say something of the
     footprint, and splats of other kernels, stay.
     """
@@ -113,7 +113,7 @@ def for_photographs(
     if not views or are_rendered(views):
         return options
     of_areas = FILTER_PX2["area"][cloud.kernel]
-    errors = dict.fromkeys((of_areas, DRAWN_PX2), 0.0)
+    errors = dict.fromkeys((of_areas, DILATION), 0.0)
     for view in views:
         image = view.load()
         weight = 1.0 if image.mask is None else image.mask[..., None]
@@ -123,8 +123,8 @@ def for_photographs(
                 cloud, view.camera, background=view.background, samples=2, dilation=px2, threads=threads
             )
             errors[px2] += float((weight * (drawn.color.clip(0, 1) - target) ** 2).mean())
-    wider = errors[DRAWN_PX2] < errors[of_areas]
-    return replace(options, footprint_px2=DRAWN_PX2) if wider else options
+    wider = errors[DILATION] < errors[of_areas]
+    return replace(options, footprint_px2=DILATION) if wider else options
 
 
 def _is_for_images_of_splats(options: ConversionOptions, config: FinetuneConfig | None) -> bool:

@@ -13,8 +13,7 @@ from meshsplats.formats._display import display_cloud
 from meshsplats.formats.content import Content
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.ply.activated import Activated, checked_activated
-from meshsplats.formats.ply.motion import VISIBLE
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud, Kernel
 
 Axes = Literal["auto", "y-down", "y-up"]
 
@@ -58,7 +57,7 @@ class Reading:
         """``cloud`` of ``splats`` with display colours, up, and the kernel that is asked for; of moving
         splats those that are visible at the instant."""
         if splats.instant is not None:
-            cloud = cloud.take(cloud.opacities >= VISIBLE)
+            cloud = cloud.take(cloud.opacities >= LEAST_OPACITY)
         if splats.linear:
             cloud = display_cloud(cloud)
         if splats.up is not None:

@@ -12,7 +12,7 @@ from meshsplats._core import library, structures
 from meshsplats._kinds import each, need, need_numbers
 from meshsplats.camera import Camera
 from meshsplats.choices import Device
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import DILATION, LOW_PASS_PX2, GaussianCloud
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
 from meshsplats.order import Order, checked_order
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
@@ -221,7 +221,7 @@ def render_splats(
     background: Sequence[float] | np.ndarray = (1, 1, 1),
     samples: int = 1,
     sh_degree: int | None = None,
-    dilation: float = 0.3,
+    dilation: float = DILATION,
     threads: int | None = None,
 ) -> Rendering:
     """The image of the splats themselves, as 3D Gaussian Splatting draws them.
@@ -274,7 +274,7 @@ def render_splats(
         sh_stored=cloud.sh.shape[1],
         sh_used=(degree + 1) ** 2,
         kernel=("3dgs", "antialiased", "2dgs").index(cloud.kernel),
-        dilation=0.5 * (dilation / 0.3) if cloud.kernel == "2dgs" else dilation,
+        dilation=LOW_PASS_PX2["2dgs"] * (dilation / DILATION) if cloud.kernel == "2dgs" else dilation,
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)

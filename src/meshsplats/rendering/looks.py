@@ -12,7 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.choices import Device, Look
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.draw_order import DrawOrder
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import DILATION, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import Rendering, render, render_splats
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
@@ -26,9 +26,6 @@ GROUND_TRUTHS: dict[Look, str] = {
 
 AREA = 4
 """The mean over a pixel's area is taken from an image this many times as large."""
-
-DILATION = 0.3
-"""Variance of the filter of 3DGS, square pixels."""
 
 
 def check_look(look: str) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import DILATION, LEAST_OPACITY, GaussianCloud
 from meshsplats.rendering.api import Rendering
 from meshsplats.rendering.reference_samples import (
     checked_background,
@@ -17,8 +17,6 @@ from meshsplats.rendering.reference_samples import (
     to_camera,
 )
 
-SPLAT_MIN_ALPHA = 1 / 255
-"""Splats fainter than this at a sample are left out there, as in 3DGS."""
 SPLAT_MAX_ALPHA = 0.99
 """No splat is more opaque than this at a sample, as in 3DGS."""
 SPLAT_MIN_TRANSMITTANCE = 1e-4
@@ -32,7 +30,7 @@ def render_splats(
     background: Sequence[float] | np.ndarray = (1, 1, 1),
     samples: int = 1,
     sh_degree: int | None = None,
-    dilation: float = 0.3,
+    dilation: float = DILATION,
 ) -> Rendering:
     """The image of splats as 3D Gaussian Splatting draws it (Kerbl et al. 2023). Arrays are float64.
 
@@ -71,7 +69,7 @@ def render_splats(
         else:
             falloff = _projected_falloff(centers[i], axes[i], scales[i], camera, x, y, dilation, cloud.kernel)
         alpha = np.minimum(SPLAT_MAX_ALPHA, opacities[i] * falloff)
-        drawn = unfinished & (alpha >= SPLAT_MIN_ALPHA)
+        drawn = unfinished & (alpha >= LEAST_OPACITY)
         after = transmittance * (1 - alpha)
         unfinished &= ~(drawn & (after < SPLAT_MIN_TRANSMITTANCE))
         drawn &= unfinished

@@ -19,10 +19,9 @@ from meshsplats.finetuning.run import Progress, TrainingLoop, run_start
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import for_views
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.gaussians import DILATION, SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Need
-from meshsplats.rendering.looks import DILATION
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growth import corners_of, fan_count, select_fans

@@ -17,7 +17,7 @@ from meshsplats._geometry import level_axes, rotation_rows
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.gaussians import DILATION, SH_C0, GaussianCloud
 from meshsplats.rendering.api import Rendering, render_splats
 from meshsplats.viewpoints.thinning import ByPlace, largest, sizes_of, without_harmonics
 
@@ -127,7 +127,7 @@ class AllSplats:
             camera,
             background=(0, 0, 0),
             threads=self.threads,
-            dilation=0.3 * (camera.width / sharp_side) ** 2,
+            dilation=DILATION * (camera.width / sharp_side) ** 2,
         )
         alpha = image.alpha.astype(np.float64)
         mean = image.color / np.maximum(alpha, 1e-6)[..., None]
@@ -261,7 +261,7 @@ class Sample:
             self._face(place, k),
             background=(0, 0, 0),
             threads=1,
-            dilation=0.3 * (SIDE / SHARP_SIDE) ** 2,
+            dilation=DILATION * (SIDE / SHARP_SIDE) ** 2,
         )
 
     def depth_along(self, depth: np.ndarray, gaze: np.ndarray) -> float:

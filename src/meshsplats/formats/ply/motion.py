@@ -23,8 +23,6 @@ from meshsplats._geometry import quaternions_of
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.splats._cloud_builder import SplatRows
 
-VISIBLE = 1 / 255
-"""Splats of less opacity than this at the instant are left out: they would be no part of its image."""
 _CUT = 0.05
 """4D Gaussian Splatting does not draw a splat whose opacity time has lowered to this share."""
 _UNKNOWN = {

@@ -21,7 +21,7 @@ from meshsplats.formats._orientation import HALF_TURN_X
 from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, order_for_streams
 from meshsplats.formats.splats._spz_layout import ANTIALIASED, COLOR_SCALE, MAGIC, REST, zstandard_modules
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud
 
 _FEWEST_BITS, _MOST_BITS = 12, 22
 _STEPS = 8
@@ -30,8 +30,6 @@ _SMALLEST, _LARGEST = math.exp(-10), math.exp(255 / 16 - 10)
 """Range of deviations, scene units."""
 _STEP = math.exp(1 / 16)
 """Of deviations, a factor."""
-_VISIBLE = 1 / 255
-"""Least opacity that renderers draw."""
 _SHOWS = 10
 """What is smaller than a tenth of most splats, and becomes no larger than that, does not show."""
 _FIRST_BUCKET, _BUCKET = 8, 16
@@ -114,7 +112,7 @@ def _usual_size(cloud: GaussianCloud) -> float:
 def _warn_of_sizes(cloud: GaussianCloud, where: object) -> None:
     """Warns of visible splats that the range of scales makes smaller, or larger where that shows: of a scene
     whose splats are small as a whole."""
-    sizes = np.sort(cloud.scales[cloud.opacities >= _VISIBLE], axis=1)
+    sizes = np.sort(cloud.scales[cloud.opacities >= LEAST_OPACITY], axis=1)
     smaller = int((sizes[:, 2] > _LARGEST * _STEP).sum())
     shows = _usual_size(cloud) < _SHOWS * _SMALLEST
     larger = int((sizes[:, 1] < _SMALLEST / _STEP).sum()) if shows else 0
