@@ -9,7 +9,7 @@ register(
         "conda": {
             "environment_name": "meshsplats",
             "python_version": "3.11",
-            "install_script": "pip install meshsplats\n",
+            "install_script": "pip install /path/to/meshsplats\n",  # yours: a clone or a wheel
         },
         "metadata": {
             "name": "MeshSplats",

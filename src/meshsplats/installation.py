@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from meshsplats.errors import PACKAGE
+
 if TYPE_CHECKING:
     from meshsplats.camera import Camera
     from meshsplats.choices import Device
@@ -69,8 +71,8 @@ def in_words(findings: dict[str, Any]) -> list[str]:
         missing = findings["to_install"].get(extra)
         advice = f"; to install: pip install {missing}" if missing else ""
         if missing and extra == "blender":
-            where = "in an environment of its own with Python 3.11 or 3.13"
-            advice = f"; to install, {where}: pip install {missing}"
+            where = "in an environment of its own with Python 3.11 or 3.13, from a clone or a wheel"
+            advice = f"; to install, {where}: pip install '{PACKAGE}[blender]'"
         lines.append(f"extra {extra!r}: {_listed(libraries)}{advice}")
     return lines
 

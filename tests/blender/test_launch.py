@@ -47,7 +47,8 @@ def program(tmp_path):
 def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bpy" else real(name))
-    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[blender\]'.*--executable"):
+    install = r"blender-env/bin/pip install '/path/to/meshsplats\[blender\]'"
+    with pytest.raises(MissingDependencyError, match=rf"{install}.*--executable"):
         draw(random_mesh(3), cameras()[:1], images=["a.png"])
 
 

@@ -24,7 +24,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main, messages
 from meshsplats.cli.arguments import Command
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.errors import PACKAGE, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud
@@ -302,11 +302,13 @@ def test_doctor(capsys, monkeypatch):
 
     from meshsplats import installation
 
-    monkeypatch.setattr(installation.metadata, "requires", lambda _: ["no-such-thing>=1; extra == 'blender'"])
+    needed = [f"no-such-thing>=1; extra == {extra!r}" for extra in ("gpu", "blender")]
+    monkeypatch.setattr(installation.metadata, "requires", lambda _: needed)
     monkeypatch.setattr(installation, "_draws", lambda *_: False)
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
-    assert f"pip install {quoted('no-such-thing>=1')}" in out
+    assert f"pip install {quoted('no-such-thing>=1')}\n" in out
+    assert f"from a clone or a wheel: pip install '{PACKAGE}[blender]'\n" in out
     assert "DOES NOT WORK" in out
 
 

@@ -21,6 +21,7 @@ from meshsplats._core.structures import (
     SplatsStruct,
     VertexGradientsStruct,
 )
+from meshsplats.errors import PACKAGE
 
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
@@ -78,8 +79,8 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
     available = available_variants()
     if not available:
         raise ImportError(
-            "the compiled core of meshsplats is missing: install the package (pip install meshsplats, or"
-            " pip install . in a source tree) instead of running it from its sources"
+            "the compiled core of meshsplats is missing: install the package from a clone or a wheel (pip"
+            f" install {PACKAGE}) instead of running it from its sources"
         )
     wanted = variant or os.environ.get("MESHSPLATS_VARIANT") or available[0]
     if wanted not in available:

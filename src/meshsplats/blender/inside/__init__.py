@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import sys
 
+from meshsplats.errors import PACKAGE
+
 _PYTHONS = ((3, 11), (3, 13))
 _HERE = "" if sys.version_info[:2] in _PYTHONS else f" (this is {sys.version_info[0]}.{sys.version_info[1]})"
 MISSING = (
     "Blender's Python module bpy is not installed in this environment. Make one for it, as it needs Python"
     f" 3.11 or 3.13{_HERE} and a NumPy of its own: python3.11 -m venv blender-env && blender-env/bin/pip"
-    " install 'meshsplats[blender]'; or name an installed Blender: --executable /path/to/blender"
+    f" install '{PACKAGE}[blender]', which is a clone or a wheel; or name an installed Blender: --executable"
+    " /path/to/blender"
 )
 """Message for a missing bpy."""
