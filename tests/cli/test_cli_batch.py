@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 import os
+import re
 import sys
 import zipfile
 from dataclasses import replace
@@ -372,6 +373,19 @@ def test_fidelity_is_that_of_compare(scans, tmp_path, capsys):
     assert printed["views"] == 2
     assert printed["psnr"] == pytest.approx(wanted.psnr, abs=1e-6)
     assert printed["ssim"] == pytest.approx(wanted.ssim, abs=1e-6)
+
+
+def test_the_records_in_the_documents_are_like_real_ones(scans, capsys):
+    page = Path(__file__).parents[2] / "docs" / "pipelines.md"
+    text = page.read_text("utf-8").partition("```json\n")[2].partition("```")[0]
+    documented = [json.loads("{" + record) for record in re.split(r"^\{", text, flags=re.MULTILINE)[1:]]
+    options = ["--formats", "glb", "--fidelity", "1", "--json", "--no-sidecar"]
+    assert run("scans/a.ply", "scans/broken.ply", "-o", "out", *options) == 1
+    made, failed = lines(capsys.readouterr().out)
+    assert [set(record) for record in documented] == [set(made), set(failed)]
+    assert set(documented[1]["error"]) == set(failed["error"])
+    for part in ("alpha", "seconds", "fidelity"):
+        assert set(documented[0][part]) == set(made[part])
 
 
 def test_what_is_cut_off_does_not_count(scans, capsys):
