@@ -92,6 +92,7 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
 
     whole = printed_help(name, "--help-all", capsys)
     assert "``" not in whole
+    assert "None" not in whole, "no value of a shell"
     assert flags_in(whole) == flags(every)
     others = [name for name in options if name not in every]
     listed = f"--set NAME=VALUE sets further options (docs/options.md): {', '.join(others)}."
