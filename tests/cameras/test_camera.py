@@ -17,7 +17,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.framing import front_axes, guess_up, scene_bounds, weighted_quantile
 from meshsplats.cameras.placing import inside_cameras, outside_cameras
-from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
+from meshsplats.cameras.trajectories import distance_of, dome, look_around, look_at, orbit
 from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -169,6 +169,12 @@ def test_dome_is_even_and_upper():
         # No two cameras sit together: n evenly spread points are about sqrt(4 pi / n) from their neighbours.
         apart = np.linalg.norm(d[:, None] - d[None], axis=2) + 9 * np.eye(400)
         assert apart.min() > 0.6 * np.sqrt((4 if whole else 2) * np.pi / 400)
+
+
+def test_the_distance_of_a_camera_is_that_from_which_it_frames_the_subject():
+    """Whatever its near plane: levels in Blender change by it."""
+    for camera in (dome(ball(), 3, target=(1, 2, 3))[1], orbit(ball(), 3, target=(1, 2, 3))[2]):
+        assert distance_of(camera) == pytest.approx(np.linalg.norm(camera.center - (1, 2, 3)))
 
 
 def test_look_around_turns_to_the_right():

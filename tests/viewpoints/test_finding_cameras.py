@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,11 +20,12 @@ from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras, first_impression, varied
 from meshsplats.viewpoints.kind import fineness_outside
+from meshsplats.viewpoints.relief import Relief
 from meshsplats.viewpoints.sample import AllSplats, Sample
 from meshsplats.viewpoints.search import find_places
 from meshsplats.viewpoints.thinning import ByPlace, probabilities, sizes_of
 from meshsplats.viewpoints.upright import find_upright, height_over_width
-from meshsplats.viewpoints.views import Checked, Chooser
+from meshsplats.viewpoints.views import SIDE, Checked, Chooser, check, depth_of
 
 HALF = np.array([2.0, 1.3, 3.0])
 """Half the width, height and length of the room; y points down."""
@@ -204,8 +206,19 @@ def test_more_views_than_can_be_found_are_variations(found):
     assert len({camera.world_to_camera.tobytes() for camera in many}) == 40
     for i, camera in enumerate(many):
         parent = found.cameras[i % COUNT]
-        assert np.linalg.norm(camera.center - parent.center) < 0.2 * parent.near / 0.02
+        assert np.linalg.norm(camera.center - parent.center) < 0.2 * depth_of(parent)
         assert camera.world_to_camera[2, :3] @ parent.world_to_camera[2, :3] > np.cos(np.radians(12))
+
+
+def test_the_depth_of_a_view_is_that_by_which_it_was_made():
+    """Whatever its lens and near plane: extents of scenes and variations of views follow from it."""
+    image = np.zeros((SIDE, SIDE))
+    sample = SimpleNamespace(whole=SimpleNamespace(look=lambda camera: (image, image, image)))
+    view = check(sample, np.zeros(3), np.array([0, 0, 1.0]), 7.0, np.array([0, -1.0, 0]), 0.01)
+    assert depth_of(view.camera) == pytest.approx(7)
+    assert depth_of(view.with_lens(0, 800, 600)) == pytest.approx(7)
+    relief = Relief(np.zeros(3), np.array([0, 0, 7.0]), np.array([0, -1.0, 0]), (0.5, 0.5), 0.1, 1.0)
+    assert [depth_of(camera) for camera in relief.cameras(3, 80, 60)] == pytest.approx([7] * 3)
 
 
 def test_the_widest_lens_of_a_good_picture(found):

@@ -24,7 +24,8 @@ from meshsplats.cameras.framing import (
 )
 
 NEAR_SHARE = 0.01
-"""Near plane of these cameras as a share of their distance from the subject's middle."""
+"""Near plane of these cameras as a share of their distance from the subject's middle, which ``distance_of``
+has from it again."""
 
 
 def look_at(
@@ -214,6 +215,12 @@ def around_subject(
         look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)
         for i, d in enumerate(directions)
     ]
+
+
+def distance_of(camera: Camera) -> float:
+    """Distance, scene units, of a camera of ``orbit`` or ``dome`` from the middle of the subject."""
+    assert camera.near is not None
+    return camera.near / NEAR_SHARE
 
 
 def _checked_count(count: int) -> int:

@@ -38,7 +38,7 @@ from meshsplats.viewpoints.sample import SMALL_SAMPLE, Sample
 from meshsplats.viewpoints.search import FEW, Places, find_places
 from meshsplats.viewpoints.standing import SEEN, find_stance, finer_stance, tips_over
 from meshsplats.viewpoints.upright import MEASURED, find_upright
-from meshsplats.viewpoints.views import NEAR_SHARE, NEARLY, Checked, choose_views
+from meshsplats.viewpoints.views import NEARLY, Checked, choose_views, depth_of
 
 MOST = 96
 """Views that are looked for, each checked with all splats; more are variations of these."""
@@ -201,7 +201,7 @@ def find_cameras(
         views = choose_views(sample, places, scene.up, wanted, around=scene.kind == "ring")
         found = _searched[cloud] = _Search(key, wanted, kind != "object", scene, views)
     shown = [view.with_lens(lens, width, height) for view, lens in found.views[:count]]
-    extent = float(np.median([_depth(camera) for camera in shown]))
+    extent = float(np.median([depth_of(camera) for camera in shown]))
     cameras = [replace(camera, name=f"view_{i:04d}") for i, camera in enumerate(varied(shown, count))]
     return replace(found.scene, extent=extent, cameras=tuple(cameras))
 
@@ -361,17 +361,12 @@ def _within(
     return FoundCameras(kind, confidence, up, sure, upright.ground, extent, ())
 
 
-def _depth(camera: Camera) -> float:
-    assert camera.near is not None
-    return camera.near / NEAR_SHARE
-
-
 def varied(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """``count`` cameras: the given ones, then variations of them from nearby; every third one is wide."""
     views = list(cameras[:count])
     for i in range(len(views), count):
         camera = cameras[i % len(cameras)]
-        depth = _depth(camera)
+        depth = depth_of(camera)
         x, y, z = 2 * ((0.5 + np.array([*STEPS]) * i) % 1) - 1
         matrix = np.eye(4)
         matrix[:3, :3] = _turned(np.radians(TURN) * x, np.radians(TURN) * y)

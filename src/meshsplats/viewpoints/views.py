@@ -52,7 +52,7 @@ POOL = 24
 PATIENCE = 40
 """So many views in a row that are no good pictures, and no more are looked for."""
 NEAR_SHARE = 0.02
-"""Near plane as a share of the mean depth of the view."""
+"""Near plane as a share of the mean depth of the view, which ``depth_of`` has from it again."""
 STEPS_BACK = (1.3, 1.15, 1.0)
 """Distances to a subject from which a scene may open, as multiples of that of the view that is turned to it:
 the whole subject is to be in the image, where photographs may show a part."""
@@ -62,6 +62,12 @@ POOR_BESIDE = 0.35
 """Greatest share of poor pixels in an opening view of a subject, beside which they lie."""
 CROSSINGS = 8
 """Rounds in which the point is found that most lines of sight pass."""
+
+
+def depth_of(camera: Camera) -> float:
+    """Mean depth, scene units, of a view that was found."""
+    assert camera.near is not None
+    return camera.near / NEAR_SHARE
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.meshes import world_points
-from meshsplats.cameras.trajectories import NEAR_SHARE, dome
+from meshsplats.cameras.trajectories import distance_of, dome
 
 CHAIN = "meshsplats_levels"
 """Property of a chain's collection: count of its levels."""
@@ -177,6 +177,5 @@ def _framing(chain: Any) -> tuple[np.ndarray, float]:
     if not len(points):
         raise ValueError(f"{chain.name} has no visible vertices")
     camera = dome(points, 32, up=(0.0, 0.0, 1.0), width=100, height=100, fov=_FOV)[0]
-    assert camera.near is not None
-    away = camera.near / NEAR_SHARE
+    away = distance_of(camera)
     return camera.center + away * camera.world_to_camera[2, :3], away
