@@ -141,6 +141,12 @@ def test_recorded_files_belong_to_scripts_and_are_linked_from_the_first_screen()
             assert results_of(script) == path.name, f"{path.name} has figures of {script.name}"
 
 
+def test_the_first_screen_says_where_scripts_without_a_file_have_their_figures():
+    first = (FOLDER / "RESULTS.md").read_text("utf-8")
+    alone = [script for script in SCRIPTS if not (FOLDER / "results" / results_of(script)).exists()]
+    assert [name_of(script) for script in alone if f"`{name_of(script)}`" not in first] == []
+
+
 def test_the_source_names_results_that_exist():
     for path in [*(ROOT / "src").rglob("*.py"), *(ROOT / "tools").rglob("*.py")]:
         for name in re.findall(r"benchmarks/[\w/]+\.\w+", path.read_text("utf-8")):
