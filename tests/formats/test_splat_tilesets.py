@@ -186,6 +186,8 @@ for _ in range(70):
         (tile("0.glb", refine="SUBTRACT"), "refine must be ADD or REPLACE, got 'SUBTRACT'"),
         (tile("0.glb", implicitTiling={}), "implicit tiling is not read"),
         (tile("0.glb", transform=[1, 2]), "a transform must be 16 numbers"),
+        (tile("0.glb", transform=[True] * 16), "a transform must be 16 numbers"),
+        (tile("0.glb", transform=[1e40] * 16), "a transform must be 16 numbers"),
         (tile("0.glb", transform=[1.0] * 16), "a transform must end in 0 0 0 1"),
         (tile("0.glb", transform=[0] * 15 + [1]), "flattens space"),
         (tile("0.glb", children=[3]), "children of a tile must be a list of objects"),

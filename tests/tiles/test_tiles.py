@@ -633,8 +633,8 @@ def test_a_tileset_inside_itself_ends(tileset, tmp_path):
         } | {"content": {"uri": "tileset.json"}}
 
     monkey = pytest.MonkeyPatch()
-    monkey.setattr("meshsplats.tiles.tileset._MAX_TILES", 500)
-    with pytest.raises(FileFormatError, match="nested too deeply, or too many"):
+    monkey.setattr("meshsplats.formats.gltf.tileset_file.MAX_TILES", 500)
+    with pytest.raises(FileFormatError, match="nested too deeply, or too many: 64 levels and 500 tiles"):
         list(Tileset(broken(tileset, tmp_path, loop)).tiles())
     monkey.undo()
 

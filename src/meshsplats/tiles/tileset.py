@@ -8,20 +8,17 @@ in a folder of its own, so that no file grows with the scene.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
 from meshsplats import __version__
 from meshsplats._files.atomic import write_text
 from meshsplats._geometry import away_from_ground
-from meshsplats._json import read_json
 from meshsplats._kinds import need_path
 from meshsplats._origin import FAR
 from meshsplats.camera import Camera
@@ -30,6 +27,16 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import tile_frame
 from meshsplats.formats.gltf.splat_tiles import CONTENT
 from meshsplats.formats.gltf.splat_tilesets import axes_of
+from meshsplats.formats.gltf.tileset_file import (
+    LARGEST,
+    check_tree,
+    file_below,
+    is_number,
+    numbers,
+    object_in,
+    objects_in,
+    read_tileset,
+)
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import NAME
@@ -37,12 +44,8 @@ from meshsplats.tiles import NAME
 LEVELS_PER_FILE = 3
 GROW = 1e-6
 """Boxes are larger than their content by this share, so that rounding leaves nothing outside."""
-_MAX_BYTES = 64 << 20
-_MAX_TILES = 1 << 22
-_MAX_DEPTH = 64
 _TILE_FILE = re.compile(r"([0-7]+/)*(tileset\.json|(root|[0-7]+)\.glb)")
 """Paths of ``tile_path`` and of tileset files."""
-_PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
 
 
 @dataclass(frozen=True)
@@ -274,7 +277,7 @@ class Tileset:
         note = _object(_object(document, "extras", self.path), "meshsplats", self.path)
         if note.get("contents") == "splats":
             raise FileFormatError(f"{self.path}: a tileset of splats, not of meshes: load_gaussians reads it")
-        up = _numbers(note.get("up"), 3, "the up direction", self.path)
+        up = numbers(note.get("up"), 3, "the up direction", self.path)
         if not up.any():
             raise FileFormatError(f"{self.path}: the up direction must not be 0")
         self.up = up / np.linalg.norm(up)
@@ -284,7 +287,7 @@ class Tileset:
         self.origin = np.zeros(3)
         """(3,) float64 point of the world that the tiles are relative to."""
         if "origin" in note:
-            self.origin = _numbers(note["origin"], 3, "the origin", self.path)
+            self.origin = numbers(note["origin"], 3, "the origin", self.path)
         self._axes: np.ndarray | None = None
         if "axes" in note:
             self._axes = axes_of(note["axes"], self.path)
@@ -328,7 +331,7 @@ class Tileset:
         """The entry of the root without its transform, which must be the one to the origin."""
         entry = dict(_object(document, "root", self.path))
         if "transform" in entry or self.origin.any():
-            found = _numbers(entry.pop("transform", None), 16, "the transform of the root", self.path)
+            found = numbers(entry.pop("transform", None), 16, "the transform of the root", self.path)
             wanted = np.array(_transform(self.up, self.origin, self._axes))
             if np.abs(found - wanted).max() > 1e-9 * max(1.0, float(np.abs(wanted).max())):
                 raise FileFormatError(
@@ -339,18 +342,14 @@ class Tileset:
 
     def _tile(self, entry: dict[str, Any], file: Path, depth: int) -> Tile:
         self._count += 1
-        if depth > _MAX_DEPTH or self._count > _MAX_TILES:
-            raise FileFormatError(f"{file}: tiles are nested too deeply, or too many")
+        check_tree(depth, self._count, file)
         if entry.get("refine", "REPLACE") != "REPLACE" or "transform" in entry or "implicitTiling" in entry:
             raise FileFormatError(f"{file}: only explicit tiles that replace their parents are read")
-        box = _numbers(_object(entry, "boundingVolume", file).get("box"), 12, "a bounding box", file)
-        uri = _object(entry, "content", file).get("uri")
-        content = _beside(file, uri)
+        box = numbers(_object(entry, "boundingVolume", file).get("box"), 12, "a bounding box", file)
+        content = _content(entry, file)
         is_file = content.suffix == ".json"
         extras = {} if is_file else _object(entry, "extras", file)
-        children = entry.get("children", [])
-        if not isinstance(children, list) or not all(isinstance(child, dict) for child in children):
-            raise FileFormatError(f"{file}: children of a tile must be a list of objects")
+        children = objects_in(entry, "children", file)
         if is_file and children:
             raise FileFormatError(f"{file}: a tile whose content is a tileset must have no children")
         tile = Tile(
@@ -371,36 +370,22 @@ class Tileset:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    document = read_json(path, _MAX_BYTES)
-    if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
-        raise FileFormatError(f"{path}: no tileset file: it has no object 'asset'")
-    version = document["asset"].get("version")
-    if version != "1.1":
-        raise FileFormatError(f"{path}: 3D Tiles of version {str(version)[:20]!r}; 1.1 is read")
-    return document
+    return read_tileset(path, ("1.1",))
 
 
 def _object(owner: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
-    value = owner.get(key)
-    if isinstance(value, dict):
-        return value
-    if key in ("extras", "meshsplats"):
+    """``object_in`` of a tileset of ours: one of others has no notes."""
+    if key in ("extras", "meshsplats") and not isinstance(owner.get(key), dict):
         raise FileFormatError(
             f"{path}: a tileset of another program; only those of 'meshsplats tiles' are read"
         )
-    raise FileFormatError(f"{path}: {key!r} must be an object, got {str(value)[:40]}")
-
-
-def _numbers(value: Any, count: int, what: str, path: Path) -> np.ndarray:
-    good = isinstance(value, list) and len(value) == count
-    if not good or not all(_is_number(x) and abs(x) < 1e39 for x in value):
-        raise FileFormatError(f"{path}: {what} must be {count} numbers, got {str(value)[:60]}")
-    return np.array(value, np.float64)
+    found: dict[str, Any] = object_in(owner, key, path)
+    return found
 
 
 def _error(owner: dict[str, Any], path: Path) -> float:
     value: Any = owner.get("geometricError")
-    if not _is_number(value) or not 0 <= value < 1e39:
+    if not is_number(value) or not 0 <= value < LARGEST:
         raise FileFormatError(f"{path}: geometricError must be a number >= 0, got {str(value)[:40]}")
     return float(value)
 
@@ -411,18 +396,9 @@ def _whole(value: Any, what: str, path: Path) -> int:
     raise FileFormatError(f"{path}: the count of {what} must be a whole number, got {str(value)[:40]}")
 
 
-def _is_number(value: Any) -> bool:
-    if isinstance(value, float):
-        return math.isfinite(value)
-    return isinstance(value, int) and not isinstance(value, bool)  # of any length
-
-
-def _beside(file: Path, uri: Any) -> Path:
-    """The file that ``uri`` names, below the folder of ``file``."""
-    name = unquote(uri) if isinstance(uri, str) else ""
-    if not _PLAIN.fullmatch(name) or any(part in (".", "..") for part in name.split("/")):
-        raise FileFormatError(f"{file}: it refers to {str(uri)[:80]!r}, no path below its folder; refused")
-    path = file.parent / name
+def _content(tile: dict[str, Any], file: Path) -> Path:
+    """The mesh of a ``tile`` of ``file``, or another tileset file."""
+    path = file_below(file, object_in(_object(tile, "content", file), "uri", file, str))
     if path.suffix not in (".glb", ".json"):
-        raise FileFormatError(f"{file}: tiles must be .glb files, got {str(uri)[:80]!r}")
+        raise FileFormatError(f"{file}: tiles must be .glb files, got {path.name[:80]!r}")
     return path

@@ -8,24 +8,29 @@ https://docs.ogc.org/cs/22-025r4/22-025r4.html.
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import unquote
 
 import numpy as np
 
 from meshsplats._geometry import away_from_ground
-from meshsplats._json import json_object
 from meshsplats._origin import choose_origin, sampled
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._orientation import TO_Z_UP, tile_frame
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.splats import names_splats, placed_clouds, splat_document
+from meshsplats.formats.gltf.tileset_file import (
+    check_tree,
+    file_below,
+    numbers,
+    object_in,
+    objects_in,
+    read_tileset,
+)
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import joined_within
@@ -35,10 +40,6 @@ FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """To x right, y down, z forward, in tilesets of others; ours say from where they were turned."""
 _TO_Z_UP = np.eye(4)
 _TO_Z_UP[:3, :3] = TO_Z_UP
-_MAX_BYTES = 64 << 20
-_MAX_TILES = 1 << 20
-_MAX_DEPTH = 64
-_PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
 _LOOKED_AT = 8
 """Tiles that tell whether a tileset is one of splats."""
 _LEGACY = {b"b3dm", b"i3dm", b"pnts", b"cmpt", b"subt"}
@@ -81,7 +82,7 @@ class _Tree:
         self.of_meshes = note is not None
         if isinstance(note, dict) and note.get("contents") == "splats":
             self.of_meshes = False
-            self.own_up = self._numbers(note.get("up"), 3, "the up direction", path)
+            self.own_up = numbers(note.get("up"), 3, "the up direction", path)
             if not self.own_up.any():
                 raise FileFormatError(f"{path}: the up direction must not be 0")
             self.own_axes = axes_of(note["axes"], path) if "axes" in note else tile_frame(self.own_up).T
@@ -94,15 +95,15 @@ class _Tree:
         if self.own_up is not None and self.own_axes is not None:
             return np.asarray(self.own_axes.T @ (self.own_up / np.linalg.norm(self.own_up)))
         tile = self.root
-        volume = self._object(tile, "boundingVolume", self._path)
+        volume = object_in(tile, "boundingVolume", self._path)
         if isinstance(region := volume.get("region"), list):
-            west, south, east, north, *_ = self._numbers(region, 6, "a region", self._path)
+            west, south, east, north, *_ = numbers(region, 6, "a region", self._path)
             east += 2 * np.pi if east < west else 0  # across the date line
             longitude, latitude = (west + east) / 2, (south + north) / 2
             flat = np.cos(latitude)
             return np.array([flat * np.cos(longitude), flat * np.sin(longitude), np.sin(latitude)])
         name, length = ("sphere", 4) if "sphere" in volume else ("box", 12)
-        center = self._numbers(volume.get(name), length, f"a {name}", self._path)[:3]
+        center = numbers(volume.get(name), length, f"a {name}", self._path)[:3]
         place = (self._matrix(tile, self._path) @ [*center, 1])[:3]
         away = away_from_ground(place)
         return np.array([0.0, 0, 1]) if away is None else away
@@ -112,9 +113,7 @@ class _Tree:
     ) -> list[_Tile]:
         """The finest tiles at or below ``tile`` of ``file``, whose parent has this matrix and refinement."""
         self._count += 1
-        if depth > _MAX_DEPTH or self._count > _MAX_TILES:
-            limits = f"{_MAX_DEPTH} levels and {_MAX_TILES:,} tiles"
-            raise FileFormatError(f"{file}: tiles are nested too deeply, or too many: {limits} are read")
+        check_tree(depth, self._count, file)
         if "implicitTiling" in tile:
             raise FileFormatError(f"{file}: implicit tiling is not read: list the tiles in the file")
         refine = str(tile.get("refine", refine)).upper()
@@ -123,32 +122,27 @@ class _Tree:
         matrix = matrix @ self._matrix(tile, file)
         own, below = [], []
         for content in self._contents(tile, file):
-            path = self._beside(file, self._object(content, "uri", file, str))
+            path = file_below(file, object_in(content, "uri", file, str))
             if self._is_tileset(path, file):
                 below += self._below(self._root(self._document(path), path), path, matrix, refine, depth + 1)
             else:
                 own.append(_Tile(path, matrix @ _TO_Z_UP))
-        for child in self._list(tile, "children", file):
+        for child in objects_in(tile, "children", file):
             below += self._below(child, file, matrix, refine, depth + 1)
         return own + below if refine == "ADD" or not below else below
 
     def _contents(self, tile: dict[str, Any], file: Path) -> list[dict[str, Any]]:
         if "content" in tile:
-            return [self._object(tile, "content", file)]
-        return self._list(tile, "contents", file)
+            return [object_in(tile, "content", file)]
+        return objects_in(tile, "contents", file)
 
     def _document(self, path: Path) -> dict[str, Any]:
         """A tileset file, which is read once."""
         self._once(path)
-        with open(path, "rb") as opened:
-            document = json_object(opened.read(_MAX_BYTES + 1), _MAX_BYTES, path)
-        version = self._object(document, "asset", path).get("version")
-        if version not in ("1.0", "1.1"):
-            raise FileFormatError(f"{path}: 3D Tiles of version {str(version)[:20]!r}; 1.0 and 1.1 are read")
-        return document
+        return read_tileset(path, ("1.0", "1.1"))
 
     def _root(self, document: dict[str, Any], path: Path) -> dict[str, Any]:
-        found: dict[str, Any] = self._object(document, "root", path)
+        found: dict[str, Any] = object_in(document, "root", path)
         return found
 
     def _is_tileset(self, path: Path, file: Path) -> bool:
@@ -172,42 +166,13 @@ class _Tree:
             raise FileFormatError(f"{self._path}: its tree names {path.name!r} twice; a tile is read once")
         self._read.add(path)
 
-    def _beside(self, file: Path, uri: str) -> Path:
-        """The file that ``uri`` in ``file`` names, if it is a plain path below the folder of ``file``."""
-        plain = unquote(uri)
-        steps = [step for step in plain.split("/") if step != "."]
-        if not _PLAIN.fullmatch(plain) or ".." in steps:
-            raise FileFormatError(
-                f"{file}: it refers to {uri[:80]!r}, which is no path below its folder; refused"
-            )
-        return file.parent.joinpath(*steps)
-
     def _matrix(self, tile: dict[str, Any], file: Path) -> np.ndarray:
         if "transform" not in tile:
             return np.eye(4)
-        matrix = self._numbers(tile["transform"], 16, "a transform", file).reshape(4, 4).T
+        matrix = numbers(tile["transform"], 16, "a transform", file).reshape(4, 4).T
         if (matrix[3] != (0, 0, 0, 1)).any():
             raise FileFormatError(f"{file}: a transform must end in 0 0 0 1 by rows, got {matrix[3]}")
         return matrix
-
-    def _numbers(self, value: object, length: int, what: str, file: Path) -> np.ndarray:
-        listed = value if isinstance(value, list) else []
-        if len(listed) != length or not all(isinstance(x, (int, float)) and abs(x) < 1e300 for x in listed):
-            raise FileFormatError(f"{file}: {what} must be {length} numbers, got {str(value)[:60]}")
-        return np.array(listed, np.float64)
-
-    def _object(self, owner: dict[str, Any], key: str, file: Path, kind: type = dict) -> Any:
-        value = owner.get(key)
-        if not isinstance(value, kind):
-            what = "a text" if kind is str else "an object"
-            raise FileFormatError(f"{file}: {key!r} must be {what}, got {str(value)[:40]}")
-        return value
-
-    def _list(self, tile: dict[str, Any], key: str, file: Path) -> list[dict[str, Any]]:
-        found = tile.get(key, [])
-        if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
-            raise FileFormatError(f"{file}: {key} of a tile must be a list of objects")
-        return found
 
 
 class SplatTileset(Splats):
