@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from meshsplats._options import changed, check_options
 from meshsplats._words import optional_color
 from meshsplats.choices import Look
+from meshsplats.conversion.options import Preset
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, SceneViews, check_photographs
 from meshsplats.errors import OptionsError, OptionValueError
@@ -190,7 +191,7 @@ class ScoringOptions:
     masks: MasksOfData = "count"
     protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
     """Score all scenes of a benchmark as in the paper's Table 1."""
-    tune: Literal["default", "paper"] | None = None
+    tune: Preset | None = None
     """With ``protocol``: first fine-tune each scene on its training views, with this preset."""
     strips: int = 8
     """Number of views, spread over all, for which strips and enlarged crops are written."""

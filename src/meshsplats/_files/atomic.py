@@ -17,10 +17,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from meshsplats._files import DISK_FULL
 from meshsplats._files.locks import LOCK, locked
-
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a full disk, an exhausted quota or a limit on file sizes."""
 
 _LEFTOVER = re.compile(r"\..*\.([0-9a-f]+)-([0-9a-f]{8})\.[0-9a-f]{16}(\..*)?")
 """Names of temporary files: process and machine, then a random part."""
@@ -286,11 +284,11 @@ def _written_meanwhile(shown: str) -> FileExistsError:
 def _full(error: BaseException) -> int | None:
     """The error number if ``error`` means a full disk, also by the message of another library."""
     if isinstance(error, OSError) and error.errno is not None:
-        return error.errno if error.errno in FULL else None
+        return error.errno if error.errno in DISK_FULL else None
     if not isinstance(error, Exception):
         return None
     text = str(error).lower()
-    return next((number for number in FULL if os.strerror(number).lower() in text), None)
+    return next((number for number in DISK_FULL if os.strerror(number).lower() in text), None)
 
 
 def _no_room(number: int, folder: Path, needs: int | None, written: int) -> str:

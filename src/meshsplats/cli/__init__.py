@@ -16,8 +16,8 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from meshsplats._files import DISK_FULL
 from meshsplats.cli.messages import (
-    DISK_FULL,
     ENDINGS,
     OK,
     UNREAD,

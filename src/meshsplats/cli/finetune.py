@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -12,7 +12,7 @@ from meshsplats.cli.arguments import Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, again
 from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.training import TrainingCommand
-from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.options import ConversionOptions, Preset
 from meshsplats.finetuning.config import FinetuneConfig, make_config
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.start_options import StartOptions
@@ -31,7 +31,7 @@ class StartConversion(ConversionOptions):  # with the look of the targets
 
 @as_cli_options(presets=False)
 class BeginOptions(StartOptions):
-    preset: Annotated[Literal["default", "paper"], tyro.conf.arg(metavar="NAME")] = "default"
+    preset: Annotated[Preset, tyro.conf.arg(metavar="NAME")] = "default"
     conversion: StartConversion
 
 

@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from meshsplats._files import DISK_FULL
 from meshsplats._words import naming
 from meshsplats.errors import ClusterError, DeviceError, NamingOptions, OverwritingError, with_options
 
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a full disk, as in ``_files.atomic``."""
 OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
 """Exit codes. FAILED: the input, or a path that was named, is wrong. LACKING: a library, a program, a GPU or
 memory is missing. Ended by signal n: 128 + n."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
-from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.options import ConversionOptions, Preset
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.benchmarks import Candidates
 from meshsplats.finetuning.config import make_config
@@ -18,7 +16,7 @@ from meshsplats.mesh import SplatMesh
 def tuned_candidates(
     scene: GaussianCloud | SplatMesh,
     dataset: Dataset,
-    preset: Literal["default", "paper"] = "default",
+    preset: Preset = "default",
     threads: int | None = None,
 ) -> Candidates:
     """What ``run_benchmark`` scores of a ``scene``: the mesh that is fine-tuned on the training views of

@@ -12,8 +12,10 @@ HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
 """Half turn about x: from y up to y down and back; reverses z, too."""
 HALF_TURN_Z = np.diag([-1.0, -1.0, 1.0])
 """Half turn about z: from y up to y down and back; reverses x, too."""
-TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Viewers of tilesets turn glTF, whose y axis points up, so."""
+Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Quarter turn about x from y up to z up, as viewers of tilesets, Blender and slicers turn what has y up."""
+Y_DOWN_FROM_Z_UP = Z_UP_FROM_Y_UP
+"""The same quarter turn from z up to x right, y down, z forward."""
 
 
 def up_quaternion(up: np.ndarray) -> list[float]:
@@ -40,7 +42,7 @@ def up_rotation(up: np.ndarray) -> np.ndarray:
 def tile_frame(up: np.ndarray) -> np.ndarray:
     """(3, 3) float64 rotation from the world frame to that of a tileset, in which ``up`` (3,) is +z: that of
     a GLB's node and of viewers together."""
-    return np.asarray(TO_Z_UP @ up_rotation(up))
+    return np.asarray(Z_UP_FROM_Y_UP @ up_rotation(up))
 
 
 def turned_origin(mesh: SplatMesh | BaseMesh) -> np.ndarray:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._files.atomic import FULL
+from meshsplats._files import DISK_FULL
 from meshsplats._geometry import morton_codes
 from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud, Kernel
@@ -185,7 +185,7 @@ class Buckets:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            if error.errno in FULL:
+            if error.errno in DISK_FULL:
                 needed = (size - passed) * self._type.itemsize / 1e6
                 text = f"no space left for the splats on their way into tiles, at least {needed:.0f} MB more"
                 raise OSError(errno.ENOSPC, text, str(self._folder)) from None

@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats.blender.inside import frame, versions
 from meshsplats.colors import linear_to_srgb
+from meshsplats.formats._orientation import Z_UP_FROM_Y_UP
 from meshsplats.formats.gltf.view_colors import put_back, stored_colors
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.spherical_harmonics import moved_harmonics
@@ -18,8 +19,6 @@ _OPACITIES = ("displayOpacity",)
 _OWNERS = ("face_splat", "splat")
 """Face attributes that may hold the index of the splat."""
 _LONGEST_NOTE = 100_000
-_FROM_GLTF = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
-"""Rotation by which Blender's importer turns the vertices of a .glb."""
 
 
 def splat_mesh(obj: Any) -> SplatMesh:
@@ -96,8 +95,8 @@ def _view_colors(data: Any, note: dict[str, Any], arrays: dict[str, Any]) -> dic
     own["face_splat"] = _fans(own["faces"]) if arrays["face_splat"] is None else arrays["face_splat"]
     if not put_back(stored, tables, own):
         return {}
-    if own.get("harmonics") is not None:
-        own["harmonics"] = moved_harmonics(own["harmonics"], _FROM_GLTF)
+    if own.get("harmonics") is not None:  # turned as the importer turns vertices
+        own["harmonics"] = moved_harmonics(own["harmonics"], Z_UP_FROM_Y_UP)
     return own
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from meshsplats._geometry import away_from_ground
 from meshsplats._origin import choose_origin, sampled
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._orientation import TO_Z_UP, tile_frame
+from meshsplats.formats._orientation import Y_DOWN_FROM_Z_UP, Z_UP_FROM_Y_UP, tile_frame
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.splats import names_splats, placed_clouds, splat_document
@@ -36,10 +36,8 @@ from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import joined_within
 from meshsplats.gaussians import GaussianCloud
 
-FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""To x right, y down, z forward, in tilesets of others; ours say from where they were turned."""
 _TO_Z_UP = np.eye(4)
-_TO_Z_UP[:3, :3] = TO_Z_UP
+_TO_Z_UP[:3, :3] = Z_UP_FROM_Y_UP
 _LOOKED_AT = 8
 """Tiles that tell whether a tileset is one of splats."""
 _LEGACY = {b"b3dm", b"i3dm", b"pnts", b"cmpt", b"subt"}
@@ -271,5 +269,5 @@ READER = FormatReader(
     lambda content, _file, _reading: SplatTileset(content.path),
     lambda content: holds_splats(content.path),
     up=lambda content: _Tree(content.path).up(),
-    to_y_down=FROM_Z_UP,
+    to_y_down=Y_DOWN_FROM_Z_UP,  # in tilesets of others; ours say from where they were turned
 )

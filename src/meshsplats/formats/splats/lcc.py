@@ -19,6 +19,7 @@ import numpy as np
 from meshsplats._json import json_object
 from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._orientation import Y_DOWN_FROM_Z_UP
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
@@ -37,8 +38,6 @@ _RECORD = np.dtype(
     ]
 )
 _HARMONICS = np.dtype([("words", "<u4", 15), ("unused", "<u4")])
-_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""To x right, y down, z forward."""
 
 
 class _Scene(NamedTuple):
@@ -216,4 +215,4 @@ def _up(_: Content) -> np.ndarray:
     return np.array([0.0, 0.0, 1.0])
 
 
-READER = FormatReader(_matches, _open, up=_up, to_y_down=_FROM_Z_UP)
+READER = FormatReader(_matches, _open, up=_up, to_y_down=Y_DOWN_FROM_Z_UP)

@@ -11,9 +11,8 @@ import numpy as np
 from meshsplats._geometry import edge_groups
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.errors import DataWarning
-from meshsplats.formats._orientation import up_rotation
+from meshsplats.formats._orientation import Z_UP_FROM_Y_UP, up_rotation
 
-_Y_TO_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 _TYPES = (
     '<?xml version="1.0" encoding="UTF-8"?>\n'
     '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
@@ -37,7 +36,7 @@ _MODEL = (
 
 def upright(base: BaseMesh) -> np.ndarray:
     """(v, 3) float64 vertices with z up, all coordinates from 0 on."""
-    turned = base.vertices.astype(np.float64) @ (_Y_TO_Z @ up_rotation(base.up)).T
+    turned = base.vertices.astype(np.float64) @ (Z_UP_FROM_Y_UP @ up_rotation(base.up)).T
     return turned - turned.min(axis=0)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._display import display_cloud, say_converted
+from meshsplats.formats._orientation import Y_DOWN_FROM_Z_UP
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
 from meshsplats.formats.opened import Splats
@@ -27,8 +28,6 @@ from meshsplats.formats.usd.reader import extracted
 from meshsplats.gaussians import GaussianCloud
 
 _PRIM = b"ParticleField3DGaussianSplat"
-_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""From a stage with z up to x right, y down, z forward."""
 _TEXT = 8 << 20
 """Bytes of a text file in which the prim is looked for."""
 
@@ -40,7 +39,7 @@ class _UsdSplats(Splats):
         self._path = content.path
         report, self._arrays = extracted(content.path, "meshsplats.formats.usd.splat_extraction")
         self._fields: list[dict[str, Any]] = report["fields"]
-        self.to_y_down = _FROM_Z_UP if report["z_up"] else None
+        self.to_y_down = Y_DOWN_FROM_Z_UP if report["z_up"] else None
         for message in report["warnings"]:
             warnings.warn(f"{content.path}: {message}", DataWarning, stacklevel=6)
 
