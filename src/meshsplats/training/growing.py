@@ -100,7 +100,8 @@ class Growing:
 
     def misfits(self, views: Sequence[View]) -> list[str]:
         """Names of the training views whose images the mesh cannot show as it shows the others, judged by
-        the losses since the last growth event. Those of a resumed run since then do not count."""
+        the losses since both the last growth event and the step from which on images have their whole size.
+        Of a resumed run, only those since it was resumed count."""
         known = np.flatnonzero(self._loss_counts)
         if not len(known):
             return []
