@@ -167,6 +167,13 @@ def test_every_option_without_a_flag_is_on_the_page():
                 assert module._plain(help_text) in text, (command, name)
 
 
+def test_the_page_names_defaults_in_words():
+    """Who types ``--set dropout=None`` is refused."""
+    pytest.importorskip("tyro")
+    rows = [row for row in script("tools/options_page.py").page().splitlines() if row.startswith("|")]
+    assert [row for row in rows if re.search(r"\bNone\b|Dataset\.", row)] == []
+
+
 def test_options_that_differ_from_their_defaults_are_changed():
     assert changed(Baking()) == []
     assert changed(Baking(heat=200, glaze=True, loaves=1)) == ["heat", "glaze"]
