@@ -18,12 +18,13 @@ DONE = {"delete": "deleted", "separate": "separated", "hide": "hid", "select": "
 def cut(operator, context, obj, mesh, faces, *, action="delete"):
     """As ``cutting.cut``, for the ``action`` delete, separate or hide; what showed baked light does so again,
     and ``operator`` reports what was lost."""
-    from meshsplats.blender.inside import baking, cutting, materials, objects
+    from meshsplats.blender.inside import baking, cutting, homes, materials, objects
 
     baked = any(materials.shows_baked(material) for material in obj.data.materials)
     even = objects.is_even(obj)
     separate = action != "delete"
-    made, lost = cutting.cut(obj, mesh, faces, separate=separate, collection=obj.users_collection[0])
+    home = homes.shown_by(context.view_layer, obj)
+    made, lost = cutting.cut(obj, mesh, faces, separate=separate, collection=home)
     report_lost(operator, {obj.name: lost})
     parts = [obj]
     if made is not None:

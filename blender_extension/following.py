@@ -13,8 +13,6 @@ BASE = "meshsplats_base"
 
 STAND_IN = "meshsplats_stand_in"
 """Property of what was made for the light of splats; ``meshsplats.blender.inside.stand_ins`` sets it."""
-POINTS = "meshsplats_light_points"
-"""Property of lit splats: the points that their light is baked at."""
 
 
 def _has_followers():
@@ -53,15 +51,11 @@ def _sweep_soon(scene):
 def has_strays(scene):
     """Whether stand-ins in ``scene`` lack their splats, or are not where these are, or not hidden as they
     are."""
-    return any(_is_stray(obj, obj.parent) for obj in scene.objects if STAND_IN in obj)
-
-
-def _is_stray(obj, owner):
-    if owner is None or set(obj.users_collection) != set(owner.users_collection):
-        return True
-    if owner.get(POINTS) == obj:  # hidden always
+    if not any(STAND_IN in obj for obj in scene.objects):  # or every file would load our libraries
         return False
-    return obj.hide_viewport != owner.hide_viewport or obj.hide_get() != owner.hide_get()
+    from meshsplats.blender.inside import stand_ins
+
+    return stand_ins.has_strays(scene)
 
 
 def sweep():

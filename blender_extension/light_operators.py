@@ -8,7 +8,16 @@ from bpy.props import BoolProperty, EnumProperty
 
 from .checks import can_change, can_change_all
 from .settings import is_blenders
-from .work import LightWork, Modal, follow_shading, own_warnings, take_over, waiting
+from .work import (
+    LightWork,
+    Modal,
+    follow_shading,
+    hide_start_scene,
+    own_warnings,
+    report_notes,
+    take_over,
+    waiting,
+)
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 LINEAR = ("linear", "Linear", "Colours as they are, but in linear light, for any view transform")
@@ -16,15 +25,14 @@ LINEAR = ("linear", "Linear", "Colours as they are, but in linear light, for any
 
 DARK = 0.1
 """Brightness of a sky up to which it lights nothing: Blender starts with one of 0.05."""
+MIXED = ("MIX_SHADER", "ADD_SHADER")
+"""Types of nodes that put backgrounds of a sky together."""
 
 
 def is_dark(scene):
     """Whether images of ``scene`` have neither a lamp nor a sky that lights anything; what glows does not
     count."""
-    from meshsplats.blender.inside.light_state import rendered
-
-    shown = rendered(bpy.context.view_layer.layer_collection)
-    if any(obj.type == "LIGHT" and obj.data.energy > 0 for obj in shown):
+    if _has_lamp(bpy.context.view_layer.layer_collection):
         return False
     world = scene.world
     if world is None:
@@ -39,7 +47,24 @@ def is_dark(scene):
                 return False
             if strength.default_value * max(color.default_value[:3]) > DARK:
                 return False
-    return True
+    # Of a group, or a texture without a background, it is not known.
+    ends = {"OUTPUT_WORLD", *MIXED}
+    return all(
+        link.from_node.type in {"BACKGROUND", *MIXED}
+        for link in world.node_tree.links
+        if link.to_node.type in ends and link.to_socket.type == "SHADER"
+    )
+
+
+def _has_lamp(place):
+    """Whether images show a lamp in ``place``, as of ``light_state.rendered``, or in instances there."""
+    from meshsplats.blender.inside.light_state import rendered
+
+    for obj in rendered(place):
+        home = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+        if (obj.type == "LIGHT" and obj.data.energy > 0) or (home is not None and _has_lamp(home)):
+            return True
+    return False
 
 
 class SetShading(Modal, bpy.types.Operator):
@@ -114,10 +139,12 @@ class SetUpRender(bpy.types.Operator):
     shading: EnumProperty(items=SHADINGS)
 
     def execute(self, context):
-        from meshsplats.blender.inside import bounces, objects
+        from meshsplats.blender.inside import bounces, notes, objects
 
+        notes.take()  # of what scripts did before
         every, lit = objects.splat_objects(context.scene), self.shading == "lit"
         limit = objects.render_settings(context.scene, every, lit)
+        report_notes(self)
         clash = objects.clash([*every, *bounces.instanced(context.scene.objects)], lit)
         if clash:
             self.report({"WARNING"}, f"MeshSplats: {clash}")
@@ -190,7 +217,7 @@ class SetUpStage(Modal, bpy.types.Operator):
         from meshsplats.blender.inside import objects, setting
 
         take_over(self, work)
-        setting.hide_start_scene(context.scene)
+        hide_start_scene(self, context.scene)
         with waiting(context), telling(self):
             every = objects.subjects(context.scene)
             camera = self.camera if self.properties.is_property_set("camera") else None

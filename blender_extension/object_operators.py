@@ -72,8 +72,10 @@ class ConvertAgain(Modal, bpy.types.Operator):
         for result in work.results:
             obj = bpy.data.objects.get(result.name)
             if obj is not None:
-                report_lost(self, {obj.name: objects.replace_mesh(obj, result.prepared[0])})
+                prepared = result.prepared[0]
+                report_lost(self, {obj.name: objects.replace_mesh(obj, prepared)})
                 if result.path:
+                    sources.turn(obj, prepared["mesh"].up.astype(float), prepared["foot"])
                     sources.mark(obj)
         obj = bpy.data.objects.get(self._active)
         if obj is None:

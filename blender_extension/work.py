@@ -272,8 +272,11 @@ class Modal:
 
         self._work = work
         notes.take()  # of what scripts did before
-        if bpy_background():
-            work.run()
+        # What Adjust Last Operation or Repeat Last begins must be done at once: Blender lists it twice among
+        # the last operations if it becomes modal, and crashes.
+        if bpy_background() or self.options.is_repeat or self.options.is_repeat_last:
+            with waiting(context):
+                work.run()
             return self._end(context)
         work.start()
         window = context.window_manager
@@ -316,14 +319,19 @@ class Modal:
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        from meshsplats.blender.inside import notes
-
-        for note in notes.take():
-            self.report({"INFO"}, f"MeshSplats: {note}")
+        report_notes(self)
         return {"FINISHED"}
 
     def cancelled(self):
         """Called when there is no result."""
+
+
+def report_notes(operator):
+    """``operator`` reports what was done in passing since notes were taken last."""
+    from meshsplats.blender.inside import notes
+
+    for note in notes.take():
+        operator.report({"INFO"}, f"MeshSplats: {note}")
 
 
 @contextmanager
@@ -339,6 +347,15 @@ def waiting(context):
             window.cursor_modal_restore()
 
 
+def hide_start_scene(operator, scene):
+    """Hides what Blender starts with from ``scene``, as ``operator`` then reports."""
+    from meshsplats.blender.inside import setting
+
+    hidden = setting.hide_start_scene(scene)
+    if hidden:
+        operator.report({"INFO"}, f"MeshSplats: hid what Blender starts with: {', '.join(hidden)}")
+
+
 def settle(operator, context, objs):
     """Selects new splat meshes, hides Blender's start scene, shows them in the viewports, a place from
     within, and, if ``operator`` is to, sets up the render for all of the scene."""
@@ -348,9 +365,8 @@ def settle(operator, context, objs):
         other.select_set(False)
     for obj in objs:
         obj.select_set(True)
-    hidden = setting.hide_start_scene(context.scene) if operator.hide_start_scene else []
-    if hidden:
-        operator.report({"INFO"}, f"MeshSplats: hid what Blender starts with: {', '.join(hidden)}")
+    if operator.hide_start_scene:
+        hide_start_scene(operator, context.scene)
     context.view_layer.update()
     if operator.frame_view:
         windows = context.window_manager.windows
@@ -392,21 +408,26 @@ def follow_shading(operator, scene, lit):
 
 def take_over(operator, work):
     """Gives the objects that ``work``, a ``LightWork``, was about their new meshes, but for those that were
-    edited or deleted meanwhile. Returns the names of those that got theirs; ``operator`` reports what was
-    lost."""
+    edited or deleted meanwhile. Returns the names of those that got theirs; ``operator`` reports the others,
+    and what was lost."""
     import bpy
 
     from meshsplats.blender.inside import objects, stand_ins
 
     from .checks import report_lost
 
-    done = []
+    done, changed = [], []
     for result in work.results:
         obj = bpy.data.objects.get(result.name)
-        if obj is not None and stand_ins.shape(obj.data) == work.shapes[result.name]:
-            report_lost(operator, {obj.name: objects.take_light(obj, result.prepared[0])})
-            obj.meshsplats.shading = work.choices["shading"]
-            done.append(result.name)
+        if obj is None or stand_ins.shape(obj.data) != work.shapes[result.name]:
+            changed.append(result.name)
+            continue
+        report_lost(operator, {obj.name: objects.take_light(obj, result.prepared[0])})
+        obj.meshsplats.shading = work.choices["shading"]
+        done.append(result.name)
+    if changed:
+        what = "was edited, renamed or deleted meanwhile, and left out"
+        operator.report({"WARNING"}, f"MeshSplats: {', '.join(changed)}: {what}")
     return done
 
 

@@ -59,11 +59,10 @@ bpy.ops.object.meshsplats_shading(shading="unlit")
 assert obj.data.materials[0].name.startswith("Splats, unlit")
 bpy.ops.scene.meshsplats_set_up(shading="unlit")
 
-report["sog"] = None
-if len(sys.argv) > 3:  # its images are decoded by the other wheel, Pillow
-    bpy.ops.import_scene.meshsplats(filepath=sys.argv[3], max_triangles=800)
-    report["sog"] = len(bpy.context.object.data.polygons)
-    bpy.data.objects.remove(bpy.context.object)
+# Its images are decoded by the other wheel, Pillow.
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "small.sog"), max_triangles=800)
+report["sog"] = len(bpy.context.object.data.polygons)
+bpy.data.objects.remove(bpy.context.object)
 
 directory = str(folder) + "/"
 bpy.ops.import_scene.meshsplats(directory=directory, files=[{"name": "mesh.npz"}, {"name": "ball.ply"}])
@@ -287,6 +286,8 @@ class Window:
 
 
 class Operator(work.Modal):
+    options = SimpleNamespace(is_repeat=False, is_repeat_last=False)
+
     def __init__(self):
         self.said, self.results, self.was_cancelled = [], None, False
 

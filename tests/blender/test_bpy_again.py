@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import bind, orbit, psnr, render, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
-from meshsplats.blender.inside import exporting, objects, sources
+from meshsplats.blender.inside import exporting, meshes, objects, sources
 from meshsplats.conversion.recovery import recover_splats
 
 
@@ -127,6 +127,33 @@ def test_what_would_be_lost_is_refused_with_a_remedy(captures, tmp_path):
     with pytest.raises(RuntimeError, match=r"prior was edited or joined.* its splats hang"):
         bpy.ops.object.meshsplats_convert_again()
     assert len(prior.data.polygons) == count
+
+
+@pytest.mark.parametrize("axes", ["z-up", "z-down", "y-up"])
+def test_another_up_stands_a_capture_upright(captures, axes):
+    """As it was turned and moved since; and on the ground where it stood."""
+    one, _ = captures
+    one.location, one.scale = (2, 1, 0.5), (2, 2, 2)
+    one.meshsplats.axes = axes
+    bpy.ops.object.meshsplats_convert_again()
+    bpy.context.view_layer.update()
+    up = {"z-up": (0, 0, 1), "z-down": (0, 0, -1), "y-up": (0, -1, 0)}[axes]
+    world = np.array(one.matrix_world)[:3, :3]
+    np.testing.assert_allclose(world @ up, (0, 0, 2), atol=1e-5)
+    np.testing.assert_allclose((world @ world.T), 4 * np.eye(3), atol=1e-5)
+    if axes != "y-up":
+        points = meshes.world_points(one)
+        np.testing.assert_allclose(points[:, 2].min(), 0.5, atol=0.6)
+        np.testing.assert_allclose(points[:, :2].mean(axis=0), (2, 1), atol=0.3)
+    one.rotation_euler.x += 0.3
+    bpy.context.view_layer.update()
+    before = np.array(one.matrix_world)
+    if axes == "z-up":
+        bpy.context.scene.meshsplats_fast = True
+        bpy.ops.object.meshsplats_shading(shading="lit")
+    bpy.ops.object.meshsplats_convert_again()
+    bpy.context.view_layer.update()
+    np.testing.assert_array_equal(np.array(one.matrix_world), before, "nothing more is turned")
 
 
 def test_a_place_that_is_converted_again_is_not_searched_again(captures, monkeypatch):

@@ -12,7 +12,7 @@ import bmesh
 from _blender_scenes import ball_splats
 
 from meshsplats import save_gaussians
-from meshsplats.blender.inside import objects, versions
+from meshsplats.blender.inside import materials, objects, remaking, versions
 
 
 @pytest.fixture
@@ -153,6 +153,38 @@ def test_joined_materials_become_one(ball):
     after = np.zeros(len(data.polygons), np.int32)
     data.polygons.foreach_get("material_index", after)
     np.testing.assert_array_equal(after, np.where(index == 2, 0, index))
+
+
+def shadow_distance(material):
+    return material.node_tree.nodes[materials.SELF_SHADOW].outputs[0]
+
+
+def test_a_material_that_was_changed_stays(ball, capfd):
+    """Where its kind does; else in the file, as is said. Light and self-shadow distance are not its look."""
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    fresh = ball.data.materials[0]
+    materials.set_baked(fresh, True)
+    assert not remaking._is_changed(fresh)
+    fresh.node_tree.nodes.new("ShaderNodeHueSaturation")
+    for how in ("light", "again"):
+        before = shadow_distance(fresh).default_value
+        if how == "light":
+            bpy.ops.object.meshsplats_shading(shading="lit")
+        else:
+            ball.meshsplats.max_triangles, ball.meshsplats.shading = 200, "lit"
+            bpy.ops.object.meshsplats_convert_again()
+        assert ball.data.materials[0] == fresh
+        assert not materials.shows_baked(fresh)
+        assert (shadow_distance(fresh).default_value == before) == (how == "light")
+    assert "stays in the file" not in capfd.readouterr().out
+    shadow_distance(fresh).default_value, fresh.name = 0.123, "Bronze"
+    bpy.ops.object.meshsplats_shading(shading="lit")
+    assert [material.name for material in ball.data.materials] == ["Bronze", "Metal"]
+    assert shadow_distance(fresh).default_value == np.float32(0.123)
+    bpy.ops.object.meshsplats_shading(shading="unlit")
+    assert [material.name.split(".")[0] for material in ball.data.materials] == ["Splats, unlit", "Metal"]
+    assert "your material Bronze stays in the file" in capfd.readouterr().out
+    assert fresh.use_fake_user
 
 
 def test_convert_again_names_what_is_lost(ball, capfd):

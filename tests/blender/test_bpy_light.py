@@ -16,6 +16,7 @@ from meshsplats import DataWarning, convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import (
     baking,
+    homes,
     materials,
     meshes,
     objects,
@@ -217,6 +218,72 @@ def test_the_stand_in_is_hidden_and_moved_with_its_splats(ball):
     stand_ins.follow(view)
     assert not surface.hide_viewport
     assert points.hide_viewport
+
+
+def test_light_linking_takes_the_stand_in_for_its_splats(ball):
+    """Where one receiver is included, a lamp lights no others: stand-ins of excluded splats must not be."""
+    obj, view = lit_ball(ball), bpy.context.scene
+    lamp = stage.add_sun(np.array([0.0, 0, 1]), 3.0, 1.0, 0.01, view.collection)
+    receivers = bpy.data.collections.new("receivers")
+    lamp.light_linking.receiver_collection = receivers
+    receivers.objects.link(obj)
+    for state in ("EXCLUDE", "INCLUDE", "EXCLUDE"):
+        receivers.collection_objects[0].light_linking.link_state = state
+        assert stand_ins.has_strays(view)
+        stand_ins.remove_strays(view)
+        assert not stand_ins.has_strays(view)
+        states = [kept.light_linking.link_state for kept in receivers.collection_objects]
+        assert states == [state] * (1 + len(obj.children))
+    receivers.objects.unlink(obj)
+    stand_ins.remove_strays(view)
+    assert not len(receivers.objects)
+    assert not stand_ins.has_strays(view)
+
+
+def test_a_rigid_body_of_splats_is_one_body(ball):
+    """And what is made for it is put where it is seen: by name, the collection of physics comes first."""
+    obj, view = lit_ball(ball), bpy.context.scene
+    home = bpy.data.collections.new("Splats")
+    view.collection.children.link(home)
+    for part in (obj, *obj.children):
+        homes.put(part, {view.collection: "INCLUDE"}, {home: "INCLUDE"})
+    bpy.ops.rigidbody.world_add()
+    bpy.context.view_layer.objects.active = obj
+    bpy.ops.rigidbody.object_add(type="ACTIVE")
+    assert obj.users_collection[0] == view.rigidbody_world.collection
+    stand_ins.remove_strays(view)
+    assert not stand_ins.has_strays(view)
+    objects.replace_mesh(obj, ball.prepared)
+    assert obj.rigid_body is not None
+    assert len(obj.children) == 2
+    assert all(child.rigid_body is None for child in obj.children)
+    assert [child.users_collection for child in obj.children] == [(home,)] * 2
+    assert homes.shown_by(bpy.context.view_layer, obj) == home
+
+
+@pytest.mark.parametrize("rays", [(False, True), (True, False)])
+def test_rays_that_the_artist_has_chosen_see_unlit_splats_again(ball, rays):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    unlit = objects.prepare(ball.mesh, False)
+    obj = objects.add(unlit, "ball", bpy.context.collection)
+    obj.visible_shadow, obj.visible_diffuse = rays
+    for prepared in (unlit, ball.prepared, ball.prepared, unlit):
+        objects.replace_mesh(obj, prepared)
+        lit = prepared is ball.prepared
+        assert (obj.visible_shadow, obj.visible_diffuse) == ((False, False) if lit else rays)
+
+
+def test_live_light_is_of_one_of_two_duplicates(ball):
+    """Shift D copies the mesh, not its material."""
+    obj = lit_ball(ball)
+    materials.set_baked(obj.data.materials[0], True)
+    other = obj.copy()
+    other.data = obj.data.copy()
+    bpy.context.collection.objects.link(other)
+    for _ in range(2):
+        baking.forget([other])
+        assert [materials.shows_baked(o.data.materials[0]) for o in (obj, other)] == [True, False]
+    assert len([m for m in bpy.data.materials if m.name.startswith("Splats")]) == 2
 
 
 def test_hidden_splats_are_baked_as_if_they_were_visible(ball):

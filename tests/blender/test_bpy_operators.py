@@ -575,6 +575,70 @@ def test_lit_and_unlit_set_up_the_render_where_all_splats_are(ball):
     assert view.view_settings.view_transform == "Raw", "one of them is unlit"
 
 
+@pytest.mark.parametrize("how", ["is_repeat", "is_repeat_last"])
+def test_what_is_repeated_is_done_at_once(extension, monkeypatch, how):
+    """From Adjust Last Operation or by Shift R: what becomes modal there, Blender lists twice and frees."""
+    ours, done = sys.modules["blender_extension.work"], []
+    monkeypatch.setattr(ours, "bpy_background", lambda: False)
+    window = SimpleNamespace(cursor_modal_set=lambda name: None, cursor_modal_restore=lambda: None)
+    work = SimpleNamespace(run=lambda: done.append("run"), paths=["a"], results=["a"], problems=[])
+    operator = ours.Modal()
+    operator.options = SimpleNamespace(**({"is_repeat": False, "is_repeat_last": False} | {how: True}))
+    operator.done = lambda context, work: done.append("done")
+    assert operator.begin(SimpleNamespace(window=window), work) == {"FINISHED"}
+    assert done == ["run", "done"]
+
+
+def test_splats_that_were_edited_meanwhile_are_named(ball, extension):
+    ours, said = sys.modules["blender_extension.work"], []
+    works = [ours.LightWork({ball.name: objects.light_source(ball)}, "unlit") for _ in range(2)]
+    for work in works:
+        work.run()
+    operator = SimpleNamespace(report=lambda kind, text: said.append(text))
+    assert ours.take_over(operator, works[0]) == [ball.name]
+    assert said == []
+    ball.data.vertices[0].co.z += 1
+    assert ours.take_over(operator, works[1]) == []
+    assert said == ["MeshSplats: ball: was edited, renamed or deleted meanwhile, and left out"]
+
+
+def test_sun_says_what_it_hides(extension, monkeypatch, capfd):
+    bpy.ops.wm.read_factory_settings()
+    monkeypatch.setattr(setting, "set_up", lambda *_, camera, fast: None)
+    bpy.ops.scene.meshsplats_stage()
+    assert "hid what Blender starts with: Cube, Light" in capfd.readouterr().out
+
+
+def test_exact_and_lit_say_what_they_change(extension, capfd):
+    bpy.ops.wm.read_factory_settings()
+    bpy.ops.scene.meshsplats_set_up(shading="lit")
+    said = capfd.readouterr().out
+    assert "MeshSplats: render settings changed: view AgX to Standard" in said
+    assert "light tree on to off" in said
+
+
+def test_it_is_dark_only_where_nothing_lights(extension):
+    is_dark = sys.modules["blender_extension.light_operators"].is_dark
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    sky = stage.even_world((0.01, 0.01, 0.01), (0, 0, 0)).node_tree
+    assert is_dark(scene)
+    out = next(node for node in sky.nodes if node.type == "OUTPUT_WORLD")
+    before = out.inputs["Surface"].links[0].from_socket
+    for kind in ("ShaderNodeTexSky", "ShaderNodeEmission"):
+        sky.links.new(sky.nodes.new(kind).outputs[0], out.inputs["Surface"])
+        assert not is_dark(scene), kind
+    sky.links.new(before, out.inputs["Surface"])
+    assert is_dark(scene)
+    lamps = bpy.data.collections.new("lamps")
+    lamps.objects.link(bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "POINT")))
+    shown = bpy.data.objects.new("shown", None)
+    scene.collection.objects.link(shown)
+    shown.instance_type, shown.instance_collection = "COLLECTION", lamps
+    bpy.context.view_layer.update()
+    assert not is_dark(scene)
+
+
 def test_a_blender_without_numpy_is_told_so(extension, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "numpy" else found(name))

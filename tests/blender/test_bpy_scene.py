@@ -85,6 +85,10 @@ def test_lit_file_has_everything_in_named_collections(tmp_path):
     assert scene.cycles.samples == 5
     assert scene.cycles.denoising_input_passes == "RGB", "it is a preview"
     assert 64 <= scene.cycles.transparent_max_bounces < 1024
+    assert (scene.cycles.max_bounces, scene.cycles.diffuse_bounces) == (8, 4)
+    assert scene.render.dither_intensity == 0
+    assert scene.render.use_compositing, "nodes that are added later have an effect"
+    assert scene.render.use_sequencer
     data = bpy.data.objects["Splats"].data
     assert data.materials[0].name == "Splats, lit"
     assert {meshes.COLOR, meshes.NORMAL, meshes.SPLAT} <= set(data.attributes.keys())

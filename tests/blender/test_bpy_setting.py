@@ -217,15 +217,26 @@ def test_the_start_scene_is_hidden_once_and_only_as_it_was(tmp_path):
     bpy.ops.wm.read_factory_settings()
     view = bpy.context.scene
     cube, lamp = view.objects["Cube"], view.objects["Light"]
-    cube.location.x = 1
-    assert setting.hide_start_scene(view) == ["Light"], "a cube that was moved is the user's"
-    cube.location.x = 0
+    cube.location.x = lamp.location.x = 1
+    assert setting.hide_start_scene(view) == [], "what was moved is the user's"
+    cube.location.x, lamp.location.x = 0, 4.07625
+    cube.modifiers.new("Bevel", "BEVEL")
+    assert setting.hide_start_scene(view) == ["Light"], "and what was modelled"
+    cube.modifiers.clear()
     assert setting.hide_start_scene(view) == ["Cube"]
     assert [o.hide_render and o.hide_get() for o in (cube, lamp)] == [True, True]
     assert setting.hide_start_scene(view) == []
+    lamp.hide_render = False
+    assert setting.hide_start_scene(view) == [], "who shows it again wants it"
     cube.hide_render = False
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
     assert setting.hide_start_scene(view) == [], "a saved file is the user's"
+
+
+def test_what_is_excluded_at_the_start_needs_no_hiding():
+    bpy.ops.wm.read_factory_settings()
+    bpy.context.view_layer.layer_collection.children["Collection"].exclude = True
+    assert setting.hide_start_scene(bpy.context.scene) == []
 
 
 def test_viewports_show_what_was_imported():
@@ -312,6 +323,23 @@ def test_a_place_is_seen_from_within(tmp_path):
         obj[views.VIEWS] = broken
         assert views.opening([obj]) is None
         assert views.within(obj, np.zeros(3)) is None
+
+
+@pytest.mark.parametrize("scale", [(-1, 1, 1), (1, 1, 1.3)])
+def test_a_mirrored_or_stretched_place_is_seen_from_within(scale):
+    bpy.ops.wm.read_factory_settings()
+    obj = ball()
+    inside = look_at((0.2, -0.3, 0.1), (1, 0.4, 0.3), up=(0, 1, 0), fov=60, width=400, height=300)
+    views.remember(obj, [inside])
+    obj.scale, obj.rotation_euler = scale, (0.3, 0, 1)
+    bpy.context.view_layer.update()
+    camera = views.opening([obj]).camera(400, 300)
+    world = np.array(obj.matrix_world)
+    eye, ahead = inside.center, inside.center + inside.world_to_camera[2, :3]
+    np.testing.assert_allclose(camera.center, world[:3, :3] @ eye + world[:3, 3], atol=1e-5)
+    x, y, depth = camera.world_to_camera[:3, :3] @ world[:3, :3] @ (ahead - eye)
+    np.testing.assert_allclose([x, y], 0, atol=1e-5)
+    assert depth > 0
 
 
 def test_what_is_seen_from_around_stays_so_until_it_changes():

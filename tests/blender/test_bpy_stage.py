@@ -44,8 +44,8 @@ def test_what_the_artist_adds_to_our_collections_is_kept(empty):
     assert "Sun.001" in note
 
 
-@pytest.mark.parametrize("change", ["nothing", "moved", "animated", "named"])
-def test_a_camera_that_was_moved_or_animated_is_kept(empty, change):
+@pytest.mark.parametrize("change", ["nothing", "moved", "animated", "named", "lens", "focus", "clipping"])
+def test_a_camera_that_was_changed_is_kept(empty, change):
     view = look_at((0, -1, -5), (0, 0, 0), width=48, height=36)
     obj = stage.add_camera(view, "Camera", np.eye(3), 100.0, stage.collection("Cameras"))
     if change == "moved":
@@ -54,6 +54,12 @@ def test_a_camera_that_was_moved_or_animated_is_kept(empty, change):
         obj.keyframe_insert("location", frame=1)
     elif change == "named":
         obj.name = "Close-up"
+    elif change == "lens":
+        obj.data.lens = 85
+    elif change == "focus":
+        obj.data.dof.use_dof = True
+    elif change == "clipping":
+        obj.data.clip_end *= 2
     stage.clear()
     stage.clear()
     assert len(empty.objects) == (change != "nothing")
@@ -92,6 +98,56 @@ def test_compositing_and_render_region_are_left_alone(empty, settings):
     assert all(getattr(empty.render, name) for name in names)
     (note,) = notes.take()
     assert f"Cycles samples 777 to {empty.cycles.samples}" in note
+
+
+OWNERS = ("cycles", "render", "eevee", "view_settings", "display_settings")
+
+
+def settings_of(scene):
+    found = {}
+    for owner in OWNERS:
+        block = getattr(scene, owner)
+        for prop in block.bl_rna.properties:
+            kept = prop.type in ("BOOLEAN", "INT", "FLOAT", "ENUM") and not prop.is_readonly
+            if kept and not getattr(prop, "is_array", False):
+                found[f"{owner}.{prop.identifier}"] = getattr(block, prop.identifier)
+    return found
+
+
+def test_every_setting_that_is_changed_is_told(empty):
+    """And none is that splats do not need: what an artist has chosen stays."""
+    cycles = empty.cycles
+    empty.eevee.use_raytracing = cycles.caustics_reflective = cycles.caustics_refractive = True
+    cycles.transparent_max_bounces, cycles.diffuse_bounces, cycles.seed = 512, 9, 7
+    empty.render.dither_intensity, empty.view_settings.gamma, cycles.film_exposure = 0.75, 1.5, 2.0
+    empty.view_settings.use_curve_mapping = True
+    versions.set_if_there(empty.view_settings, use_white_balance=True)
+    before = settings_of(empty)
+    rendering.lit_settings(empty, "cycles", limit=64, denoise=True)
+    after = settings_of(empty)
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed <= set(rendering._TOLD.values())
+    assert {"cycles.use_light_tree", "view_settings.gamma", "cycles.pixel_filter_type"} <= changed
+    stays = {"eevee.use_raytracing", "cycles.caustics_reflective", "cycles.transparent_max_bounces"}
+    stays |= {"cycles.diffuse_bounces", "cycles.seed", "render.dither_intensity", "cycles.film_exposure"}
+    assert not stays & changed
+    (note,) = notes.take()
+    assert all(part in note for part in ("gamma 1.5 to 1", "light tree on to off", "pixel filter "))
+    rendering.exact_settings(empty, "cycles")
+    last = settings_of(empty)
+    assert {name for name in after if after[name] != last[name]} <= set(rendering._TOLD.values())
+    (note,) = notes.take()
+    assert all(part in note for part in ("dither 0.75 to 0", "curves on to off", "film exposure 2 to 1"))
+
+
+def test_a_view_that_a_studio_lacks_is_told(empty):
+    before = empty.view_settings.view_transform
+    rendering._choose(empty.view_settings, "view_transform", "Plain", "view transform")
+    assert empty.view_settings.view_transform == before
+    assert notes.take() == [
+        f"the colour management of this Blender has no view transform Plain, so that {before} stays: colours"
+        " may differ"
+    ]
 
 
 @pytest.mark.parametrize("chosen", [False, True])

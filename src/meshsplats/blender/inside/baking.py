@@ -151,6 +151,7 @@ def is_older(scene: Any, obj: Any) -> bool:
 def forget(objs: list[Any]) -> None:
     """Has the lamps of the scene light the splat objects ``objs`` in every image, instead of baked light."""
     for obj in objs:
+        _part_materials(obj.data)
         for material in obj.data.materials:
             materials.set_baked(material, False)
 
@@ -164,9 +165,19 @@ def show(data: Any, light: np.ndarray) -> None:
     values[:, :3] = light[index]
     attribute = data.attributes.get(LIGHT) or data.attributes.new(LIGHT, "FLOAT_COLOR", "POINT")
     attribute.data.foreach_set("color", values.ravel())
+    _part_materials(data)
     for material in data.materials:
         materials.set_baked(material, True)
     data.update_tag()
+
+
+def _part_materials(data: Any) -> None:
+    """Gives the splats ``data`` copies of lit materials that others use, too, as duplicates by Shift D do:
+    which light they show is for each to choose."""
+    for i, material in enumerate(data.materials):
+        lit = material is not None and material.node_tree and materials.BAKED in material.node_tree.nodes
+        if lit and material.users - material.use_fake_user > 1:
+            data.materials[i] = material.copy()
 
 
 def smoothed(data: Any) -> np.ndarray:

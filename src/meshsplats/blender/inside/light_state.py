@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import Any
 
 from meshsplats.blender.inside import deforming, meshes, pacing, versions
@@ -186,15 +186,20 @@ def _shape(data: Any) -> list[Any]:
 
 def _block(block: Any) -> list[Any]:
     """Values and nodes of a lamp, a material or a world."""
-    return [block.name, *_values(block), *_nodes(block.node_tree, frozenset())]
+    return [block.name, *_values(block), *nodes(block.node_tree)]
 
 
-def _nodes(tree: Any, outer: frozenset[str]) -> list[Any]:
+def nodes(tree: Any, outer: frozenset[str] = frozenset(), *, free: Container[str] = ()) -> list[Any]:
+    """Kinds, values and links of the nodes of ``tree``, a group in the trees ``outer``; values of those that
+    are named in ``free`` do not count."""
     if tree is None or tree.name in outer or _is_as_made(tree):
         return []
     parts: list[Any] = []
     for node in tree.nodes:
-        parts += [node.name, node.bl_idname, *_values(node)]
+        parts += [node.name, node.bl_idname]
+        if node.name in free:
+            continue
+        parts += _values(node)
         newer = _NEWER_INPUTS.get(node.bl_idname, ())
         inputs = (socket for socket in node.inputs if socket.identifier not in newer)
         for socket in (*inputs, *(node.outputs if node.bl_idname in _CONSTANTS else ())):
@@ -206,7 +211,7 @@ def _nodes(tree: Any, outer: frozenset[str]) -> list[Any]:
         ramp = getattr(node, "color_ramp", None)
         if ramp is not None:
             parts += [ramp.interpolation, *([e.position, *e.color] for e in ramp.elements)]
-        parts += _nodes(getattr(node, "node_tree", None), outer | {tree.name})
+        parts += nodes(getattr(node, "node_tree", None), outer | {tree.name})
     ends = (
         (link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier)
         for link in tree.links

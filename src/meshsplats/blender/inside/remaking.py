@@ -3,11 +3,23 @@ stays, such as vertex groups, shape keys, UV maps, attributes and materials."""
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, materials, meshes, priors, sorted_copies, versions
+from meshsplats.blender.inside import (
+    baking,
+    light_state,
+    materials,
+    meshes,
+    notes,
+    priors,
+    sorted_copies,
+    versions,
+)
+from meshsplats.blender.inside.host import bpy
 
 _OWN = {
     *(meshes.COLOR, meshes.DISPLAY, meshes.MADE, meshes.NORMAL, meshes.SPLAT, sorted_copies.CENTER),
@@ -26,6 +38,10 @@ _WIDTHS = {
 _TYPES = {"BOOLEAN": bool, "INT": np.int32, "INT8": np.int8, "INT16_2D": np.int16, "INT32_2D": np.int32}
 _NAMES = "Splats"
 """How the names of our materials begin; what an artist has renamed is the artist's."""
+LOOK = "meshsplats_look"
+"""Property of our materials: what their ``_look`` was when they were made, the same for all of a kind."""
+DISTANCE = "meshsplats_self_shadow"
+"""Property of lit ones: the self-shadow distance that they were made with."""
 
 
 def fits(data: Any, vertices: np.ndarray, faces: np.ndarray, away: float | None) -> bool:
@@ -78,10 +94,16 @@ def fill(
 
 
 def set_material(data: Any, material: Any) -> None:
-    """Puts ``material`` in the place of all materials of MeshSplats that ``data`` has, or else in the first
-    one, whose material moves to the end. Faces keep the numbers of their materials."""
+    """Puts ``material``, a new one, in the place of all materials of MeshSplats that ``data`` has, or else in
+    the first one, whose material moves to the end. Faces keep the numbers of their materials. One of them
+    that an artist has changed stays instead, or at least in the file (``_chosen``)."""
+    material[LOOK] = _look(material)
+    distance = _distance(material)
+    if distance is not None:
+        material[DISTANCE] = distance
     slots = data.materials
-    ours = [i for i, other in enumerate(slots) if other is not None and other.name.startswith(_NAMES)]
+    ours = _ours(slots)
+    material = _chosen([slots[i] for i in ours], material)
     if not ours:
         if len(slots) and slots[0] is not None:
             slots.append(slots[0])
@@ -99,6 +121,66 @@ def set_material(data: Any, material: Any) -> None:
     data.polygons.foreach_set("material_index", index)
     for i in reversed(ours[1:]):
         slots.pop(index=i)
+
+
+def _ours(slots: Any) -> list[int]:
+    """Indices of the materials of MeshSplats among ``slots``: by their names, or the first material if it was
+    made here and renamed since."""
+    found = [i for i, other in enumerate(slots) if other is not None and other.name.startswith(_NAMES)]
+    renamed = len(slots) > 0 and slots[0] is not None and LOOK in slots[0]
+    return found or [0] * renamed
+
+
+def _chosen(old: Iterable[Any], material: Any, *, shared: bool = False) -> Any:
+    """``material``, which is new, or in its place the first of the ``old`` ones that is of its kind and that
+    an artist has changed or renamed. Others of these stay in the file, and a note names them. ``shared``:
+    others use the old ones, too."""
+    chosen = material
+    for other in filter(_is_changed, old):
+        if chosen == material and other[LOOK] == material[LOOK]:
+            chosen = _like(other, material, shared=shared or other.users - other.use_fake_user > 1)
+        else:
+            other.use_fake_user = True
+            notes.add(f"your material {other.name} stays in the file, and gave its place to {material.name}")
+    if chosen != material:
+        bpy.data.materials.remove(material)
+    return chosen
+
+
+def _like(changed: Any, material: Any, *, shared: bool) -> Any:
+    """``changed``, or a copy of it if it is ``shared``, showing the light that ``material`` shows, with its
+    self-shadow distance, unless the artist has set that."""
+    if shared:
+        changed = changed.copy()
+    if materials.shows_even(material):
+        materials.set_even(changed)
+    else:
+        materials.set_baked(changed, materials.shows_baked(material))
+    if DISTANCE in material and _distance(changed) == changed[DISTANCE]:
+        changed.node_tree.nodes[materials.SELF_SHADOW].outputs[0].default_value = material[DISTANCE]
+        changed[DISTANCE] = material[DISTANCE]
+    return changed
+
+
+def _is_changed(material: Any) -> bool:
+    """Whether an artist has changed or renamed ``material`` since it was made here."""
+    if LOOK not in material:
+        return False
+    renamed = not material.name.startswith(_NAMES)
+    return renamed or _distance(material) != material.get(DISTANCE) or _look(material) != material[LOOK]
+
+
+def _look(material: Any) -> str:
+    """A checksum of the nodes of ``material`` and of what else images show of it, whatever light it shows and
+    whatever its self-shadow distance."""
+    nodes = light_state.nodes(material.node_tree, free=(materials.BAKED, materials.SELF_SHADOW))
+    parts = [nodes, material.pass_index, material.use_backface_culling, material.surface_render_method]
+    return f"{zlib.crc32(repr(parts).encode()):08x}"
+
+
+def _distance(material: Any) -> float | None:
+    node = material.node_tree.nodes.get(materials.SELF_SHADOW) if material.node_tree else None
+    return None if node is None else float(node.outputs[0].default_value)
 
 
 def part(data: Any, faces: np.ndarray) -> None:
@@ -148,12 +230,16 @@ def added(obj: Any) -> list[str]:
 
 
 def take_properties(data: Any, old: Any) -> None:
-    """Gives ``data`` the custom properties and further materials of the mesh ``old``, which it replaces."""
+    """Gives ``data`` the custom properties and further materials of the mesh ``old``, which it replaces, and
+    its first one where an artist has changed that (``_chosen``)."""
     for name in old.keys():  # noqa: SIM118 - no dictionary
         if name not in data and not name.startswith("meshsplats"):
             data[name] = old[name]
-    for material in old.materials:
-        if material is not None and not material.name.startswith(_NAMES):
+    ours = _ours(old.materials)
+    before = [old.materials[i] for i in ours]
+    data.materials[0] = _chosen(before, data.materials[0], shared=old.users > 0)
+    for i, material in enumerate(old.materials):
+        if material is not None and i not in ours:
             data.materials.append(material)
 
 

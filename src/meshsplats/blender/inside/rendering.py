@@ -24,13 +24,18 @@ _FEWER = 8
 def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
     """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view
     transform. Colours that are ``linear`` light are encoded for display (sRGB)."""
-    with _told(scene):
+    with told(scene):
         _exact(scene, engine, linear)
 
 
 def _exact(scene: Any, engine: str, linear: bool) -> None:
+    _choose(scene.display_settings, "display_device", "sRGB", "display")
     _common(scene, engine, "Standard" if linear else "Raw")
+    scene.render.dither_intensity = 0
+    scene.view_settings.use_curve_mapping = False
+    versions.set_if_there(scene.view_settings, use_white_balance=False)
     cycles = scene.cycles
+    cycles.film_exposure = 1.0
     cycles.samples = 1
     cycles.pixel_filter_type = "GAUSSIAN"
     # The first sample lies at the pixel's centre; a filter this narrow keeps it there.
@@ -50,19 +55,20 @@ def lit_settings(
     limit: int = 1024,
     bounces: int = 4,
     denoise: bool = False,
-    raytracing: bool = False,
+    raytracing: bool | None = None,
     exposure: float = 0.0,
 ) -> None:
-    """Settings for linear light, shown with the view transform Standard (sRGB).
+    """Settings for linear light, shown with the view transform Standard (sRGB). Limits on bounces are raised
+    where they are lower. What splats do not need stays the artist's: caustics, dither, the display.
 
     Args:
         samples: per pixel; four times as many to ``denoise`` in a Blender that cannot.
         limit: most layers that a ray may pass.
         bounces: how often light is scattered.
-        raytracing: EEVEE traces rays for mirrors and glass.
+        raytracing: whether EEVEE traces rays for mirrors and glass; None: as it does.
         exposure: in stops.
     """
-    with _told(scene):
+    with told(scene):
         if denoise and not versions.can_denoise():
             samples, denoise = 4 * samples, False
         _common(scene, engine, "Standard")
@@ -73,12 +79,10 @@ def lit_settings(
         # The mean over a pixel, as in ``render``: wider filters blur the detail of splats.
         cycles.pixel_filter_type = "BOX"
         cycles.filter_width = 1.0
-        cycles.max_bounces = max(bounces, 8)
-        cycles.diffuse_bounces = bounces
-        cycles.glossy_bounces = max(bounces, 4)
-        cycles.transmission_bounces = max(bounces, 8)
-        cycles.caustics_reflective = False
-        cycles.caustics_refractive = False
+        wanted = {"max_bounces": max(bounces, 8), "diffuse_bounces": bounces}
+        wanted |= {"glossy_bounces": max(bounces, 4), "transmission_bounces": max(bounces, 8)}
+        for name, least in wanted.items():
+            setattr(cycles, name, max(getattr(cycles, name), least))
         cycles.use_denoising = denoise
         versions.set_if_there(cycles, denoising_input_passes="RGB_ALBEDO_NORMAL", denoising_quality="HIGH")
         # The light tree skips lights behind a triangle, though its smoothed normal may face them.
@@ -87,7 +91,9 @@ def lit_settings(
         _layers(scene, limit, least=_FEW if denoise else limit)
         scene.eevee.taa_render_samples = samples
         scene.render.filter_size = 1.5
-        versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=raytracing)
+        versions.set_if_there(scene.eevee, use_shadows=True)
+        if raytracing is not None:
+            versions.set_if_there(scene.eevee, use_raytracing=raytracing)
 
 
 def preview_settings(scene: Any) -> None:
@@ -100,58 +106,100 @@ def preview_settings(scene: Any) -> None:
 def layers_alone(scene: Any, limit: int) -> None:
     """Lets rays pass ``limit`` layers, in a file whose other settings are the artist's."""
     if scene.cycles.transparent_max_bounces < limit:
-        with _told(scene):
+        with told(scene):
             scene.cycles.transparent_max_bounces = limit
 
 
-def splats_alone(scene: Any) -> None:
-    """Images of new files show what is rendered, nothing else, and all of it."""
-    scene.render.use_compositing = False
-    scene.render.use_sequencer = False
-    scene.render.use_border = False
+def new_file(scene: Any) -> None:
+    """Before ``exact_settings`` or ``lit_settings`` of a file that no artist has: what these leave alone.
+    Images are then the same everywhere, and take no longer than they need.
+
+    Raises:
+        TypeError: the colour management of this Blender (OCIO) has no such display or view.
+    """
+    scene.display_settings.display_device = "sRGB"
+    for view in ("Raw", "Standard"):
+        scene.view_settings.view_transform = view
+    scene.render.dither_intensity = 0
+    cycles = scene.cycles
+    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = cycles.transmission_bounces = 0
+    cycles.caustics_reflective = cycles.caustics_refractive = False
+
+
+_TOLD = {
+    **{"engine": "render.engine", "view": "view_settings.view_transform", "look": "view_settings.look"},
+    **{"exposure": "view_settings.exposure", "gamma": "view_settings.gamma"},
+    **{"curves": "view_settings.use_curve_mapping", "white balance": "view_settings.use_white_balance"},
+    **{"display": "display_settings.display_device", "dither": "render.dither_intensity"},
+    **{"Cycles samples": "cycles.samples", "adaptive sampling": "cycles.use_adaptive_sampling"},
+    **{"EEVEE samples": "eevee.taa_render_samples", "film exposure": "cycles.film_exposure"},
+    **{"denoising": "cycles.use_denoising", "denoising passes": "cycles.denoising_input_passes"},
+    **{"denoising quality": "cycles.denoising_quality", "light tree": "cycles.use_light_tree"},
+    **{"bounces": "cycles.max_bounces", "diffuse bounces": "cycles.diffuse_bounces"},
+    **{"glossy bounces": "cycles.glossy_bounces", "transmission bounces": "cycles.transmission_bounces"},
+    "transparent bounces": "cycles.transparent_max_bounces",
+    "least transparent bounces": "cycles.min_transparent_bounces",
+    **{"pixel filter": "cycles.pixel_filter_type", "filter width": "cycles.filter_width"},
+    **{"EEVEE filter": "render.filter_size", "EEVEE shadows": "eevee.use_shadows"},
+    "EEVEE ray tracing": "eevee.use_raytracing",
+}
+"""All settings that functions here change in an artist's file, by what notes call them."""
+_open: list[dict[str, Any]] = []
+"""Values of the settings when each of the nested ``told`` began."""
 
 
 @contextmanager
-def _told(scene: Any) -> Iterator[None]:
-    """A note says which of the settings that matter most to an artist were changed meanwhile."""
-    before = _main_settings(scene)
-    yield
-    after = _main_settings(scene)
+def told(scene: Any) -> Iterator[None]:
+    """A note says which settings were changed meanwhile; of nested ones, the outermost does."""
+    _open.append(_settings(scene))
+    try:
+        yield
+    finally:
+        before = _open.pop()
+    if _open:
+        return
+    after = _settings(scene)
     changes = [f"{name} {value} to {after[name]}" for name, value in before.items() if value != after[name]]
     if changes:
         notes.add(f"render settings changed: {', '.join(changes)}")
 
 
-def _main_settings(scene: Any) -> dict[str, Any]:
-    cycles, view = scene.cycles, scene.view_settings
-    return {
-        "view": view.view_transform,
-        "look": view.look,
-        "exposure": round(view.exposure, 3),
-        "Cycles samples": cycles.samples,
-        "EEVEE samples": scene.eevee.taa_render_samples,
-        "bounces": cycles.max_bounces,
-        "transparent bounces": cycles.transparent_max_bounces,
-        "denoising": "on" if cycles.use_denoising else "off",
-    }
+def _settings(scene: Any) -> dict[str, Any]:
+    """Values of ``_TOLD``, without those that this version of Blender lacks."""
+    found = {}
+    for name, path in _TOLD.items():
+        owner, setting = path.split(".")
+        value = getattr(getattr(scene, owner), setting, None)
+        if value is not None:
+            found[name] = ("off", "on")[value] if isinstance(value, bool) else value
+            if isinstance(value, float):
+                found[name] = f"{value:.3g}"
+    return found
 
 
 def _layers(scene: Any, limit: int, least: int | None = None) -> None:
     # A ray that passes more layers than the limit turns black. Beyond the minimum, it may end at random.
-    scene.cycles.transparent_max_bounces = limit
+    scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, limit)
     scene.cycles.min_transparent_bounces = limit if least is None else min(least, limit)
 
 
 def _common(scene: Any, engine: str, view: str) -> None:
     # Sets up both engines, so that the user can switch.
     scene.render.engine = versions.engine_name(engine)
-    scene.render.dither_intensity = 0
-    scene.display_settings.display_device = "sRGB"
-    scene.view_settings.view_transform = view
+    _choose(scene.view_settings, "view_transform", view, "view transform")
     scene.view_settings.look = "None"
     scene.view_settings.exposure = 0
     scene.view_settings.gamma = 1
-    scene.cycles.seed = 0
+
+
+def _choose(owner: Any, name: str, value: str, what: str) -> None:
+    """Sets the property ``name`` of ``owner``. Where the colour management (OCIO) is a studio's own, it may
+    lack the ``value``: then a note says so, and it stays as it is."""
+    try:
+        setattr(owner, name, value)
+    except TypeError:
+        stays = f"{getattr(owner, name)} stays: colours may differ"
+        notes.add(f"the colour management of this Blender has no {what} {value}, so that {stays}")
 
 
 def render_to(scene: Any, path: Path, factor: int = 1, *, scratch: Path | None = None) -> None:

@@ -16,6 +16,7 @@ from meshsplats.blender.inside import (
     materials,
     meshes,
     objects,
+    remaking,
     rendering,
     stage,
     stand_ins,
@@ -129,7 +130,7 @@ def build(
         away = float(np.linalg.norm(camera.center - subject.center))
         reach = 2 * (away + subject.reach) + 1000 * subject.radius * (options.light is not None)
         made.append(stage.add_camera(camera, camera.name or f"view_{i:04d}", rotation, reach, home))
-    rendering.splats_alone(scene)
+    rendering.new_file(scene)
     light = options.light
     if light is None:
         background = np.array(options.background or (0, 0, 0))
@@ -194,7 +195,7 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
     if light is None:
         if subject.harmonics is not None:
             meshes.store_harmonics(mesh, subject.harmonics)
-        mesh.materials.append(materials.unlit(terms=meshes.terms_of(subject.harmonics)))
+        remaking.set_material(mesh, materials.unlit(terms=meshes.terms_of(subject.harmonics)))
         return obj
     material = materials.lit(
         self_shadow=subject.self_shadow,
@@ -202,7 +203,7 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         specular=light.specular,
         smooth=subject.normals is not None,
     )
-    mesh.materials.append(material)
+    remaking.set_material(mesh, material)
     if subject.surface_vertices is not None:
         stand_ins.add(
             obj,

@@ -33,6 +33,10 @@ _AWAY = 2.5
 """Distance from which a viewport shows a subject, in radii of it, for a lens of 36 mm."""
 _START_CAMERA = (7.3589, -6.9258, 4.9583)
 """Where the camera stands that Blender starts with."""
+_START_LAMP = (4.0762, 1.0055, 5.9039)
+"""And the lamp."""
+_HID = "meshsplats_hid"
+"""Property of what ``hide_start_scene`` has hidden: who shows it again wants it."""
 _RENDERED = ("MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD")
 """Types of objects that images show."""
 _ROOM = 1.1
@@ -72,9 +76,11 @@ def set_up(
     viewer = None if view.camera is None else np.array(view.camera.matrix_world.translation)
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
-    objects.render_settings(view, objs, True, light)
-    if fast:
-        rendering.preview_settings(view)
+    versions.enable_cycles()
+    with rendering.told(view):
+        objects.render_settings(view, objs, True, light)
+        if fast:
+            rendering.preview_settings(view)
     baking.bake(view, objs, samples=(FAST if fast else CAREFUL).samples)
     return light
 
@@ -140,10 +146,14 @@ def _is_others(obj: Any) -> bool:
 
 
 def _is_start(obj: Any) -> bool:
-    """Whether ``obj`` is the cube or the lamp that Blender starts with."""
+    """Whether ``obj`` is the cube or the lamp that Blender starts with, as it is and where it is then."""
     if obj.type == "MESH":
-        return obj.name == "Cube" and len(obj.data.vertices) == 8 and not obj.location.length
-    return obj.type == "LIGHT" and obj.name == "Light" and obj.data.energy == 1000
+        if obj.name != "Cube" or len(obj.data.vertices) != 8 or len(obj.modifiers):
+            return False
+        large = bool((np.abs(versions.positions(obj.data)) == 1).all()) and tuple(obj.scale) == (1, 1, 1)
+        return large and _stands_at(obj, (0, 0, 0))
+    lamp = obj.type == "LIGHT" and obj.name == "Light" and obj.data.energy == 1000
+    return lamp and _stands_at(obj, _START_LAMP)
 
 
 def hide_start_scene(scene: Any) -> list[str]:
@@ -151,10 +161,11 @@ def hide_start_scene(scene: Any) -> list[str]:
     in the middle of what is imported, the other would be baked into its light. Returns their names."""
     if bpy.data.filepath:
         return []
-    hidden = []
+    hidden, layer = [], bpy.context.view_layer
+    layer.update()  # or it has objects of collections that were excluded just now
     for obj in scene.objects:
-        if _is_start(obj) and not obj.hide_render:
-            obj.hide_render = True
+        if _is_start(obj) and _HID not in obj and not obj.hide_render and obj.name in layer.objects:
+            obj.hide_render = obj[_HID] = True
             obj.hide_set(True)
             hidden.append(obj.name)
     return hidden
@@ -222,7 +233,11 @@ def _start_camera(scene: Any) -> Any:
 
 
 def _stands_at_start(camera: Any) -> bool:
-    return camera.name == "Camera" and np.allclose(camera.location, _START_CAMERA, atol=1e-3)
+    return camera.name == "Camera" and _stands_at(camera, _START_CAMERA)
+
+
+def _stands_at(obj: Any, place: tuple[float, float, float]) -> bool:
+    return np.allclose(obj.location, place, atol=1e-3)
 
 
 def _shown_size(scene: Any) -> tuple[float, float]:

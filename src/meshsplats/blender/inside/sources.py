@@ -7,18 +7,41 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import meshes, priors, stand_ins
+from meshsplats.blender.inside import frame, levels, meshes, priors, stand_ins
+from meshsplats.blender.inside.host import bpy
 from meshsplats.conversion.recovery import recover_splats
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 MADE = "meshsplats_made"
 """Property of an object: what ``_state`` was when its mesh was made from its file."""
+UP = "meshsplats_file_up"
+"""And which way was up in the file then."""
+_UP, _ORIGIN = "meshsplats_up", "meshsplats_origin"
+"""Properties of the mesh data; ``objects`` sets them."""
 
 
 def mark(obj: Any) -> None:
     """Remembers that the mesh of ``obj`` is what its file gave."""
+    if MADE not in obj:  # its import
+        obj[UP] = list(obj.data[_UP])
     obj[MADE] = _state(obj)
+
+
+def turn(obj: Any, up: np.ndarray, foot: np.ndarray) -> None:
+    """Stands ``obj`` upright again where its file was read with another ``up`` (3,) than before, and with its
+    ``foot`` (3,), in the frame of the file, where its origin was. Coarser levels follow the finest."""
+    from mathutils import Matrix, Vector
+
+    before = np.array(obj.get(UP, up))
+    obj[UP] = up.tolist()
+    if np.allclose(before, up, atol=1e-6) or obj != levels.with_levels(obj)[0]:
+        return
+    bpy.context.view_layer.update()
+    world, place = obj.matrix_world, obj.matrix_world.translation.copy()
+    turned = world.to_3x3() @ Matrix((frame.to_blender(before).T @ frame.to_blender(up)).tolist())
+    away = turned @ Vector((foot - np.array(obj.data[_ORIGIN])).tolist())
+    obj.matrix_world = Matrix.Translation(place - away) @ turned.to_4x4()
 
 
 def is_as_made(obj: Any) -> bool:

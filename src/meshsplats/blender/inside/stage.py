@@ -20,6 +20,13 @@ MADE = "meshsplats_stage"
 what they look like. Duplicates and what the artist has renamed have other names."""
 POSE = "meshsplats_pose"
 """Property of the cameras that were made here: where they were put."""
+LENS = "meshsplats_lens"
+"""And what their ``_lens`` was."""
+_LENS = (
+    *("type", "lens", "ortho_scale", "sensor_width", "sensor_height", "sensor_fit", "shift_x", "shift_y"),
+    *("clip_start", "clip_end"),
+)
+_FOCUS = ("use_dof", "focus_distance", "aperture_fstop")
 FADES = (1.5, 10.0)
 """Distances between which the ground fades, in radii of the subject."""
 
@@ -35,8 +42,8 @@ def collection(name: str, *, lasting: bool = False) -> Any:
 
 def clear(scene: Any = None) -> None:
     """Removes what was made here from the scene: collections, objects and world. What the artist has put into
-    these collections goes to the collection of the scene, as do cameras that were moved or animated, and the
-    world of the artist stays in the file; notes say so."""
+    these collections goes to the collection of the scene, as do cameras that were changed, and the world of
+    the artist stays in the file; notes say so."""
     scene = scene or bpy.context.scene
     kept = []
     for obj in [o for o in scene.objects if MADE in o]:
@@ -70,10 +77,10 @@ def clear(scene: Any = None) -> None:
 
 def is_artists(obj: Any) -> bool:
     """Whether ``obj`` is not, or no longer, what was made here: it was renamed or duplicated, or is a camera
-    that was moved or animated."""
+    that was moved or animated, or has another lens or focus."""
     if obj.get(MADE) != obj.name:
         return True
-    return obj.type == "CAMERA" and MADE in obj and _was_moved(obj)
+    return obj.type == "CAMERA" and MADE in obj and _was_changed(obj)
 
 
 def is_animated(camera: Any) -> bool:
@@ -81,11 +88,17 @@ def is_animated(camera: Any) -> bool:
     return any(part.animation_data is not None for part in (camera, camera.data)) or bool(camera.constraints)
 
 
-def _was_moved(camera: Any) -> bool:
-    if is_animated(camera):
+def _was_changed(camera: Any) -> bool:
+    lens = _lens(camera.data)
+    if is_animated(camera) or camera.get(LENS, lens) != lens:
         return True
     pose = [value for row in camera.matrix_basis for value in row]
     return not np.allclose(pose, list(camera.get(POSE, pose)), rtol=1e-5, atol=1e-6)
+
+
+def _lens(data: Any) -> str:
+    values = [getattr(data, name) for name in _LENS] + [getattr(data.dof, name) for name in _FOCUS]
+    return " ".join(f"{value:.6g}" if isinstance(value, float) else str(value) for value in values)
 
 
 def _ours(obj: Any, home: Any) -> Any:
@@ -110,6 +123,7 @@ def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, ho
     obj = bpy.data.objects.new(name, data)
     obj.matrix_world = Matrix(frame.camera_pose(camera, rotation).tolist())
     obj[POSE] = [value for row in obj.matrix_basis for value in row]
+    obj[LENS] = _lens(data)
     return _ours(obj, home)
 
 

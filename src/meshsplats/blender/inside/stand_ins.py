@@ -4,13 +4,13 @@ file."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, materials, meshes, versions
+from meshsplats.blender.inside import baking, homes, materials, meshes, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.meshes import STAND_IN as STAND_IN
 from meshsplats.blender.inside.splat_points import values
@@ -30,10 +30,12 @@ ROUGH = "meshsplats_rough"
 """Property of the object of lit splats: whether surface and colours for light are those of a preview."""
 SHAPE = "meshsplats_shape"
 """Property of lit splats: the ``shape`` that their mesh had when their stand-in was made."""
+RAYS = "meshsplats_rays"
+"""Property of splats with a stand-in: whether they were visible to shadow rays and to diffuse ones before."""
 
 
 def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow: float, home: Any) -> None:
-    """Gives the splats ``obj`` a stand-in: children of ``obj`` in the collection ``home``.
+    """Gives the splats ``obj`` a stand-in: children of ``obj``, in its collections.
 
     Cameras, mirrors and glass see the splats. Shadows, bounced light and occlusion come from the stand-in.
 
@@ -41,13 +43,15 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
         arrays: those of ``SPLATS`` and ``ARRAYS``, in the frame of the object.
         size: distance of neighbouring points, scene units.
         self_shadow: rays that start within this distance of the fine faces ignore them.
+        home: their collection where ``obj`` is in none.
     """
+    places = homes.without_physics(homes.of([obj])[obj]) or {home: "INCLUDE"}
     faces, colors, fine = arrays["surface_faces"], arrays["surface_colors"], arrays["fine_faces"]
     rgba = np.column_stack([colors, np.ones(len(colors), np.float32)])
     surface = meshes.make_mesh(f"{obj.name} stand-in", arrays["surface_vertices"], faces, rgba)
     surface.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
     surface.materials.append(materials.stand_in())
-    obj[SURFACE] = _child(obj, surface, home)
+    obj[SURFACE] = _child(obj, surface, places)
     if fine.any():
         used, index = np.unique(arrays["faces"][fine], return_inverse=True)
         thin = meshes.make_mesh(
@@ -57,11 +61,11 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
             arrays["colors"][used],
         )
         thin.materials.append(materials.stand_in("Stand-in, fine", fine=True, self_shadow=self_shadow))
-        obj[FINE] = _child(obj, thin, home)
+        obj[FINE] = _child(obj, thin, places)
     points = baking.make_points(
         f"{obj.name} light points", arrays["light_points"], arrays["light_normals"], size
     )
-    target = _child(obj, points, home)
+    target = _child(obj, points, places)
     target.visible_diffuse = target.visible_shadow = False
     target.visible_volume_scatter = True  # Cycles leaves out what no ray at all can see
     target.hide_select = False
@@ -70,11 +74,13 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     obj[baking.POINTS] = target
     index_of = obj.data.attributes.get(baking.POINT) or obj.data.attributes.new(baking.POINT, "INT", "POINT")
     index_of.data.foreach_set("value", np.ascontiguousarray(arrays["light_point_of"], np.int32))
+    obj[RAYS] = [obj.visible_shadow, obj.visible_diffuse]
     obj.visible_shadow = obj.visible_diffuse = False
 
 
-def _child(obj: Any, mesh: Any, home: Any) -> Any:
-    """A child of ``obj`` at its place, invisible to cameras, mirrors and glass."""
+def _child(obj: Any, mesh: Any, places: homes.Homes) -> Any:
+    """A child of ``obj`` at its place and in the collections ``places``, invisible to cameras, mirrors and
+    glass."""
     child = bpy.data.objects.new(mesh.name, mesh)
     child[STAND_IN], child[OWNER] = True, obj
     for way in ("camera", "glossy", "transmission", "volume_scatter"):
@@ -82,7 +88,7 @@ def _child(obj: Any, mesh: Any, home: Any) -> Any:
     child.parent = obj
     child.display_type = "BOUNDS"  # viewports draw the edges of wires over the splats
     child.hide_select = True
-    home.objects.link(child)
+    homes.put(child, {}, places)
     _tie(child)
     return child
 
@@ -97,16 +103,25 @@ def _tie(child: Any) -> None:
     variable.targets[0].data_path = "hide_render"
 
 
+def has_strays(scene: Any) -> bool:
+    """Whether what was made here for splats of ``scene`` lacks these, is not where they are, or not hidden as
+    they are. Asked after every change of the scene."""
+    made = [obj for obj in scene.objects if STAND_IN in obj]
+    return any(obj.parent is None for obj in made) or any(
+        mine != wanted or not (_is_points(obj) or _is_hidden_alike(obj, obj.parent))
+        for obj, mine, wanted in _places(made)
+    )
+
+
 def follow(scene: Any) -> None:
     """Moves what was made for splats to the collections that they were moved to, so that it is excluded and
-    hidden with these, and hides it in viewports where they are hidden."""
-    for obj in [o for o in scene.objects if _hangs(o)]:
-        mine, wanted = _homes(obj), _homes(obj.parent)
-        for home in wanted - mine:
-            home.objects.link(obj)
-        for home in mine - wanted:
-            home.objects.unlink(obj)
-        if obj == baking.points_of(obj.parent):
+    hidden with these, and light linking takes it for them; and hides it in viewports where they are hidden.
+    It is no rigid body where they are."""
+    for obj, mine, wanted in _places([obj for obj in scene.objects if obj.get(STAND_IN)]):
+        if not wanted:  # they were deleted
+            continue
+        homes.put(obj, mine, wanted)
+        if _is_points(obj):
             continue
         if obj.hide_viewport != obj.parent.hide_viewport:  # each assignment is an update
             obj.hide_viewport = obj.parent.hide_viewport
@@ -117,12 +132,23 @@ def follow(scene: Any) -> None:
             _tie(obj)
 
 
-def _hangs(obj: Any) -> bool:
-    return bool(obj.get(STAND_IN)) and obj.parent is not None and bool(obj.parent.users_collection)
+def _places(made: Iterable[Any]) -> Iterator[tuple[Any, homes.Homes, homes.Homes]]:
+    """Of those that were ``made`` here and have splats: the object, the collections that it is in, and those
+    that it belongs in."""
+    parts = [obj for obj in made if obj.parent is not None]
+    if parts:
+        found = homes.of([*parts, *(part.parent for part in parts)])
+        for part in parts:
+            yield part, found[part], homes.without_physics(found[part.parent])
 
 
-def _homes(obj: Any) -> set[Any]:
-    return set(obj.users_collection)
+def _is_points(obj: Any) -> bool:
+    """Whether ``obj``, made for its parent, is the points of its light, which are always hidden."""
+    return bool(obj.parent.get(baking.POINTS) == obj)
+
+
+def _is_hidden_alike(obj: Any, owner: Any) -> bool:
+    return bool(obj.hide_viewport == owner.hide_viewport and obj.hide_get() == owner.hide_get())
 
 
 def shape(data: Any) -> str:
@@ -177,9 +203,10 @@ def _delete(obj: Any) -> None:
 
 
 def remove(obj: Any) -> None:
-    """Removes the stand-in of ``obj``, which then casts its own shadow."""
+    """Removes the stand-in of ``obj``, which then casts its own shadow, if it did so before."""
     for child in [c for c in obj.children if c.get(STAND_IN)]:
         _delete(child)
-    for name in (baking.POINTS, SURFACE, FINE):
+    if baking.POINTS in obj:
+        obj.visible_shadow, obj.visible_diffuse = map(bool, obj.get(RAYS, (True, True)))
+    for name in (baking.POINTS, SURFACE, FINE, RAYS):
         obj.pop(name, None)
-    obj.visible_shadow = obj.visible_diffuse = True
