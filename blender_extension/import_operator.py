@@ -61,7 +61,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
     at_origin: BoolProperty(
         name="Move to World Origin",
         description="Stand it on the centre of the grid. Otherwise it keeps the place that its file gives it,"
-        " with others of the same capture",
+        " with others of the same capture, and beside earlier ones where coordinates are those of the world",
         default=False,
     )
 
@@ -99,7 +99,7 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
         return self.begin(context, Work(paths, choices | {"fast": context.scene.meshsplats_fast}))
 
     def done(self, context, work):
-        from meshsplats.blender.inside import objects, priors, sources
+        from meshsplats.blender.inside import objects, placing, sources
 
         objs = []
         for result in work.results:
@@ -115,11 +115,8 @@ class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHe
                 sources.mark(obj)
             result.remember_views(made[0])
             objs.append(made[0])
-        if self.at_origin:  # all by the same way: files of one capture keep their places to each other
-            roots = [priors.base_of(obj) or obj for obj in objs]
-            away = objects.foot_of(roots[0], work.results[0].prepared[0])
-            for root in roots:
-                root.location -= away
+        prepared = [result.prepared[0] for result in work.results]
+        placing.place(context.scene, objs, prepared, centred=self.at_origin)
         settle(self, context, objs)
         if not bpy_background():
             bpy.ops.ed.undo_push(message=self.bl_label)

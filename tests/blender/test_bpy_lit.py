@@ -126,6 +126,32 @@ def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):
             bpy.data.objects.remove(sun)
 
 
+def test_a_small_object_throws_its_shadow_on_what_is_near(tmp_path):
+    """Rays ignore layers within a distance that shrinks with the object."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    versions.enable_cycles()
+    home = stage.collection("all")
+    square = 3 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces, grey = np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.5, 0.5, 0.5, 1], (4, 1))
+    data = meshes.make_mesh("m", square, faces, grey, normals=np.tile([0.0, 0, 1], (4, 1)))
+    data.materials.append(materials.lit(self_shadow=0.1))
+    meshes.make_object(data, "m", np.eye(3), home).scale = (0.01, 0.01, 0.01)
+    floor = meshes.make_mesh("floor", square, faces, grey)
+    floor.materials.append(materials.plain("Grey", (0.5, 0.5, 0.5)))
+    meshes.make_object(floor, "floor", np.eye(3), home).location.z = -0.02
+    stage.even_world((0, 0, 0))
+    stage.add_sun(np.array([0.0, 0, 1]), np.pi, 0, 0.01, home)
+    rendering.lit_settings(bpy.context.scene, "cycles", samples=1, limit=64, bounces=0)
+    found = []
+    for middle in (0.0, 0.2):
+        view = look_at((0.5, 0, 0.1), (middle, 0, -0.02), up=(0, 0, 1), width=8, height=8, fov=1)
+        camera = stage.add_camera(view, "c", np.eye(3), 100, home)
+        stage.aim(bpy.context.scene, view, camera)
+        rendering.render_to(bpy.context.scene, tmp_path / "a.exr")
+        found.append(rendering.read_pixels(tmp_path / "a.exr")[..., 0].mean())
+    assert found[0] < 0.5 * found[1]
+
+
 @pytest.mark.nightly
 def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
     """Slow without a graphics card: one small scene for both. All light on the ground is the sun's."""

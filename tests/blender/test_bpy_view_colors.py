@@ -10,12 +10,24 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
+import bmesh
+from _blender_scenes import ball_splats, random_mesh
 from _eevee import draw_by_eevee
 from _local import shared_data
+from mathutils import Matrix
 
 from meshsplats import convert, load_gaussians, orbit, render, save_mesh
 from meshsplats.blender import SceneOptions, draw
-from meshsplats.blender.inside import foreign, frame, meshes, objects, versions
+from meshsplats.blender.inside import (
+    exporting,
+    far_to_near,
+    foreign,
+    frame,
+    meshes,
+    objects,
+    turning,
+    versions,
+)
 from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
@@ -80,8 +92,114 @@ def test_an_object_gives_its_harmonics_back(degree):
     assert meshes.read_harmonics(obj.data).shape == (len(mesh.vertices), mesh.harmonics.shape[1], 3)
 
 
+@pytest.fixture
+def followed():
+    """An empty scene with the handler of the extension."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    handlers = bpy.app.handlers.depsgraph_update_post
+    handlers.append(lambda _, depsgraph: far_to_near.after_update(depsgraph))
+    yield bpy.context.scene
+    handlers.clear()
+
+
+def balls(scene, count):
+    """Selected objects, each turned in its own way, the first one active."""
+    made = []
+    for i in range(count):
+        cloud = ball_splats(60, seed=i)[0]
+        sh = np.concatenate([cloud.sh, np.random.default_rng(i).normal(0, 0.2, (60, 3, 3))], axis=1)
+        mesh = convert(replace(cloud, sh=sh))
+        obj = objects.add(objects.prepare(mesh, False), "ball", scene.collection)
+        obj.rotation_euler, obj.location.x = (0.4 + i, 0.2, 1 - i), 3 * i
+        made.append(obj)
+    bpy.context.view_layer.update()
+    for obj in made:
+        obj.select_set(True)
+    bpy.context.view_layer.objects.active = made[0]
+    return made
+
+
+def assert_seen_alike(obj, before):
+    """In exports, and by the attributes that the material reads."""
+    bpy.context.view_layer.update()
+    after = exporting.exported([obj])
+    np.testing.assert_allclose(after.vertices, before.vertices, atol=1e-5)
+    np.testing.assert_allclose(after.harmonics, before.harmonics, atol=0.01)
+    own = meshes.read_harmonics(obj.data, after.faces[after.splats.starts, 0])
+    turn = np.array(obj.matrix_world)[:3, :3]
+    np.testing.assert_allclose(moved_harmonics(own, turn), before.harmonics, atol=0.01)
+
+
+def test_colours_stay_where_a_rotation_is_applied(followed):
+    (obj,) = balls(followed, 1)
+    before = exporting.exported([obj])
+    bpy.ops.object.transform_apply()
+    assert_seen_alike(obj, before)
+    obj.scale.x = -1
+    bpy.context.view_layer.update()
+    mirrored = exporting.exported([obj]).harmonics
+    bpy.ops.object.transform_apply()
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(exporting.exported([obj]).harmonics, mirrored, atol=0.01)
+    assert np.abs(mirrored - before.harmonics).max() > 0.2
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_colours_stay_where_objects_are_joined(followed, count):
+    objs = balls(followed, count)
+    before = exporting.exported(objs)
+    bpy.ops.object.join()
+    assert_seen_alike(objs[0], before)
+
+
+def test_colours_turn_with_splats_that_are_turned(followed):
+    (obj,) = balls(followed, 1)
+    obj.matrix_world = Matrix()
+    bpy.context.view_layer.update()
+    before = exporting.exported([obj])
+    turn = np.array(Matrix.Rotation(1.2, 3, (1, 2, 3)))
+    half = before.splats.of_vertex >= 30
+    places = versions.positions(obj.data)
+    places[half] = places[half] @ turn.T
+    versions.set_positions(obj.data, places)
+    obj.data.update()
+    bpy.context.view_layer.update()
+    found = meshes.read_harmonics(obj.data, before.faces[before.splats.starts, 0])
+    np.testing.assert_array_equal(found[:30], before.harmonics[:30])
+    np.testing.assert_allclose(found[30:], moved_harmonics(before.harmonics[30:], turn), atol=0.01)
+    cut = bmesh.new()
+    cut.from_mesh(obj.data)
+    cut.verts.ensure_lookup_table()
+    bmesh.ops.delete(cut, geom=[cut.verts[2], cut.verts[3]], context="VERTS")
+    cut.to_mesh(obj.data)
+    cut.free()
+    bpy.context.view_layer.update()
+    after = exporting.exported([obj])
+    np.testing.assert_allclose(after.harmonics, found, atol=0.02, err_msg="a part of a splat is not turned")
+
+
+def test_normals_turn_with_the_mesh(followed):
+    mesh = random_mesh(50)
+    normals = np.repeat(np.random.default_rng(0).normal(size=(50, 3)), 3, axis=0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    data = meshes.make_mesh(
+        "m", mesh.vertices, mesh.faces, mesh.colors, normals=normals, face_splat=mesh.face_splat
+    )
+    turning.remember(data)
+    turn = Matrix.Rotation(1.2, 4, (1, 2, 3))
+    data.transform(turn)
+    turning.follow(data)
+    found = np.empty(normals.size, np.float32)
+    data.attributes[meshes.NORMAL].data.foreach_get("vector", found)
+    np.testing.assert_allclose(found.reshape(-1, 3), normals @ np.array(turn)[:3, :3].T, atol=1e-3)
+    turning.follow(data)  # once
+    again = np.empty_like(found)
+    data.attributes[meshes.NORMAL].data.foreach_get("vector", again)
+    np.testing.assert_array_equal(again, found)
+
+
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_a_glb_with_texture_coordinates_has_its_harmonics_after_a_click(degree, tmp_path):
+def test_a_glb_with_texture_coordinates_has_its_harmonics_after_a_click(extension, degree, tmp_path):
     mesh = replace(colorful(degree), up=np.array([0, 0, 1], np.float32))
     save_mesh(mesh, tmp_path / "m.glb", harmonics="texcoords")
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -97,5 +215,6 @@ def test_a_glb_with_texture_coordinates_has_its_harmonics_after_a_click(degree, 
     largest = np.abs(mesh.harmonics).max()
     np.testing.assert_allclose(found.harmonics, expected, atol=0.02 * largest)
     np.testing.assert_allclose(found.colors, mesh.colors, atol=0.01)
-    objects.dress(obj, lit=False)
+    bpy.context.view_layer.objects.active = obj
+    bpy.ops.object.meshsplats_shading(shading="unlit")
     assert meshes.read_harmonics(obj.data) is not None

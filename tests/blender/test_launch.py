@@ -7,6 +7,7 @@ import errno
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -216,6 +217,21 @@ time.sleep(600)
         assert _alive(child)
         process.kill()
     assert _until(lambda: not _alive(child))
+
+
+def test_the_worker_takes_nothing_from_beside_the_package(tmp_path):
+    """Where it is installed from a wheel, NumPy for another Python than Blender's lies there."""
+    package = Path(launch.__file__).parents[1]
+    beside = tmp_path / "site-packages"
+    shutil.copytree(package, beside / "meshsplats", ignore=shutil.ignore_patterns("__pycache__", "page"))
+    (beside / "numpy").mkdir()
+    (beside / "numpy" / "__init__.py").write_text("raise ImportError('for another Python')\n")
+    job = tmp_path / "job.json"
+    job.write_text("no job")
+    script = beside / "meshsplats" / "blender" / "inside" / "worker.py"
+    ran = subprocess.run([sys.executable, "-I", script, "--", job], capture_output=True, text=True)
+    assert "for another Python" not in ran.stdout + ran.stderr
+    assert "JSONDecodeError" in ran.stdout or "No module named 'bpy'" in ran.stdout
 
 
 def test_the_pipe_ends_the_worker(monkeypatch):

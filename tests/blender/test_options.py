@@ -91,6 +91,47 @@ def test_named_lights_and_what_is_said_instead():
     assert light("sun", sky=0.0, mirror=True) == replace(LIGHTS["sun"], sky=0.0, mirror=True)
 
 
+def test_an_environment_image_lights_without_a_second_sun(tmp_path):
+    from meshsplats.blender.files import PictureOptions
+    from meshsplats.cli.blender import BlenderOptions, LightArguments
+
+    sky = tmp_path / "sky.hdr"
+
+    def sun(lights=None, **given):
+        return BlenderOptions(lit=True, lights=lights, light=LightArguments(hdri=sky, **given)).named_light()
+
+    alone = PictureOptions(lit=True, light=LightOptions(hdri=sky)).named_light()
+    assert sun() == alone
+    assert (alone.sun_strength, alone.fill) == (0, 0)
+    assert sun("sun").sun_strength == sun(sun=(0, 30)).sun_strength == LIGHTS["sun"].sun_strength
+    assert sun("noon").sun_strength == LIGHTS["noon"].sun_strength
+    assert sun(sun_strength=1.5).sun_strength == 1.5
+
+
+def test_a_catcher_has_no_background(tmp_path):
+    from meshsplats.blender.files import PictureOptions
+    from meshsplats.errors import OptionsError
+
+    caught = PictureOptions(lit=True, light=LightOptions(ground="catcher"))
+    caught.scene_options(tmp_path / "a.png")
+    with pytest.raises(OptionsError, match="ground catcher, whose images have an alpha channel"):
+        replace(caught, background="#336699").scene_options(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name", ["lit.png", "lit.blend", "views/cameras.json", "views/view_0000.png"])
+def test_what_exists_is_refused_before_views_are_looked_for(tmp_path, monkeypatch, name):
+    from meshsplats.blender import files
+
+    there = tmp_path / name
+    there.parent.mkdir(exist_ok=True)
+    there.write_bytes(b"mine")
+    output = there if there.parent == tmp_path else there.parent
+    monkeypatch.setattr(files, "command", lambda executable: [])
+    run = files.PictureRun(tmp_path / "not read.ply", output, files.PictureOptions(lit=True))
+    with pytest.raises(FileExistsError, match=there.name):
+        run.save()
+
+
 @pytest.mark.parametrize(
     ("terms", "options", "seconds"),
     [

@@ -94,8 +94,16 @@ class PictureOptions:
         return self.lit or self.fast or self.lights is not None
 
     def named_light(self) -> LightOptions:
-        """The light of ``lights``, with those options of ``light`` that are not as by default."""
+        """The light of ``lights``, with those options of ``light`` that are not as by default. An environment
+        image lights alone, unless ``lights`` or an option of the sun is given.
+
+        In Python, a value that is the default of ``LightOptions`` cannot be told from none: for such a change
+        of a named light, leave out ``lights`` and give ``replace(LIGHTS["noon"], sun_strength=2.5)`` as
+        ``light``.
+        """
         given = {name: getattr(self.light, name) for name in changed(self.light)}
+        if "hdri" in given and self.lights is None and not any(name.startswith("sun") for name in given):
+            given["sun_strength"] = 0.0
         return replace(LIGHTS[self.lights or "sun"], **given)
 
     def scene_options(self, output: Path) -> SceneOptions:
@@ -122,6 +130,11 @@ class PictureOptions:
             raise OptionsError("``format`` is for a folder of images: the name given with ``output`` decides")
         if self.light.hdri is not None and self.background != "white":
             raise OptionsError("``background`` has no effect with ``hdri``, which is the background")
+        if self.light.ground == "catcher" and self.background != "white":
+            raise OptionsError(
+                "``background`` has no effect with ``ground`` catcher, whose images have an alpha channel:"
+                " leave it out, or choose a plane or none"
+            )
         samples = self.samples
         if samples is None:
             lit = FAST_SAMPLES if self.fast else LIT_SAMPLES
@@ -221,6 +234,14 @@ class PictureRun:
         options = chosen.scene_options(self.output)
         chain = self._chain(suffix)
         command(chosen.executable)
+        blend = [self.output] if suffix == ".blend" else []
+        records = [
+            beside(self.output, record) if suffix else self.output / record
+            for record in (CAMERAS, CONFIGURATION)
+        ]
+        # Before views are looked for, which takes longest; how many images a folder gets is known after it.
+        folder = None if suffix else self.output
+        check_outputs([*self._images(suffix, 1), *blend, *records], force, folder)
         tileset = open_tileset(self.source, crop=chosen.part.crop, max_error=chosen.max_error)
         scene, *coarser = [outline(tileset)] if tileset else self._scenes(chain)
         count = 1 if suffix else 60
@@ -235,13 +256,7 @@ class PictureRun:
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise OptionsError(f"{len(cameras):,} views do not fit one {suffix}: give ``output`` a folder")
         images = self._images(suffix, len(cameras))
-        blend = self.output if suffix == ".blend" else None
-        records = [
-            beside(self.output, record) if suffix else self.output / record
-            for record in (CAMERAS, CONFIGURATION)
-        ]
-        every = [*images, *([blend] if blend else []), *records]
-        check_outputs(every, force, None if suffix else self.output)
+        check_outputs([*images, *blend, *records], force, folder)
         mesh = self._tiles(tileset, cameras) if tileset else chosen.converted(scene, self.source)
         subject: SplatMesh | LevelMeshes = mesh
         if chain:
@@ -253,7 +268,7 @@ class PictureRun:
             subject,
             cameras,
             images=images,
-            blend=blend,
+            blend=self.output if blend else None,
             options=options,
             executable=chosen.executable,
             announce=lambda ahead: self.say(in_words(ahead, options, len(images))),

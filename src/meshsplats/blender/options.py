@@ -39,14 +39,15 @@ class LightOptions:
     sky_color: Annotated[tuple[float, float, float], "RGB", Advanced] = (1.0, 1.0, 1.0)
     """Colour of that sky: linear R G B, 0 to 1; ``sky`` is multiplied by it."""
     hdri: Path | None = None
-    """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
+    """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it. There is
+    no sun beside it, unless ``lights`` or an option of the sun is given."""
     hdri_strength: Annotated[float, Range(0, 1e6), Advanced] = 1.0
     """Factor on the environment image."""
     hdri_rotation: Annotated[float, Range(-1e6, 1e6), Advanced] = 0.0
     """Degrees that the environment is rotated about the up direction."""
     ground: Ground = "plane"
     """Ground under the subject: a grey plane that fades into the background; a catcher, visible only where
-    shadows fall (Cycles); or none."""
+    shadows fall (Cycles), for images with an alpha channel and no background; or none."""
     exposure: Annotated[float, Range(-20, 20)] = 0.35
     """Brightness added for display, in stops: with 0.35, a white plate that lies or faces the
     viewer looks white. Values of an .exr and the background do not change."""
@@ -132,7 +133,8 @@ class SceneOptions:
     samples: Annotated[int, Range(1, 65536)] = 1
     """Unlit: side of the grid of samples in each pixel, as in ``render``. Lit: samples per pixel."""
     background: Annotated[tuple[float, float, float] | None, "RGB"] = (1.0, 1.0, 1.0)
-    """Display RGB behind everything; None: transparent. An environment image replaces it."""
+    """Display RGB behind everything; None: transparent, as with a catcher. An environment image replaces
+    it."""
     denoise: bool = False
     """Cycles, lit: remove noise with OpenImageDenoise."""
     threads: Annotated[int | None, Range(1, math.inf)] = None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import meshes, objects
+from meshsplats.blender.inside import meshes, objects, scene_linear
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.mesh import MAX_COLOR
 
@@ -46,7 +46,6 @@ def adjust(data: Any, change: Adjustment) -> None:
     """Applies ``change`` to the splat mesh ``data``, unlit or lit: colours, those that depend on the view,
     and opacities."""
     matrix, shift = change.color_map
-    shown = meshes.read_colors(data, meshes.COLOR)
     before = objects.unlit_colors(data)
     lit, linear = data[objects.LIT], data[objects.LINEAR]
     display = linear_to_srgb(before[:, :3]) if linear else before[:, :3]
@@ -58,12 +57,13 @@ def adjust(data: Any, change: Adjustment) -> None:
     if not lit:
         if linear:
             after[:, :3] = light
-        _store(data, meshes.COLOR, after)
+        _store(data, meshes.COLOR, scene_linear.from_rec709(after) if linear else after)
         harmonics = meshes.read_harmonics(data)
         if harmonics is not None:
             meshes.store_harmonics(data, (harmonics @ matrix.T).astype(np.float32))
     else:
         # The factor and the exponent that fit a lit splat's colours to linear light stay.
+        shown = scene_linear.to_rec709(meshes.read_colors(data, meshes.COLOR))
         old = before[:, :3] if linear else srgb_to_linear(before[:, :3])
         fitted = np.where(old > _DARK, shown[:, :3] / np.maximum(old, _DARK), 1)
         clear = np.log1p(-np.minimum(before[:, 3], np.float32(0.9999)))
@@ -76,6 +76,7 @@ def adjust(data: Any, change: Adjustment) -> None:
         made[:, 3] = np.where(after[:, 3] >= 1, 1, opaque)
         if linear:
             after[:, :3] = light
+        made = scene_linear.from_rec709(made)
         for name, values in ((meshes.COLOR, made), (meshes.MADE, made), (meshes.DISPLAY, after)):
             _store(data, name, values)
     data.update()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._arrays import subsample
-from meshsplats.blender.inside import meshes, sorted_copies, versions
+from meshsplats.blender.inside import meshes, sorted_copies, turning, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.sorted_copies import CENTER, SORTED, VIEW
 
@@ -47,8 +47,10 @@ def add(obj: Any, *, viewport: bool = True) -> Any:
 
 def renew() -> None:
     """Has the modifiers of files that an earlier release saved sort by where splats are, not by where they
-    are at rest."""
+    are at rest, and their meshes know when they are turned, as those of the command."""
     for obj in bpy.data.objects:
+        if obj.type == "MESH" and not obj.data.library and turning.REST not in obj.data.attributes:
+            turning.remember(obj.data)
         found = modifier_of(obj) if obj.type == "MESH" and not obj.library else None
         if found is None or obj.override_library or _is_latest(found.node_group):
             continue
@@ -72,11 +74,12 @@ def modifier_of(obj: Any) -> Any:
     return next((m for m in obj.modifiers if m.type == "NODES" and m.name.startswith(MODIFIER)), None)
 
 
-def set_centers(data: Any) -> None:
+def set_centers(data: Any) -> bool:
     """Stores with the mesh ``data`` the centres of its splats, if they have changed: those of faces that lie
-    side by side and belong to one splat; where faces have no splats, each is one."""
+    side by side and belong to one splat; where faces have no splats, each is one. Returns whether they
+    have."""
     if not len(data.polygons):
-        return
+        return False
     middles = meshes.face_middles(data)
     if meshes.SPLAT in data.attributes:
         owner = meshes.owners(data)
@@ -93,8 +96,9 @@ def set_centers(data: Any) -> None:
         before = np.empty(len(centers), np.float32)
         attribute.data.foreach_get("vector", before)
         if (before == centers).all():
-            return
+            return False
     attribute.data.foreach_set("vector", centers)
+    return True
 
 
 def _in_steps(places: np.ndarray) -> np.ndarray:
@@ -138,9 +142,9 @@ def follow_camera(scene: Any) -> None:
 
 
 def after_update(depsgraph: Any) -> None:
-    """Finds the centres of splats again after edits of their meshes, and has nodes sort those that were
-    edited or turned, a handler of ``depsgraph_update_post``. While a mesh is in edit mode, it is drawn in its
-    own order."""
+    """Finds the centres of splats again after edits of their meshes, with what turns along, and has nodes
+    sort those that were edited or turned, a handler of ``depsgraph_update_post``. While a mesh is in edit
+    mode, it is drawn in its own order."""
     for update in depsgraph.updates:
         changed = update.id.original
         if isinstance(changed, bpy.types.Object):
@@ -151,8 +155,8 @@ def after_update(depsgraph: Any) -> None:
             for obj in sorted_objects(depsgraph.scene):
                 if obj.data == changed and sorted_copies.is_stale(modifier_of(obj)):
                     sorted_copies.drop(modifier_of(obj))
-            if not changed.is_editmode:
-                set_centers(changed)
+            if not changed.is_editmode and set_centers(changed):
+                turning.follow(changed)
 
 
 def drop_copies() -> None:

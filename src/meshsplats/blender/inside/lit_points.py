@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import baking, frame, materials, splat_points, stand_ins, views
+from meshsplats.blender.inside import (
+    baking,
+    frame,
+    materials,
+    scene_linear,
+    splat_points,
+    stand_ins,
+    views,
+)
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.materials import LIT
 from meshsplats.blender.inside.stand_ins import ROUGH
@@ -110,6 +118,8 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
     data = obj.data
     if len(data.points) != len(prepared["splat_colors"]):
         raise ValueError(f"{obj.name} was edited meanwhile")
+    linear = ("colors", "surface_colors", "splat_colors")
+    prepared = prepared | {name: scene_linear.from_rec709(prepared[name]) for name in linear}
     unlight(obj)
     data = _own(obj)
     _store(data, splat_points.COLOR, "FLOAT_COLOR", "color", prepared["splat_colors"])
@@ -125,7 +135,7 @@ def light(obj: Any, prepared: dict[str, Any]) -> None:
         prepared,
         prepared["light_spacing"],
         self_shadow=prepared["self_shadow"],
-        home=obj.users_collection[0] if obj.users_collection else bpy.context.scene.collection,
+        home=bpy.context.scene.collection,
     )
     obj[stand_ins.SHAPE] = stand_ins.shape(data)
     obj[ROUGH] = prepared["fast"]

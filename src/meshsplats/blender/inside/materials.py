@@ -90,8 +90,8 @@ def lit(
 
     Many translucent layers form one surface, so each is shaded by the smoothed normal of that surface
     (attribute ``splat_normal``; ``smooth`` False: by the triangle's own). Rays that start on a layer ignore
-    layers within ``self_shadow`` (scene units), which would shade half of it at random. Shadows of objects
-    farther away stay.
+    layers within ``self_shadow`` (units of the mesh), which would shade half of it at random. Shadows of
+    objects farther away stay.
     """
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
@@ -125,11 +125,9 @@ def lit(
         tree.link(shader, coat.inputs[1])
         tree.link(gloss.outputs[0], coat.inputs[2])
         shader = coat.outputs[0]
-    path = tree.node("ShaderNodeLightPath", 0, 5)
     distance = tree.node("ShaderNodeValue", 0, 7, name=SELF_SHADOW, label=SELF_SHADOW)
     distance.outputs[0].default_value = self_shadow
-    seen = tree.math("GREATER_THAN", 1, 5, path.outputs["Ray Length"], distance.outputs[0])
-    alpha = tree.math("MULTIPLY", 2, 5, color.outputs["Alpha"], seen)
+    alpha = tree.math("MULTIPLY", 2, 5, color.outputs["Alpha"], _beyond(tree, distance.outputs[0]))
     baked = tree.node("ShaderNodeValue", 0, 8, name=BAKED, label=BAKED)
     baked.outputs[0].default_value = 0
     glow = _glow(tree, color.outputs["Color"], baked.outputs[0])
@@ -222,6 +220,19 @@ def _polynomial(tree: _Tree, d: tuple[Any, Any, Any], k: int) -> Any:
     return total
 
 
+def _beyond(tree: _Tree, distance: Any) -> Any:
+    """Output that is 1 for rays longer than ``distance``, which grows with the object; else 0."""
+    path = tree.node("ShaderNodeLightPath", 0, 5)
+    unit = tree.node(
+        "ShaderNodeVectorTransform", -2, 7, vector_type="VECTOR", convert_from="OBJECT", convert_to="WORLD"
+    )
+    unit.inputs["Vector"].default_value = (3**-0.5, 3**-0.5, 3**-0.5)
+    scale = tree.node("ShaderNodeVectorMath", -1, 7, operation="LENGTH")
+    tree.link(unit.outputs[0], scale.inputs[0])
+    scaled = tree.math("MULTIPLY", 1, 7, scale.outputs["Value"], distance)
+    return tree.math("GREATER_THAN", 1, 5, path.outputs["Ray Length"], scaled)
+
+
 def set_baked(material: Any, baked: bool) -> None:
     """Has the lit ``material`` show baked light, or that of the scene's lamps."""
     _set_light(material, float(baked))
@@ -259,7 +270,7 @@ def stand_in(name: str = "Stand-in", *, fine: bool = False, self_shadow: float =
 
     Light that leaves through it from below passes, so that places under it are lit like those above.
     ``fine``: splats instead, translucent and seen from both sides, which rays that start within
-    ``self_shadow`` ignore.
+    ``self_shadow`` (units of the mesh) ignore.
     """
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
@@ -270,9 +281,7 @@ def stand_in(name: str = "Stand-in", *, fine: bool = False, self_shadow: float =
     mix = tree.node("ShaderNodeMixShader", 2, 1)
     out = tree.node("ShaderNodeOutputMaterial", 3, 1)
     if fine:
-        path = tree.node("ShaderNodeLightPath", 0, 3)
-        seen = tree.math("GREATER_THAN", 1, 3, path.outputs["Ray Length"], self_shadow)
-        share = tree.math("MULTIPLY", 2, 3, color.outputs["Alpha"], seen)
+        share = tree.math("MULTIPLY", 2, 3, color.outputs["Alpha"], _beyond(tree, self_shadow))
         first, second = clear, surface
     else:
         share = tree.node("ShaderNodeNewGeometry", 0, 3).outputs["Backfacing"]

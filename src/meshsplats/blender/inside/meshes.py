@@ -25,10 +25,13 @@ NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
 """Face attribute: index of the splat that each was made from."""
+BASE_FACE = "splat_base_face"
+"""Attribute of splats that follow a base: the face of it that each vertex lies on."""
 STAND_IN = "meshsplats_stand_in"
 """Property of the objects that take light in place of splats: True."""
 POINTS = "meshsplats_light_points"
 """Property of the splats' object: the object of the points that light on them is gathered at."""
+_ALL = slice(None)
 _VISIBLE = 0.1
 """Opacity from which a vertex counts as visible."""
 
@@ -76,13 +79,14 @@ def make_mesh(
     return mesh
 
 
-def store_harmonics(mesh: Any, harmonics: np.ndarray) -> None:
-    """Gives the bpy ``mesh`` the harmonics (v, k, 3) of its vertices' splats."""
+def store_harmonics(mesh: Any, harmonics: np.ndarray, of_vertex: np.ndarray | slice = _ALL) -> None:
+    """Gives the bpy ``mesh`` the harmonics (v, k, 3) of its vertices' splats, or those of its splats (s, k,
+    3) and the splat ``of_vertex`` (v,)."""
     for name, fours in zip(HARMONICS, in_fours(harmonics), strict=True):
         for i, four in enumerate(fours):
             own = f"{name}_{i}"
             attribute = mesh.attributes.get(own) or mesh.attributes.new(own, "FLOAT_COLOR", "POINT")
-            attribute.data.foreach_set("color", four.ravel())
+            attribute.data.foreach_set("color", four[of_vertex].ravel())
 
 
 def terms_of(harmonics: np.ndarray | None) -> int:
@@ -90,15 +94,16 @@ def terms_of(harmonics: np.ndarray | None) -> int:
     return 0 if harmonics is None else harmonics.shape[1]
 
 
-def read_harmonics(mesh: Any) -> np.ndarray | None:
-    """(v, k, 3) float32 harmonics of the vertices' splats, k = 3, 8 or 15; None without."""
+def read_harmonics(mesh: Any, vertices: np.ndarray | slice = _ALL) -> np.ndarray | None:
+    """(v, k, 3) float32 harmonics of the splats of ``vertices`` (v,), k = 3, 8 or 15; None without."""
     fours = 0
     while all(f"{name}_{fours}" in mesh.attributes for name in HARMONICS):
         fours += 1
     if not fours:
         return None
     found = [
-        np.concatenate([read_colors(mesh, f"{name}_{i}") for i in range(fours)], axis=1) for name in HARMONICS
+        np.concatenate([read_colors(mesh, f"{name}_{i}")[vertices] for i in range(fours)], axis=1)
+        for name in HARMONICS
     ]
     return np.stack(found, axis=2)[:, : max(terms for terms in TERMS if terms <= 4 * fours)]
 

@@ -10,7 +10,6 @@ import numpy as np
 from meshsplats.blender.inside import (
     bounces,
     far_to_near,
-    foreign,
     frame,
     levels,
     lit_points,
@@ -19,9 +18,11 @@ from meshsplats.blender.inside import (
     priors,
     remaking,
     rendering,
+    scene_linear,
     sorted_copies,
     sources,
     stand_ins,
+    turning,
     versions,
     views,
 )
@@ -100,6 +101,7 @@ def add(prepared: dict[str, Any], name: str, collection: Any, onto: Any = None) 
     """A new object in ``collection``, upright in Blender's frame, with its material. Its origin lies under
     the subject. The splats of a mesh prior are a child of a new object of their base, which they follow.
     ``onto``: a mesh of this shape, which it takes (``cutting``)."""
+    prepared = _in_working_space(prepared)
     rotation = frame.to_blender(prepared["mesh"].up)
     obj = meshes.make_object(_data(prepared, name, onto), name, rotation, collection)
     obj.location = (rotation @ prepared["origin"]).tolist()
@@ -109,13 +111,6 @@ def add(prepared: dict[str, Any], name: str, collection: Any, onto: Any = None) 
         priors.give_base(obj, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = obj
     return obj
-
-
-def foot_of(root: Any, prepared: dict[str, Any]) -> Any:
-    """Where the foot of the splats that ``add`` has made of ``prepared`` is, Blender's world: a Vector.
-    ``root``: their object, or that of the base that they follow."""
-    rotation = frame.to_blender(prepared["mesh"].up)
-    return root.location + type(root.location)((rotation @ (prepared["foot"] - prepared["origin"])).tolist())
 
 
 def add_chain(
@@ -164,7 +159,7 @@ def replace_mesh(obj: Any, prepared: dict[str, Any], onto: Any = None) -> list[s
         What could not stay (``remaking.added``).
     """
     old, as_made = obj.data, sources.is_as_made(obj)
-    prepared = prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
+    prepared = _in_working_space(prepared) | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
     name, lost = old.name, []
     modifier = far_to_near.modifier_of(obj)
     if modifier is not None:
@@ -249,6 +244,13 @@ def needs_light(obj: Any, *, fast: bool = False) -> bool:
     return not stand_ins.is_current(obj) or bool(obj.get(ROUGH) and not fast)
 
 
+def _in_working_space(prepared: dict[str, Any]) -> dict[str, Any]:
+    if not prepared["lit"] and prepared["mesh"].blending != "linear":
+        return prepared
+    names = prepared.keys() & {"colors", "surface_colors"}
+    return prepared | {name: scene_linear.from_rec709(prepared[name]) for name in names}
+
+
 def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
     if prepared["lit"]:
         obj[stand_ins.SHAPE] = stand_ins.shape(obj.data)
@@ -265,7 +267,7 @@ def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
         arrays,
         prepared["light_spacing"],
         self_shadow=prepared["self_shadow"],
-        home=obj.users_collection[0] if obj.users_collection else bpy.context.scene.collection,
+        home=bpy.context.scene.collection,
     )
 
 
@@ -301,6 +303,7 @@ def _data(prepared: dict[str, Any], name: str, onto: Any = None) -> Any:
         linear=mesh.blending == "linear",
         layers=prepared["layers"],
     )
+    turning.remember(data)
     if mesh.origin.any():
         data[WORLD] = mesh.origin.tolist()
     elif WORLD in data:
@@ -350,7 +353,9 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
         faces,
         colors,
         face_splat=owner,
-        harmonics=_harmonics_of(data, faces, owner),
+        harmonics=None
+        if owner is None
+        else turning.harmonics_of(data, FaceSplats(faces, owner, len(vertices))),
         up=frame.up_of(obj),  # the rotation may have been applied to the mesh
         blending=blending,
         origin=np.array(facts.get(WORLD, (0, 0, 0)), np.float64),
@@ -361,16 +366,6 @@ def splat_mesh_of(obj: Any, data: Any) -> SplatMesh:
     return found.moved(binding.positions(), normals=binding.normals(), binding=binding)
 
 
-def _harmonics_of(data: Any, faces: np.ndarray, owner: np.ndarray | None) -> np.ndarray | None:
-    """(s, k, 3) harmonics of the splats of the mesh ``data``; None where it has none, or splats share
-    vertices."""
-    found = None if owner is None else meshes.read_harmonics(data)
-    if found is None or not len(faces):
-        return None
-    splats = FaceSplats(faces, owner, len(found))
-    return None if splats.share_vertices else found[faces[splats.starts, 0]]
-
-
 def unlit_colors(data: Any) -> np.ndarray:
     """(v, 4) float32 RGBA of the mesh ``data`` as composited unlit."""
     return _unlit_colors(data, data)
@@ -379,8 +374,9 @@ def unlit_colors(data: Any) -> np.ndarray:
 def _unlit_colors(data: Any, facts: Any) -> np.ndarray:
     """As ``unlit_colors``, of a mesh ``data`` that has its properties from ``facts``."""
     shown = meshes.read_colors(data, meshes.COLOR)
-    colors = np.clip(shown, 0, 1)
-    if not facts[LIT] and not facts[LINEAR]:
+    light = facts[LIT] or facts[LINEAR]
+    colors = np.clip(scene_linear.to_rec709(shown) if light else shown, 0, 1)
+    if not light:
         colors[:, :3] = np.clip(shown[:, :3], 0, MAX_COLOR)
     if not facts[LIT]:
         return colors
@@ -430,13 +426,3 @@ def clash(objs: list[Any], lit: bool) -> str:
     if lit or len(kinds) < 2:
         return ""
     return "some meshes blend display values and others linear light: unlit, the latter look too dark here"
-
-
-def dress(obj: Any, lit: bool) -> None:
-    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) our colours and material: display
-    colours for the exact image, or linear ones, smoothed normals and a lit material.
-
-    Raises:
-        ValueError: the object has no colours, or faces that are not triangles.
-    """
-    replace_mesh(obj, prepare(foreign.splat_mesh(obj), lit))

@@ -29,7 +29,7 @@ REST = "meshsplats_rest"
 """Property of the mesh data: positions of the base that the distance between layers is meant for."""
 STRETCH = "meshsplats_stretch"
 """Property of the mesh data: what that distance is multiplied by at the base's vertices, if not by 1."""
-ATTRIBUTES = {"vertex_face": "splat_base_face", "weights": "splat_base_weights", "layers": "splat_layer"}
+ATTRIBUTES = {"vertex_face": meshes.BASE_FACE, "weights": "splat_base_weights", "layers": "splat_layer"}
 """Attributes of the vertices: the arrays of the binding."""
 FACE = ATTRIBUTES["vertex_face"]
 _FIELDS = [

@@ -61,10 +61,10 @@ def opening(objs: Sequence[Any]) -> View | None:
         for numbers in () if stored is None else stored:
             pose = np.array(obj.matrix_world) @ numbers[:16].reshape(4, 4)
             scale = np.linalg.norm(pose[:3, :3], axis=0)
-            if scale.all():
-                pose[:3, :3] /= scale
+            if np.linalg.det(pose[:3, :3]):
+                pose[:3, :3] = _upright(pose[:3, :3])
                 away = float(np.linalg.norm(scene_bounds(meshes.world_points(obj)).center - pose[:3, 3]))
-                near = min(numbers[17] * scale[0], away / 10) or away / 1000
+                near = min(numbers[17] * scale[2], away / 10) or away / 1000
                 return View(pose, float(numbers[16]), near, away)
     return None
 
@@ -98,6 +98,15 @@ def _stored(obj: Any) -> np.ndarray | None:
         if now is None or max(moved, abs(now.radius - bounds[3])) > _CHANGE * bounds[3]:
             return None
     return views if len(bounds) in (0, 4) else None
+
+
+def _upright(axes: np.ndarray) -> np.ndarray:
+    """(3, 3) the rotation of a camera that looks and stands as ``axes`` (3, 3) do, its columns, which its
+    place may have mirrored or stretched."""
+    backward = axes[:, 2] / np.linalg.norm(axes[:, 2])
+    right = np.cross(axes[:, 1], backward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(backward, right), backward], axis=1)
 
 
 def _camera(pose: np.ndarray, half: float, near: float, width: int, height: int) -> Camera:

@@ -4,6 +4,7 @@ result."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -14,7 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 
 if __package__ in (None, ""):  # run as a file by Blender, whose Python does not know this package
-    sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
+    # It alone: beside it may lie what was installed for another Python, NumPy above all.
+    package = Path(__file__).resolve().parents[2]
+    spec = importlib.util.spec_from_file_location(package.name, package / "__init__.py")
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[package.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules[package.name])
 
 MARK = "@meshsplats "
 """Prefix of output lines for the parent process."""
