@@ -1,30 +1,32 @@
 // The page: settings, the loop that draws while something moves and refines the image when it is still.
 
-import { View, add, dot, nearestVertex } from "./camera.js";
-import { Contents } from "./contents.js";
-import { connect, connectPanel, fillCameras } from "./controls.js";
+import { add, nearestVertex } from "./camera.js";
+import { Contents, connectOptions } from "./contents.js";
+import { Pilot, connect, connectPanel, fillCameras } from "./controls.js";
 import { CropBox } from "./crop.js";
 import { ExactRenderer } from "./exact.js";
 import { SortedRenderer } from "./sorted.js";
-import { element, note, number, report, say } from "./status.js";
+import { element, note, number, report, say, seen } from "./status.js";
 
 const QUIET = 180; // milliseconds without a change, after which the image is still
 const DRAFTS = [1 / 4, 1 / 3, 1 / 2, 1]; // sizes of the image while it moves
 // milliseconds of a frame: a smaller draft, a larger one, the other renderer
 const SLOW = 50, QUICK = 16, HOPELESS = 150;
 const PICK = 8; // CSS pixels around a double click
-const MOST_PIXELS = 3.9e6; // of the canvas: the exact renderer draws an image in one piece
-const FLIGHT = 450; // milliseconds from one camera to the next
+const MOST_PIXELS = 1.6e7, LONGEST = 8192; // of the canvas, where the devices set no other limit
+const DRAFT_PIXELS = 3.9e6; // of the largest image while it moves
+// milliseconds before WebGPU's device is asked for again, each time that it was lost
+const AGAIN = [2e3, 60e3, 60e3];
 const LOST = "The graphics device was lost. If it does not come back by itself, load the page again.";
 
-const calm = matchMedia("(prefers-reduced-motion: reduce)");
 const PHONE = 600; // CSS pixels of the shorter side of a screen, below which a device with touch is a phone
 
-export class App {
+export class App extends Pilot {
   // levels: the meshes that are unpacked, "coarse" and "fine", and the "surface"; unpackFine() gives the
   // fine one, once, where it is not.
   constructor(settings, levels, splats, unpackFine) {
-    Object.assign(this, { settings, levels, splats, unpackFine });
+    super(settings);
+    Object.assign(this, { levels, splats, unpackFine });
     this.stage = element("stage");
     this.canvases = { exact: element("exact"), sorted: element("sorted") };
     this.meshes = ["coarse", "fine"].filter(level => levels[level]);
@@ -33,21 +35,19 @@ export class App {
     this.options = { style: "blended", renderer: "exact", samples: 2, gain: 1 };
     const phone = matchMedia("(pointer: coarse)").matches && Math.min(screen.width, screen.height) < PHONE;
     this.options.detail = phone && levels.coarse ? "coarse" : "fine";
-    this.view = this.#viewOf(0);
-    this.camera = 0;
-    this.flying = false;
-    this.thrust = [0, 0, 0];
     this.changedAt = -Infinity;
     this.passes = 0;
     this.dirty = true;
     this.drafts = { exact: 2, sorted: 2 };
+    this.again = [...AGAIN];
+    this.exactOnly = new Set(); // levels that WebGL cannot draw
     this.wake = () => {};
   }
 
   // The level of the image at rest, and its mesh.
   get resting() {
     const { kinds, chosen } = this.contents;
-    if (chosen === "surface" || !kinds.includes("mesh")) return "surface";
+    if (chosen === "surface" || this.levels.surface && !kinds.includes("mesh")) return "surface";
     if (this.options.detail === "fine" && this.levels.fine) return "fine";
     return this.levels.coarse ? "coarse" : "fine";
   }
@@ -59,15 +59,16 @@ export class App {
   async start(kernels) {
     const problems = [];
     try {
-      this.sorted = new SortedRenderer(this.canvases.sorted, this.levels, this.splats);
+      this.sorted = new SortedRenderer(this.canvases.sorted, this.levels, this.splats, note);
     } catch (error) {
       problems.push(error.message);
     }
     this.#connect();
-    this.preparing = Boolean(kernels);
+    this.kernels = kernels;
+    this.preparing = this.awaited = Boolean(kernels); // awaited: the exact renderer may come
     if (this.sorted) this.#begin();
     await this.#refine();
-    if (kernels) await this.#prepareExact(kernels, problems);
+    if (kernels) await this.#prepareExact(problems);
     if (!this.exact && !this.sorted)
       throw new Error(`This browser cannot draw the scene: ${problems.join("; ")}.`);
     if (this.exact) {
@@ -86,18 +87,35 @@ export class App {
     }
   }
 
-  async #prepareExact(kernels, problems) {
+  async #prepareExact(problems) {
     this.preparing = true;
     try {
-      const lost = reason =>
-        this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
-      const exact = await ExactRenderer.create(this.canvases.exact, kernels, lost);
+      const exact = await ExactRenderer.create(this.canvases.exact, this.kernels, lost => this.#lose(lost));
       for (const level of this.meshes) this.#give(exact, level);
+      if (exact.lost) throw new Error(`the graphics device was lost (${exact.lost})`);
       this.exact = exact;
     } catch (error) {
       problems.push(error.message);
     }
-    this.preparing = false;
+    this.preparing = this.awaited = false;
+  }
+
+  // WebGPU's device went, as it may when the machine sleeps: it is asked for again, while WebGL draws.
+  async #lose(exact) {
+    if (exact !== this.exact) return;
+    const why = `The graphics device was lost (${exact.lost})`;
+    this.exact = null;
+    this.awaited = true;
+    if (this.sorted) say(`${why}; triangles are drawn by WebGL until it is back.`);
+    this.changed();
+    while (this.awaited && this.again.length) {
+      await seen(this.again.shift());
+      const problems = [];
+      await this.#prepareExact(problems);
+      this.awaited = problems.length > 0;
+    }
+    if (this.awaited) this.#fall(`${why}; triangles are drawn by WebGL now.`);
+    else this.#regained();
   }
 
   #begin() {
@@ -119,11 +137,16 @@ export class App {
       this.crop.again();
       if (this.exact) this.#give(this.exact, "fine");
     } catch (error) {
-      delete this.levels.fine;
-      say(`Only the coarse mesh is shown: ${error.message}`);
+      this.#dropFine(error.message);
     }
     this.preparing = false;
     this.changed();
+  }
+
+  #dropFine(reason) {
+    delete this.levels.fine;
+    this.meshes = this.meshes.filter(level => level !== "fine");
+    say(`Only the coarse mesh is shown: ${reason}`);
   }
 
   #give(exact, level) {
@@ -139,6 +162,8 @@ export class App {
   // From now on without the exact renderer.
   #fall(message) {
     this.exact = null;
+    this.awaited = false;
+    this.exactOnly.clear();
     this.options.renderer = "sorted";
     element("renderer").value = "sorted";
     element("renderer").options[0].disabled = true;
@@ -147,23 +172,6 @@ export class App {
   }
 
   // ---- Views
-
-  #viewOf(index) {
-    const { cameras, up, center, radius } = this.settings, camera = cameras[index];
-    const view = new View(camera, up, 1);
-    view.distance = Math.max(dot(add(center, view.position, -1), view.forward), 0.2 * radius);
-    return view;
-  }
-
-  jump(index) {
-    const count = this.settings.cameras.length;
-    this.camera = (index + count) % count;
-    element("cameras").value = String(this.camera);
-    const target = this.#viewOf(this.camera);
-    this.flight = calm.matches ? null : { from: this.view.copy(), target, start: performance.now() };
-    if (!this.flight) this.view = target;
-    this.changed();
-  }
 
   changed() {
     this.changedAt = performance.now();
@@ -182,15 +190,6 @@ export class App {
     if (name === "plain") this.changed();
   }
 
-  // begun: a key went down just now; even the shortest press moves the camera.
-  fly(keys, fast, begun = false) {
-    const pressed = (plus, minus) => Number(keys.has(plus)) - Number(keys.has(minus));
-    const speed = this.settings.radius * (fast ? 2.4 : 0.6);
-    this.thrust = [pressed("d", "a"), pressed("q", "e"), pressed("w", "s")].map(value => value * speed);
-    if (begun) this.view.move(...this.thrust.map(value => value / 60));
-    if (keys.size) this.changed();
-  }
-
   // Centres the nearest visible vertex at a point of the stage, in CSS pixels.
   pick(x, y) {
     const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight), { mesh } = this;
@@ -199,14 +198,13 @@ export class App {
     const target = this.view.copy();
     target.distance = found.depth;
     target.position = add(found.point, target.forward, -found.depth);
-    this.flight = { from: this.view.copy(), target, start: calm.matches ? -Infinity : performance.now() };
-    this.changed();
+    this.flyTo(target);
   }
 
   // ---- Settings
 
   #connect() {
-    const { settings, options } = this, list = element("cameras");
+    const { settings, options } = this, list = element("cameras"), changed = () => this.changed();
     fillCameras(list, settings.cameras);
     element("previous").disabled = element("next").disabled = settings.cameras.length < 2;
     list.addEventListener("change", () => this.jump(Number(list.value)));
@@ -217,36 +215,8 @@ export class App {
       this.spinning = event.target.checked;
       this.changed();
     });
-    const choose = (name, apply) => {
-      for (const input of document.querySelectorAll(`[name=${name}]`)) {
-        input.addEventListener("change", () => { options[name] = input.value; apply(); });
-      }
-    };
-    this.contents.connect(this.stage, () => this.changed());
-    choose("style", () => this.changed());
-    const background = element("background");
-    background.value = settings.background;
-    const paint = () => {
-      options.background = [1, 3, 5].map(i => parseInt(background.value.slice(i, i + 2), 16) / 255);
-      document.body.style.background = background.value;
-      this.changed();
-    };
-    background.addEventListener("input", paint);
-    paint();
-    element("exposure").addEventListener("input", event => {
-      const stops = Number(event.target.value);
-      options.gain = 2 ** stops;
-      element("exposureText").value = `${stops > 0 ? "+" : ""}${stops} EV`;
-      this.changed();
-    });
-    element("samples").addEventListener("change", event => {
-      options.samples = Number(event.target.value);
-      this.changed();
-    });
-    element("renderer").addEventListener("change", event => {
-      options.renderer = event.target.value;
-      this.changed();
-    });
+    this.contents.connect(this.stage, changed);
+    connectOptions(options, settings.background, changed);
     const detail = element("detail");
     element("detailLine").hidden = !settings.triangles.coarse;
     for (const option of detail.options)
@@ -262,7 +232,7 @@ export class App {
       this.cropped = true; // the renderers hear of it before the next frame, never within one
       this.changed();
     });
-    element("crop").addEventListener("toggle", () => this.changed());
+    element("crop").addEventListener("toggle", changed);
     connectPanel(element("panel"), element("toggle"));
     element("dismiss").addEventListener("click", () => { element("message").hidden = true; });
     this.canvases.sorted.addEventListener("webglcontextlost", event => {
@@ -271,14 +241,23 @@ export class App {
     });
     this.canvases.sorted.addEventListener("webglcontextrestored", () => this.#regain());
     connect(this.stage, this, settings.radius);
-    new ResizeObserver(() => this.changed()).observe(this.stage);
+    new ResizeObserver(changed).observe(this.stage);
+    const watch = () => matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", () => {
+      watch();
+      this.changed();
+    }, { once: true });
+    watch();
     this.#measure();
   }
 
   #regain() {
-    this.sorted = new SortedRenderer(this.canvases.sorted, this.levels, this.splats);
+    this.sorted = new SortedRenderer(this.canvases.sorted, this.levels, this.splats, note);
     this.sorted.crop(this.kept ?? null);
-    element("message").hidden = true;
+    this.#regained();
+  }
+
+  #regained() {
+    if (element("messageText").textContent === LOST) element("message").hidden = true;
     this.changed();
   }
 
@@ -297,52 +276,66 @@ export class App {
         continue;
       }
       const now = await new Promise(requestAnimationFrame);
-      this.#advance(performance.now(), Math.min(100, now - before) / 1000);
+      this.advance(Math.min(100, now - before) / 1000);
       before = now;
-      const wasExact = Boolean(this.exact);
       try {
         await this.#frame(now);
       } catch (error) {
-        if (this.#waits()) continue;
-        if (!wasExact || !this.sorted) {
-          say(`Drawing failed: ${error.message}`, true);
-          document.body.dataset.state = "failed";
-          return;
-        }
-        this.#fall(`The exact image failed (${error.message}); triangles are drawn by WebGL now.`);
+        if (this.#waits() || await this.#without(error)) continue;
+        say(`Drawing failed: ${error.message}`, true);
+        document.body.dataset.state = "failed";
+        return;
       }
     }
   }
 
-  #busy() { return this.dirty || this.#moves() || !this.finished; }
-
-  // Whether a part of the image has to wait for WebGL's device.
-  #waits() { return this.sorted?.lost && !(this.exactly && this.contents.parts.length === 1); }
-
-  #moves() { return Boolean(this.flight) || Boolean(this.spinning) || this.thrust.some(Boolean); }
-
-  #advance(now, seconds) {
-    if (this.flight) {
-      const t = Math.min(1, (now - this.flight.start) / FLIGHT);
-      this.view = this.flight.from.towards(this.flight.target, t < 1 ? t * t * (3 - 2 * t) : 1);
-      if (t === 1) this.flight = null;
-      this.changed();
+  // Whether drawing goes on without what failed: a part of the image by one of the renderers.
+  async #without({ renderer, part, level, message }) {
+    if (renderer) {
+      await new Promise(done => setTimeout(done, 200)); // a device that is lost may say so only now
+      if (renderer === this.exact && !this.sorted) return false;
+      if (renderer === this.exact)
+        this.#fall(`The exact image failed (${message}); triangles are drawn by WebGL now.`);
+    } else if (part === "mesh" && (this.exact || this.awaited)) {
+      this.exactOnly.add(level);
+      Object.assign(this.options, { style: "blended", renderer: "exact" });
+      document.querySelector("[name=style][value=blended]").checked = true;
+      element("renderer").value = "exact";
+      for (const input of document.querySelectorAll("[name=style], #renderer")) input.disabled = true;
+      note(`WebGL does not draw the mesh here: ${message}`);
+    } else if (part === "mesh" && level === "fine" && this.levels.coarse) {
+      this.#dropFine(message);
+    } else if (part && this.contents.kinds.length > 1) {
+      this.contents.withdraw(part);
+      say(`The ${part} cannot be drawn here: ${message}`);
+    } else {
+      return false;
     }
-    if (this.spinning) {
-      this.view.orbit(seconds * 0.5, 0);
-      this.changed();
-    }
-    if (this.thrust.some(Boolean)) {
-      this.view.move(...this.thrust.map(value => value * seconds));
-      this.changed();
-    }
+    this.changed();
+    return true;
   }
 
+  #busy() { return this.dirty || this.moves || !this.finished; }
+
+  // Whether a part of the image has to wait for a device.
+  #waits() {
+    return this.sorted ? this.sorted.lost && !(this.exactly && this.contents.parts.length === 1)
+      : !this.exact;
+  }
+
+  // The canvas has the pixels of the screen, where the devices take so many.
   #measure() {
-    const { clientWidth, clientHeight } = this.stage;
-    const ratio = Math.min(devicePixelRatio || 1, 2, Math.sqrt(MOST_PIXELS / (clientWidth * clientHeight)));
-    const width = Math.max(1, Math.round(clientWidth * ratio)),
-      height = Math.max(1, Math.round(clientHeight * ratio));
+    const { clientWidth, clientHeight } = this.stage, whole = devicePixelRatio || 1;
+    const most = Math.min(MOST_PIXELS, this.exact ? this.exact.mostPixels : Infinity);
+    const ratio = Math.min(whole, Math.sqrt(most / (clientWidth * clientHeight)),
+      Math.min(LONGEST, this.sorted?.longest || LONGEST) / Math.max(clientWidth, clientHeight));
+    const rounded = ratio < whole ? Math.floor : Math.round;
+    const width = Math.max(1, rounded(clientWidth * ratio)),
+      height = Math.max(1, rounded(clientHeight * ratio));
+    const millions = (...sides) => (sides[0] * sides[1] / 1e6).toFixed(1);
+    this.limited = ratio === whole ? "" : `, ${millions(width, height)} of ` +
+      `${millions(clientWidth * whole, clientHeight * whole)} million pixels`;
+    this.largestDraft = Math.min(1, Math.sqrt(DRAFT_PIXELS / (width * height)));
     for (const canvas of Object.values(this.canvases)) {
       if (canvas.width !== width) canvas.width = width;
       if (canvas.height !== height) canvas.height = height;
@@ -350,7 +343,7 @@ export class App {
   }
 
   async #frame(now) {
-    const quiet = performance.now() - this.changedAt >= QUIET && !this.#moves();
+    const quiet = performance.now() - this.changedAt >= QUIET && !this.moves;
     if (this.dirty) {
       this.dirty = false;
       if (this.cropped) for (const renderer of [this.sorted, this.exact]) renderer?.crop(this.kept);
@@ -365,7 +358,8 @@ export class App {
     if (!quiet || this.finished) return;
     const { options } = this, exact = this.exactly;
     const passes = exact ? options.samples ** 2 : 1, pass = this.passes++;
-    if (exact) await this.#drawExact(this.resting, 1, pass, options.samples);
+    if (exact) await this.#drawExact(this.resting, 1, pass, options.samples, () => this.dirty);
+    if (this.dirty) return;
     if (pass === 0) await this.#drawSorted(this.resting, 1, true, exact);
     if (this.dirty) return;
     this.finished = this.passes >= passes;
@@ -382,8 +376,9 @@ export class App {
 
   // A quick image while something changes: small enough to be fluid, by WebGL where WebGPU is too slow.
   async #draft(now) {
-    const exact = this.exactly && (this.drafts.exact >= 0 || !this.sorted);
-    const kind = exact ? "exact" : "sorted", scale = DRAFTS[Math.max(0, this.drafts[kind])];
+    const exact = this.exactly && (this.drafts.exact >= 0 || !this.sorted || this.exactOnly.size > 0);
+    const kind = exact ? "exact" : "sorted", share = DRAFTS[Math.max(0, this.drafts[kind])];
+    const scale = share * this.largestDraft;
     const level = this.levels.coarse && !(exact && this.swift) ? "coarse" : this.resting;
     if (!exact) await this.#drawSorted(level, scale, false, false);
     let took = this.lastDraft === kind ? now - this.draftAt : 0;
@@ -395,7 +390,7 @@ export class App {
       // The fine level too moves where the coarse one is so quick that it should; not again where it is slow.
       const ratio = this.mesh.faces.length / this.levels[level].faces.length;
       if (this.swift && took > SLOW) [this.swift, this.sluggish] = [false, true];
-      else if (scale === 1 && took * ratio < SLOW / 2) this.swift = !this.sluggish;
+      else if (share === 1 && took * ratio < SLOW / 2) this.swift = !this.sluggish;
     }
     this.lastDraft = kind;
     this.draftAt = now;
@@ -407,7 +402,8 @@ export class App {
   }
 
   async #drawSorted(level, scale, still, exact) {
-    const parts = this.contents.parts.filter(({ what }) => !(exact && what === "mesh"));
+    const elsewhere = exact || this.exactOnly.has(level);
+    const parts = this.contents.parts.filter(({ what }) => !(elsewhere && what === "mesh"));
     const { style, background, gain } = this.options, stop = () => this.dirty;
     if (parts.length && this.sorted && !this.sorted.lost) {
       const drawn = await this.sorted.draw(
@@ -419,13 +415,18 @@ export class App {
   }
 
   // Sample `pass` of n x n in each pixel.
-  async #drawExact(level, scale, pass, n) {
+  async #drawExact(level, scale, pass, n, stop) {
     const { width, height } = this.canvases.exact, { background, gain } = this.options;
     const w = Math.max(1, Math.round(width * scale)), h = Math.max(1, Math.round(height * scale));
     const begun = performance.now();
     const dx = (pass % n + 0.5) / n - 0.5, dy = (Math.floor(pass / n) + 0.5) / n - 0.5;
-    await this.exact.draw(level, this.view.pinhole(w, h, dx, dy),
-      { first: pass === 0, background, gain, filterScale: scale });
+    const { exact: renderer } = this, first = pass === 0;
+    try {
+      await renderer.draw(level, this.view.pinhole(w, h, dx, dy),
+        { first, background, gain, filterScale: scale, stop });
+    } catch (error) {
+      throw Object.assign(error, { renderer });
+    }
     this.exactTook = performance.now() - begun;
   }
 

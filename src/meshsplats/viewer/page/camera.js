@@ -14,6 +14,7 @@ export function turned(v, axis, angle) {
 }
 
 const NEAREST = 1e-3, FARTHEST = 50; // distances of the pivot that zooming reaches, in radii of the scene
+const NEAR = 0.1; // the near plane of a view that came nearer, at most: share of the distance of the pivot
 
 export class View {
   // camera: {matrix: 12 numbers, the rows of world to camera; fx, fy, cx, cy, width, height, near}; up: unit
@@ -27,6 +28,8 @@ export class View {
     const t = [m[3], m[7], m[11]];
     this.position = [0, 1, 2].map(k => -(m[k] * t[0] + m[4 + k] * t[1] + m[8 + k] * t[2]));
     this.lens = camera;
+    // The near plane is that of the camera until one comes nearer; mostNear: until one flies.
+    this.near = this.mostNear = camera.near;
     this.distance = distance;
   }
 
@@ -44,6 +47,7 @@ export class View {
     view.right = unit(cross(down, view.forward));
     view.down = cross(view.forward, view.right);
     view.distance = this.distance + t * (other.distance - this.distance);
+    view.near = Math.min(this.near, other.near);
     const lens = { ...other.lens };
     for (const key of ["fx", "fy", "cx", "cy", "width", "height"]) {
       lens[key] = this.lens[key] + t * (other.lens[key] - this.lens[key]);
@@ -89,11 +93,13 @@ export class View {
     const pivot = this.pivot, { fx, width, height } = this.lens;
     const most = Math.max(this.distance, FARTHEST * radius * fx / Math.max(width, height));
     this.distance = Math.min(most, Math.max(this.distance * factor, NEAREST * radius));
+    this.near = Math.min(this.mostNear, NEAR * this.distance);
     this.position = add(pivot, this.forward, -this.distance);
   }
 
-  // Along right, down, forward in scene units.
-  move(x, y, z) {
+  // Along right, down, forward in scene units, to anything: the near plane is as near as zooming brings it.
+  move(x, y, z, radius) {
+    this.near = this.mostNear = Math.min(this.mostNear, NEAR * NEAREST * radius);
     this.position = add(add(add(this.position, this.right, x), this.down, y), this.forward, z);
   }
 
@@ -102,7 +108,7 @@ export class View {
     const lens = this.lens, s = this.scale(w, h), p = this.position;
     const rows = [this.right, this.down, this.forward].map(axis => [...axis, -dot(axis, p)]);
     return {
-      rows, center: p, fx: lens.fx * s, fy: lens.fy * s, near: lens.near, width: w, height: h,
+      rows, center: p, fx: lens.fx * s, fy: lens.fy * s, near: this.near, width: w, height: h,
       cx: w / 2 + (lens.cx - lens.width / 2) * s - dx, cy: h / 2 + (lens.cy - lens.height / 2) * s - dy,
     };
   }

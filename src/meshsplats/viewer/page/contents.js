@@ -1,4 +1,4 @@
-// What the page shows: the mesh, the splats, a textured surface, or two of them side by side.
+// What the page shows: the mesh, the splats, a textured surface, or two of them side by side; and how.
 
 import { connectDivider } from "./controls.js";
 import { element } from "./status.js";
@@ -8,9 +8,16 @@ const PAIRS = [["splats", "mesh"], ["surface", "mesh"], ["splats", "surface"]];
 export class Contents {
   // kinds: what there is, of "mesh", "splats" and "surface".
   constructor(kinds) {
+    this.split = 0.5;
+    this.#have(kinds);
+  }
+
+  #have(kinds) {
     const pairs = PAIRS.filter(pair => pair.every(kind => kinds.includes(kind)));
-    Object.assign(this, { kinds, pairs, pair: pairs[0], split: 0.5 });
-    this.chosen = kinds.includes("mesh") ? "mesh" : "surface";
+    Object.assign(this, { kinds, pairs });
+    if (!pairs.includes(this.pair)) this.pair = pairs[0];
+    if (!(this.chosen === "both" ? pairs.length : kinds.includes(this.chosen)))
+      this.chosen = kinds.find(kind => kind !== "splats") ?? kinds[0];
   }
 
   // Parts of the image's width, 0 to 1, and what each shows.
@@ -23,39 +30,89 @@ export class Contents {
 
   shows(kind) { return this.parts.some(({ what }) => what === kind); }
 
+  // Takes back a kind that cannot be drawn, which is not the only one.
+  withdraw(kind) {
+    this.#have(this.kinds.filter(other => other !== kind));
+    this.#offer();
+  }
+
+  // The settings, of what there is.
+  #offer() {
+    const { kinds, pairs, chosen } = this;
+    for (const input of document.querySelectorAll("[name=content]")) {
+      input.checked = input.value === chosen;
+      input.disabled = input.value === "both" ? !pairs.length : !kinds.includes(input.value);
+      input.closest("label").hidden = input.disabled;
+    }
+    element("content").closest("fieldset").hidden = kinds.length < 2;
+    element("pair").replaceChildren(
+      ...pairs.map(([left, right], i) => new Option(`${left}, ${right}`, String(i))));
+    element("pair").value = String(pairs.indexOf(this.pair));
+    element("pairLine").hidden = pairs.length < 2;
+    this.#name();
+  }
+
+  // The boundary.
+  #name() {
+    const { pair, chosen } = this, divider = element("divider");
+    divider.hidden = chosen !== "both";
+    if (!pair) return;
+    divider.setAttribute("aria-label", `Boundary between ${pair.join(" and ")}`);
+    [".left", ".right"].forEach((end, i) => { divider.querySelector(end).textContent = pair[i]; });
+  }
+
   // The settings and the boundary; `changed` is called when something else is shown.
   connect(stage, changed) {
-    const { kinds, pairs } = this, divider = element("divider"), list = element("pair");
     for (const input of document.querySelectorAll("[name=content]")) {
-      input.checked = input.value === this.chosen;
-      input.disabled = input.value === "both" ? !pairs.length : !kinds.includes(input.value);
-      if (input.disabled) input.closest("label").hidden = true;
       input.addEventListener("change", () => {
         this.chosen = input.value;
-        divider.hidden = this.chosen !== "both";
+        this.#name();
         changed();
       });
     }
-    if (!kinds.includes("mesh")) { // a depth buffer blends nothing
+    if (!this.kinds.includes("mesh")) { // a depth buffer blends nothing
       const blended = document.querySelector("[name=style][value=blended]");
       blended.disabled = blended.closest("label").hidden = true;
       document.querySelector("[name=style][value=opaque]").checked = true;
     }
-    element("content").closest("fieldset").hidden = kinds.length < 2;
-    pairs.forEach(([left, right], i) => list.append(new Option(`${left}, ${right}`, String(i))));
-    element("pairLine").hidden = pairs.length < 2;
-    const name = () => {
-      divider.setAttribute("aria-label", `Boundary between ${this.pair.join(" and ")}`);
-      [".left", ".right"].forEach((end, i) => { divider.querySelector(end).textContent = this.pair[i]; });
-    };
-    if (pairs.length) name();
-    list.addEventListener("change", () => {
-      this.pair = pairs[Number(list.value)];
-      name();
+    element("pair").addEventListener("change", event => {
+      this.pair = this.pairs[Number(event.target.value)];
+      this.#name();
       changed();
     });
-    connectDivider(divider, stage, split => {
+    this.#offer();
+    connectDivider(element("divider"), stage, split => {
       this.split = split;
+      changed();
+    });
+  }
+}
+
+// The settings of the image, which is drawn again when one of `options` is another.
+export function connectOptions(options, background, changed) {
+  const paint = () => {
+    const { value } = element("background");
+    options.background = [1, 3, 5].map(i => parseInt(value.slice(i, i + 2), 16) / 255);
+    document.body.style.background = value;
+    changed();
+  };
+  element("background").value = background;
+  element("background").addEventListener("input", paint);
+  paint();
+  element("exposure").addEventListener("input", event => {
+    const stops = Number(event.target.value);
+    options.gain = 2 ** stops;
+    element("exposureText").value = `${stops > 0 ? "+" : ""}${stops} EV`;
+    changed();
+  });
+  element("samples").addEventListener("change", event => {
+    options.samples = Number(event.target.value);
+    changed();
+  });
+  const choices = [...document.querySelectorAll("[name=style]"), element("renderer")];
+  for (const choice of choices) {
+    choice.addEventListener("change", () => {
+      options[choice.name || choice.id] = choice.value;
       changed();
     });
   }

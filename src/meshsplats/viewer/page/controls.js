@@ -1,5 +1,8 @@
-// Mouse, touch and keys: they move the view of `pilot`, {view, changed(), flying, command(name), pick(x, y)}.
+// The view and what moves it: mouse, touch, keys, flights. The boundary and the panel.
 
+import { View, add, dot } from "./camera.js";
+
+const FLIGHT = 450; // milliseconds from one view to the next
 const STEP = 0.05; // radians of an arrow key
 const ZOOM = 0.85; // of a press of +
 // powers of e that zoom: a pixel of the wheel; one of a pinch on a trackpad, which browsers report as a wheel
@@ -7,16 +10,78 @@ const ZOOM = 0.85; // of a press of +
 const WHEEL = 0.0015, PINCH = 0.01, MOST = 0.45;
 // controls that arrows and Home move
 const WITH_ARROWS = "[type=radio], [type=range], [role=slider]", MOVES = /^(Arrow|Home)/;
+const FLIES = /^[wasdqe]$/, ZOOMS = /^[+=-]$/, WITH_ALT = /^[[\]]$/; // with Alt on some keyboards of Macs
 
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+// The view and its motion. What extends it has changed(), which is called when the view is another.
+export class Pilot {
+  constructor(settings) {
+    this.settings = settings;
+    this.view = this.#viewOf(0);
+    this.camera = 0;
+    this.flying = false;
+    this.thrust = [0, 0, 0];
+  }
+
+  #viewOf(index) {
+    const { cameras, up, center, radius } = this.settings, view = new View(cameras[index], up, 1);
+    view.distance = Math.max(dot(add(center, view.position, -1), view.forward), 0.2 * radius);
+    return view;
+  }
+
+  jump(index) {
+    const count = this.settings.cameras.length;
+    this.camera = (index + count) % count;
+    document.getElementById("cameras").value = String(this.camera);
+    this.flyTo(this.#viewOf(this.camera));
+  }
+
+  // In a moment; at once where motion is unwelcome.
+  flyTo(target) {
+    this.flight = calm.matches ? null : { from: this.view.copy(), target, start: performance.now() };
+    if (!this.flight) this.view = target;
+    this.changed();
+  }
+
+  // begun: a key went down just now; even the shortest press moves the camera.
+  fly(keys, fast, begun = false) {
+    const pressed = (plus, minus) => Number(keys.has(plus)) - Number(keys.has(minus));
+    const speed = this.settings.radius * (fast ? 2.4 : 0.6);
+    this.thrust = [pressed("d", "a"), pressed("q", "e"), pressed("w", "s")].map(value => value * speed);
+    if (begun) this.#move(1 / 60);
+    if (keys.size) this.changed();
+  }
+
+  get moves() { return Boolean(this.flight) || Boolean(this.spinning) || this.thrust.some(Boolean); }
+
+  advance(seconds) {
+    if (!this.moves) return;
+    this.changed();
+    if (this.flight) {
+      const t = Math.min(1, (performance.now() - this.flight.start) / FLIGHT);
+      this.view = this.flight.from.towards(this.flight.target, t < 1 ? t * t * (3 - 2 * t) : 1);
+      if (t === 1) this.flight = null;
+    }
+    if (this.spinning) this.view.orbit(seconds * 0.5, 0);
+    if (this.thrust.some(Boolean)) this.#move(seconds);
+  }
+
+  #move(seconds) { this.view.move(...this.thrust.map(value => value * seconds), this.settings.radius); }
+}
+
+// They move the view of `pilot`, a Pilot with command(name) and pick(x, y), and end its flight to another.
 // radius: of the scene.
 export function connect(stage, pilot, radius) {
   const touches = new Map(), keys = new Set();
   const shorter = () => Math.min(stage.clientWidth, stage.clientHeight);
   const pan = (x, y) => pilot.view.pan(x, y, stage.clientWidth, stage.clientHeight);
+  const grab = () => { pilot.flight = null; };
 
   stage.addEventListener("pointerdown", event => {
     if (event.target.closest("#divider")) return;
     stage.setPointerCapture(event.pointerId);
+    grab();
     touches.set(event.pointerId, { x: event.clientX, y: event.clientY,
       pans: event.button > 0 || event.shiftKey });
     stage.classList.add("dragging");
@@ -50,6 +115,7 @@ export function connect(stage, pilot, radius) {
   });
   stage.addEventListener("wheel", event => {
     event.preventDefault();
+    grab();
     const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
     const power = pixels * (event.ctrlKey ? PINCH : WHEEL);
     pilot.view.zoom(Math.exp(Math.max(-MOST, Math.min(MOST, power))), radius);
@@ -72,17 +138,23 @@ export function connect(stage, pilot, radius) {
   document.addEventListener("change", event => {
     if (event.target === pressed && pressed.matches("select")) stage.focus({ preventScroll: true });
   });
+  const release = () => {
+    keys.clear();
+    pilot.fly(keys, false);
+  };
   document.addEventListener("keydown", event => {
     pressed = null;
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (event.key === "Meta") release(); // macOS tells of no key that goes up while this one is down
+    const key = labelOf(event), place = placeOf(event);
+    if (event.ctrlKey || event.metaKey || event.altKey && !WITH_ALT.test(key)) return;
     if (event.target.matches("select") || event.target.matches(WITH_ARROWS) && MOVES.test(key)) return;
-    const { view } = pilot;
-    if (once[key]) {
-      if (!event.repeat) pilot.command(once[key]);
-    } else if ("wasdqe".includes(key)) {
-      keys.add(key);
+    const { view } = pilot, flies = FLIES.test(place), command = once[key] ?? once[place];
+    if (flies || key.startsWith("Arrow") || ZOOMS.test(key)) grab();
+    if (flies) {
+      keys.add(place);
       pilot.fly(keys, event.shiftKey, !event.repeat);
+    } else if (command) {
+      if (!event.repeat) pilot.command(command);
     } else if (key.startsWith("Arrow")) {
       const x = Number(key === "ArrowRight") - Number(key === "ArrowLeft");
       const y = Number(key === "ArrowDown") - Number(key === "ArrowUp");
@@ -90,7 +162,7 @@ export function connect(stage, pilot, radius) {
       else if (pilot.flying) view.look(-x * STEP, y * STEP);
       else view.orbit(x * STEP * 2, -y * STEP * 2);
       pilot.changed();
-    } else if (key === "+" || key === "=" || key === "-") {
+    } else if (ZOOMS.test(key)) {
       view.zoom(key === "-" ? 1 / ZOOM : ZOOM, radius);
       pilot.changed();
     } else {
@@ -99,14 +171,19 @@ export function connect(stage, pilot, radius) {
     event.preventDefault();
   });
   document.addEventListener("keyup", event => {
-    keys.delete(event.key.toLowerCase());
+    keys.delete(placeOf(event));
+    if (event.key === "Meta") keys.clear();
     pilot.fly(keys, event.shiftKey);
   });
-  window.addEventListener("blur", () => {
-    keys.clear();
-    pilot.fly(keys, false);
-  });
+  window.addEventListener("blur", release);
 }
+
+// The name of a key, in small letters where it is one.
+const labelOf = ({ key }) => key.length === 1 ? key.toLowerCase() : key;
+
+// The letter or digit at its place on an English keyboard, where it has one there: others have other letters
+// there, and some the same ones elsewhere.
+const placeOf = event => /^(?:Key|Digit)(.)$/.exec(event.code)?.[1].toLowerCase() ?? labelOf(event);
 
 // Middle and distance of the first two touches.
 function pair(touches) {
@@ -149,6 +226,11 @@ export function connectPanel(panel, toggle) {
     toggle.setAttribute("aria-expanded", String(shown));
   };
   toggle.addEventListener("click", () => open(panel.classList.contains("closed")));
+  document.querySelector(".skip").addEventListener("click", event => {
+    event.preventDefault();
+    open(true);
+    panel.focus();
+  });
   document.addEventListener("keydown", event => {
     if (event.key !== "Escape" || panel.classList.contains("closed")) return;
     open(false);

@@ -55,7 +55,7 @@ fn pixel(p: vec2i) -> vec4f {
 }`;
 
 export class ExactRenderer {
-  // lost(reason) is called when the device goes. Throws where there is no WebGPU.
+  // lost(renderer) is called when the device goes; renderer.lost says why. Throws where there is no WebGPU.
   static async create(canvas, kernels, lost) {
     if (!navigator.gpu) throw new Error(
       isSecureContext ? "this browser has no WebGPU" : "browsers offer WebGPU to pages by https only");
@@ -70,8 +70,13 @@ export class ExactRenderer {
     Object.assign(self, { capacity: kernels.limits.firstPairs, budget: kernels.limits.budgets[0] });
     self.name = description || [vendor, architecture].filter(Boolean).join(" ") || "WebGPU";
     self.most = Math.min(maxStorageBufferBindingSize, maxBufferSize);
+    self.mostPixels = Math.floor(self.most / 16);
     self.capacity = Math.min(self.capacity, Math.floor(self.most / 8));
-    device.lost.then(info => { if (info.reason !== "destroyed") lost(info.message || "no reason given"); });
+    device.lost.then(({ reason, message }) => {
+      if (reason === "destroyed") return;
+      self.lost = message || "no reason given";
+      lost(self);
+    });
     device.addEventListener("uncapturederror", event => { self.problem ??= event.error.message; });
     self.context = canvas.getContext("webgpu");
     self.format = navigator.gpu.getPreferredCanvasFormat();
@@ -117,8 +122,22 @@ export class ExactRenderer {
   // ---- The mesh
 
   // Adds a mesh under the name `level`: the part of it that fits the device. Returns the share of triangles
-  // left out. Throws if not even parts fit.
+  // left out. Throws if not even parts fit; then nothing of it is left.
   add(level, mesh) {
+    try {
+      return this.#add(level, mesh);
+    } catch (error) {
+      delete this.levels[level];
+      for (const name of Object.keys(this.buffers).filter(name => name.startsWith(`${level}/`))) {
+        this.buffers[name].destroy();
+        delete this.buffers[name];
+      }
+      this.groupsOfBindings.delete(level);
+      throw error;
+    }
+  }
+
+  #add(level, mesh) {
     const part = fitting(mesh, this.most, this.kernels.limits.runs, this.kernels.groups);
     this.levels[level] = { mesh, part };
     this.#upload(`${level}/vertices`, part?.vertices ?? mesh.vertices);
@@ -208,9 +227,11 @@ export class ExactRenderer {
 
   // Draws one sample in each pixel of a level and shows the mean of it and of the frames since the last one
   // with `first`. filterScale: size of the image in that of the canvas, for the low-pass filter of the mesh.
-  async draw(level, pinhole, { first, background, gain, filterScale }) {
+  // stop(): whether the image is not wanted any more; then the canvas stays as it is, and the next frame has
+  // to be a first one.
+  async draw(level, pinhole, { first, background, gain, filterScale, stop = () => false }) {
     const { width, height } = pinhole, { mesh, counts } = this.levels[level];
-    if (16 * width * height > this.most) throw new Error("the image is too large");
+    if (width * height > this.mostPixels) throw new Error("the image is too large");
     this.#allocate("total", 16 * width * height);
     this.frames = first ? 1 : this.frames + 1;
     const show = { width, height, first, background, gain, linear: mesh.blending === "linear" };
@@ -219,12 +240,13 @@ export class ExactRenderer {
     while (waiting.length) {
       const [top, rows] = waiting.pop();
       if (!this.#fits(width, rows) || (counts.faces &&
-        !await this.#drawStrip(level, pinhole, top, rows, filterScale))) {
+        !await this.#drawStrip(level, pinhole, top, rows, filterScale, stop))) {
         if (rows <= ROWS) throw new Error("the tile lists need more memory than WebGPU allows here");
         const upper = ROWS * Math.ceil(rows / 2 / ROWS);
         waiting.push([top + upper, rows - upper], [top, upper]);
         continue;
       }
+      if (stop()) return;
       this.#collect({ ...show, top, rows }, !counts.faces);
     }
     this.#paint();
@@ -236,8 +258,9 @@ export class ExactRenderer {
       width * rows <= Math.min(window, this.most / 32);
   }
 
-  // Draws some rows of the image to `samples`; false if they have too many pairs of a run and a tile.
-  async #drawStrip(level, pinhole, top, rows, filterScale) {
+  // Draws some rows of the image to `samples`, unless stop(); false if they have too many pairs of a run and
+  // a tile.
+  async #drawStrip(level, pinhole, top, rows, filterScale, stop) {
     const strip = { ...pinhole, cy: pinhole.cy - top, height: rows };
     this.#prepare(level, strip, filterScale);
     // Loop iterations of one walk through a tile list, one limit after the other until all tiles are
@@ -250,6 +273,7 @@ export class ExactRenderer {
     for (let round = 0; ; round++) {
       const counters = await this.#run(level, steps);
       if (this.problem) throw new Error(this.problem);
+      if (stop()) return true;
       if (counters[0] > this.capacity) {
         const most = Math.min(pairs, Math.floor(this.most / 8));
         if (counters[0] > most) return false;

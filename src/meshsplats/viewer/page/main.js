@@ -4,7 +4,11 @@ import { App } from "./app.js";
 import { decodeMesh, decodeSplats, decodeSurface, unpack } from "./scene.js";
 import { element, say } from "./status.js";
 
-async function main() {
+// `saved`: by a browser, which writes the page as it is then, without the data that was taken from it.
+async function main(saved) {
+  if (saved)
+    throw new Error("This copy was saved by a browser, without its scene." +
+      " meshsplats view FILE -o scene.html writes a page with it.");
   if (!element("end")) throw new Error("This page is incomplete: its download was cut off. Load it again.");
   element("doing").textContent = "Unpacking the scene";
   const text = id => element(id)?.textContent.trim();
@@ -29,10 +33,11 @@ async function main() {
 
 function fail(error) {
   document.body.dataset.state = "failed";
-  element("loading").remove();
+  element("loading")?.remove();
   say(error.message, true);
 }
 
 // The scene follows this script, which may take a while to come.
-element("blocked").remove();
-document.addEventListener("DOMContentLoaded", () => main().catch(fail));
+const blocked = element("blocked");
+blocked?.remove();
+document.addEventListener("DOMContentLoaded", () => main(!blocked).catch(fail));

@@ -9,16 +9,22 @@ import { PRESENT_FRAGMENT, PRESENT_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, meshFra
   from "./shaders.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
-const PART = 1 << 18; // triangles of a draw call: long ones block slow devices, or lose them
+// triangles and pixels of a draw call: long ones block slow devices, or lose them
+const PART = 1 << 18, FILL = 1 << 22;
 const SOLID = { blended: -1, opaque: 1, wireframe: 0.8 };
 
 export class SortedRenderer {
-  // levels: meshes by name; others may be added later. Throws where there is no WebGL2.
-  constructor(canvas, levels, splats) {
+  // levels: meshes by name; others may be added later. note(text) is told what the device lacks. Throws where
+  // there is no WebGL2.
+  constructor(canvas, levels, splats, note) {
     const gl = canvas.getContext("webgl2", { alpha: true, antialias: false, premultipliedAlpha: true });
     if (!gl) throw new Error("this browser has no WebGL2");
-    Object.assign(this, { canvas, gl, levels, splats, triangles: {}, frames: new Map() });
-    this.float = Boolean(gl.getExtension("EXT_color_buffer_float"));
+    Object.assign(this, { canvas, gl, levels, splats, note, triangles: {}, frames: new Map() });
+    // Phones may have the second one alone, which suffices for the format here.
+    this.float = Boolean(gl.getExtension("EXT_color_buffer_float") ??
+      gl.getExtension("EXT_color_buffer_half_float"));
+    if (!this.float && !this.lost) note("WebGL draws with 8 bits a colour here: faint layers are lost.");
+    this.longest = gl.getParameter(gl.MAX_TEXTURE_SIZE); // texels
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);
     this.programs = { present: program(gl, PRESENT_VERTEX, PRESENT_FRAGMENT) };
@@ -28,11 +34,11 @@ export class SortedRenderer {
   // Whether the device has taken everything with it.
   get lost() { return this.gl.isContextLost(); }
 
-  #needMesh(level) {
+  async #needMesh(level) {
     if (this.triangles[level]) return this.triangles[level];
     const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3,
       V = mesh.vertices.length / 3;
-    const { harmonics, uv } = mesh, terms = harmonics?.terms ?? 0;
+    const harmonics = this.#harmonicsOf(mesh), { uv } = mesh, terms = harmonics?.terms ?? 0;
     const drawing = this.programs[`mesh ${uv ? "textured" : terms}`] ??= program(
       gl, meshVertex(terms, uv), meshFragment(uv));
     const brightest = mesh.colors.reduce((most, value) => Math.max(most, value), 1), bright = brightest > 1;
@@ -47,6 +53,7 @@ export class SortedRenderer {
     }
     if (uv) {
       attributes.push(["coordinate", uv, 2, gl.FLOAT]);
+      mesh.image = await shrunk(mesh.image, this.longest, this.note);
       textures.picture = picture(gl, mesh);
     }
     // In the order of the splats, the centres have the precision of the core's.
@@ -61,6 +68,13 @@ export class SortedRenderer {
     };
     this.crop(this.kept ?? null);
     return this.triangles[level];
+  }
+
+  // Those of a mesh, where a texture holds them.
+  #harmonicsOf({ harmonics }) {
+    if (!harmonics || harmonics.values.length / 3 <= WIDTH * this.longest) return harmonics;
+    this.note("WebGL draws without colours that depend on the view: its textures do not hold so many here.");
+    return null;
   }
 
   #needSplats() {
@@ -100,17 +114,23 @@ export class SortedRenderer {
   // the rest of the canvas transparent. scale: size of the image in that of the canvas; still: triangles are
   // sorted one by one, not fan by fan, unless the mesh is in the order of its splats, and the device may take
   // its time, unless stop() says that the image is not wanted any more: then the canvas stays as it is, and
-  // the result is false.
+  // the result is false. An error says at which `part` and level it arose.
   async draw({ view, level, parts, style, still, scale, background, gain, stop }) {
     const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
     const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h), images = [];
-    gl.disable(gl.SCISSOR_TEST);
+    const goesOn = still ? async () => { await this.#idle(); return !stop(); } : () => true;
     for (const { what } of parts) {
-      images.push(what === "splats" ? this.#drawSplats(pinhole, scale) : what === "mesh"
-        ? await this.#drawMesh("mesh", level, pinhole, style, still, stop)
-        : await this.#drawMesh(what, what, pinhole, style === "blended" ? "opaque" : style, still, stop));
+      try {
+        images.push(what === "splats" ? await this.#drawSplats(pinhole, scale, goesOn) : what === "mesh"
+          ? await this.#drawMesh("mesh", level, pinhole, style, still, goesOn)
+          : await this.#drawMesh(what, what, pinhole, style === "blended" ? "opaque" : style, still, goesOn));
+      } catch (error) {
+        throw Object.assign(error, { part: what, level });
+      }
       if (!images.at(-1)) return false;
     }
+    for (const [key, frame] of this.frames) if (!images.includes(frame.image)) this.#free(key);
+    gl.disable(gl.SCISSOR_TEST);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -133,36 +153,37 @@ export class SortedRenderer {
     return true;
   }
 
-  async #drawMesh(what, level, pinhole, style, still, stop) {
-    const { gl } = this, all = this.#needMesh(level), opaque = style === "opaque",
+  // goesOn(): waited for between the draw calls; whether the image is still wanted.
+  async #drawMesh(what, level, pinhole, style, still, goesOn) {
+    const { gl } = this, all = await this.#needMesh(level), opaque = style === "opaque",
       wires = style === "wireframe";
     if (!opaque) this.#sortMesh(all, pinhole, still);
     const list = opaque ? all.items : all.order.subarray(0, all.count);
     const frame = this.#frame(what, pinhole.width, pinhole.height, 4, opaque), corners = wires ? 6 : 3;
-    for (let at = 0; at === 0 || at < list.length; at += PART) {
-      if (still && at > 0) {
-        await this.#idle();
-        if (stop()) return null;
+    for (let bottom = 0; bottom < frame.height; bottom += frame.rows) {
+      for (let at = 0; at === 0 || at < list.length; at += PART) {
+        if (bottom + at > 0 && !await goesOn()) return null;
+        const some = list.subarray(at, at + PART);
+        this.#begin(frame, all.drawing, pinhole, bottom, at === 0);
+        if (opaque) {
+          gl.disable(gl.BLEND);
+          gl.enable(gl.DEPTH_TEST);
+        }
+        const place = all.drawing.at;
+        bindTextures(gl, all.drawing, all.textures);
+        gl.uniform1f(place("solid"), SOLID[style]);
+        gl.uniform1f(place("brightest"), all.brightest);
+        gl.uniform1f(place("harmonicStep"), all.harmonicStep);
+        gl.uniform3fv(place("eye"), pinhole.center);
+        gl.bindVertexArray(all.array);
+        gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires),
+          gl.STREAM_DRAW);
+        gl.drawElements(wires ? gl.LINES : gl.TRIANGLES, corners * some.length, gl.UNSIGNED_INT, 0);
+        gl.bindVertexArray(null);
       }
-      const some = list.subarray(at, at + PART);
-      this.#begin(frame, all.drawing, pinhole, at === 0);
-      if (opaque) {
-        gl.disable(gl.BLEND);
-        gl.enable(gl.DEPTH_TEST);
-      }
-      const place = all.drawing.at;
-      bindTextures(gl, all.drawing, all.textures);
-      gl.uniform1f(place("solid"), SOLID[style]);
-      gl.uniform1f(place("brightest"), all.brightest);
-      gl.uniform1f(place("harmonicStep"), all.harmonicStep);
-      gl.uniform3fv(place("eye"), pinhole.center);
-      gl.bindVertexArray(all.array);
-      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires),
-        gl.STREAM_DRAW);
-      gl.drawElements(wires ? gl.LINES : gl.TRIANGLES, corners * some.length, gl.UNSIGNED_INT, 0);
-      gl.bindVertexArray(null);
+      resolve(gl, frame, bottom);
     }
-    return resolve(gl, frame);
+    return frame.image;
   }
 
   // Until the device has done what it was given.
@@ -193,28 +214,35 @@ export class SortedRenderer {
     all.count = at;
   }
 
-  #drawSplats(pinhole, scale) {
+  async #drawSplats(pinhole, scale, goesOn) {
     const { gl } = this, all = this.#needSplats();
     depthsOf(this.splats.means, pinhole.rows[2], pinhole.near, all.depths);
     sortFarToNear(all.depths, all.items, all.order);
     const frame = this.#frame("splats", pinhole.width, pinhole.height, 0, false);
     const list = all.order.subarray(0, all.items.length);
-    this.#begin(frame, this.programs.splats, pinhole, true);
-    bindTextures(gl, this.programs.splats, all.textures);
-    gl.bindVertexArray(all.array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, all.buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, list, gl.STREAM_DRAW);
-    gl.uniform1f(this.programs.splats.at("dilation"), 0.3 * scale * scale);
-    gl.uniform1i(this.programs.splats.at("antialiased"), Number(this.splats.kernel === "antialiased"));
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, list.length);
-    gl.bindVertexArray(null);
-    return resolve(gl, frame);
+    for (let bottom = 0; bottom < frame.height; bottom += frame.rows) {
+      if (bottom > 0 && !await goesOn()) return null;
+      this.#begin(frame, this.programs.splats, pinhole, bottom, true);
+      bindTextures(gl, this.programs.splats, all.textures);
+      gl.bindVertexArray(all.array);
+      gl.bindBuffer(gl.ARRAY_BUFFER, all.buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, list, gl.STREAM_DRAW);
+      gl.uniform1f(this.programs.splats.at("dilation"), 0.3 * scale * scale);
+      gl.uniform1i(this.programs.splats.at("antialiased"), Number(this.splats.kernel === "antialiased"));
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, list.length);
+      gl.bindVertexArray(null);
+    }
+    return frame.image;
   }
 
-  #begin(frame, { id, at }, pinhole, clear) {
-    const { gl } = this;
+  // The rows of a frame from `bottom` on. A target with samples has the size of one strip, another that of
+  // the image.
+  #begin(frame, { id, at }, pinhole, bottom, clear) {
+    const { gl } = this, low = frame.target === frame.plain ? bottom : 0;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame.target);
-    gl.viewport(0, 0, frame.width, frame.height);
+    gl.viewport(0, low - bottom, frame.width, frame.height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(0, low, frame.width, frame.rows);
     gl.clearColor(0, 0, 0, 0);
     gl.depthMask(true);
     if (clear) gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -227,55 +255,73 @@ export class SortedRenderer {
     gl.uniform3f(at("size"), pinhole.width, pinhole.height, pinhole.near);
   }
 
-  // A frame buffer of that size for a part of the image, kept until another size is asked for.
+  #free(key) {
+    for (const free of this.frames.get(key).free) free();
+    this.frames.delete(key);
+  }
+
+  // A frame buffer of that size for a part of the image, drawn in strips of some rows, kept until another
+  // size is asked for, or an image without that part.
   #frame(what, width, height, samples, depth) {
     const { gl } = this, format = this.float ? gl.RGBA16F : gl.RGBA8, key = `${what} ${depth}`;
     const old = this.frames.get(key);
     if (old && old.width === width && old.height === height) return old;
-    if (old) for (const free of old.free) free();
-    const frame = { width, height, free: [] };
+    if (old) this.#free(key);
+    const rows = Math.max(1, Math.min(height, Math.floor(FILL / width)));
+    const frame = { width, height, rows, free: [] };
     frame.image = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, frame.image);
     gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
     for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
       gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
-    frame.plain = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, frame.plain);
+    frame.target = frame.plain = framebuffer(gl, frame);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, frame.image, 0);
-    frame.target = frame.plain;
-    frame.free.push(() => gl.deleteTexture(frame.image), () => gl.deleteFramebuffer(frame.plain));
+    frame.free.push(() => gl.deleteTexture(frame.image));
     const most = gl.getInternalformatParameter(gl.RENDERBUFFER, format, gl.SAMPLES)[0] ?? 0;
     if (samples && most) {
-      frame.target = gl.createFramebuffer();
-      gl.bindFramebuffer(gl.FRAMEBUFFER, frame.target);
-      frame.free.push(() => gl.deleteFramebuffer(frame.target));
-      attach(gl, frame, gl.COLOR_ATTACHMENT0, format, Math.min(samples, most));
-      if (depth) attach(gl, frame, gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24, Math.min(samples, most));
+      if (rows < height) {
+        frame.strip = framebuffer(gl, frame);
+        attach(gl, frame, gl.COLOR_ATTACHMENT0, format, 0, rows);
+      }
+      frame.target = framebuffer(gl, frame);
+      attach(gl, frame, gl.COLOR_ATTACHMENT0, format, Math.min(samples, most), rows);
+      if (depth) attach(gl, frame, gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24, Math.min(samples, most), rows);
     } else if (depth) {
-      attach(gl, frame, gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24, 0);
+      attach(gl, frame, gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24, 0, height);
     }
     this.frames.set(key, frame);
     return frame;
   }
 }
 
-function attach(gl, frame, place, format, samples) {
+function framebuffer(gl, frame) {
+  const made = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, made);
+  frame.free.push(() => gl.deleteFramebuffer(made));
+  return made;
+}
+
+function attach(gl, frame, place, format, samples, rows) {
   const buffer = gl.createRenderbuffer();
   gl.bindRenderbuffer(gl.RENDERBUFFER, buffer);
-  gl.renderbufferStorageMultisample(gl.RENDERBUFFER, samples, format, frame.width, frame.height);
+  gl.renderbufferStorageMultisample(gl.RENDERBUFFER, samples, format, frame.width, rows);
   gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, buffer);
   frame.free.push(() => gl.deleteRenderbuffer(buffer));
 }
 
-function resolve(gl, frame) {
-  if (frame.target !== frame.plain) {
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame.target);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, frame.plain);
-    gl.blitFramebuffer(0, 0, frame.width, frame.height, 0, 0, frame.width, frame.height, gl.COLOR_BUFFER_BIT,
-      gl.NEAREST);
+// The rows of a frame that were drawn, from `bottom` on, to its image. Samples are resolved where they are;
+// only then are they moved.
+function resolve(gl, { target, strip, plain, width, height, rows }, bottom) {
+  if (target === plain) return;
+  gl.disable(gl.SCISSOR_TEST);
+  const some = Math.min(rows, height - bottom), moves = strip ? [[target, strip, 0], [strip, plain, bottom]]
+    : [[target, plain, 0]];
+  for (const [from, to, low] of moves) {
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, from);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, to);
+    gl.blitFramebuffer(0, 0, width, some, 0, low, width, low + some, gl.COLOR_BUFFER_BIT, gl.NEAREST);
   }
-  return frame.image;
 }
 
 function program(gl, vertex, fragment) {
@@ -364,6 +410,16 @@ function texture(gl, format, layout, type, values) {
   for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
     gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
   return id;
+}
+
+// A picture with sides of at most `most` pixels.
+async function shrunk(image, most, note) {
+  const { width, height } = image, side = Math.max(width, height);
+  if (side <= most) return image;
+  note(`WebGL takes textures of ${most} texels here: that of the surface, of ${side}, is made smaller.`);
+  const [resizeWidth, resizeHeight] = [width, height].map(texels => Math.ceil(texels * most / side));
+  return createImageBitmap(image, { resizeWidth, resizeHeight, resizeQuality: "high",
+    colorSpaceConversion: "none", premultiplyAlpha: "none" });
 }
 
 // The texture of a surface.

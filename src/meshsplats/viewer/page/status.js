@@ -8,8 +8,9 @@ export const number = value => Math.round(value).toLocaleString("en");
 const MOMENT = 8000; // milliseconds of a note over the image
 let hiding;
 
-// In the settings, and where the mouse rests on the line of the state.
+// In the settings, once, and where the mouse rests on the line of the state.
 export function note(text) {
+  if ([...element("notes").children].some(line => line.textContent === text)) return;
   const line = document.createElement("p");
   element("notes").append(line);
   element("status").title = line.textContent = text;
@@ -27,12 +28,20 @@ export function say(text, lasting = false) {
   hiding = setTimeout(() => { message.hidden = true; }, MOMENT);
 }
 
+// Until the page is seen, and some milliseconds more.
+export async function seen(milliseconds) {
+  while (document.hidden)
+    await new Promise(done => document.addEventListener("visibilitychange", done, { once: true }));
+  await new Promise(done => setTimeout(done, milliseconds));
+}
+
 // state: of the image; exact: whether the exact renderer drew it, in so many passes; scale: of the canvas.
 export function report(app, state, exact, passes, scale, level) {
   const kind = !app.contents.shows("mesh") ? app.contents.parts.map(({ what }) => what).join(", ")
     : exact ? "exact" : "sorted";
   const samples = exact ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
-  const size = scale < 1 ? `, 1/${Math.round(1 / scale)} size` : state === "moving" ? ", moving" : samples;
+  const part = Math.round(1 / scale);
+  const size = part > 1 ? `, 1/${part} size` : state === "moving" ? ", moving" : samples + app.limited;
   const wording = {
     refining: `, ${app.passes} of ${passes} samples`, preparing: ", preparing the exact image",
   };
