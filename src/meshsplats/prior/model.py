@@ -125,10 +125,6 @@ class MeshPrior:
         layers are set apart by ``export_lift``."""
         return self.mesh if Path(path).suffix.lower() == ".npz" else self.pose(lift=self.export_lift)
 
-    def check_topology(self, base: BaseMesh) -> None:
-        """Raises what ``vertices_of`` raises."""
-        self.vertices_of(base)
-
     def vertices_of(self, base: BaseMesh) -> np.ndarray:
         """(n, 3) float32 positions of this base's vertices in ``base``, an edited one as ``load_base`` reads
         it: with the same vertices in the same order and the same triangles, or with the same triangles in the
