@@ -226,5 +226,5 @@ def test_python_of_the_documents_runs(page, scene_file, tmp_path, monkeypatch):
 def test_make_targets_of_the_documents_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for path in DOCUMENTS:
-        for target in re.findall(r"(?:^ *|`)make (\w+)", path.read_text(encoding="utf-8"), re.MULTILINE):
+        for target in re.findall(r"(?:^ *|`)make ([\w-]+)", path.read_text(encoding="utf-8"), re.MULTILINE):
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"{path.name} has make {target}"

@@ -21,7 +21,6 @@ from meshsplats._core.structures import (
     SplatsStruct,
     VertexGradientsStruct,
 )
-from meshsplats.errors import PACKAGE
 
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
@@ -80,7 +79,7 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
     if not available:
         raise ImportError(
             "the compiled core of meshsplats is missing: install the package from a clone or a wheel (pip"
-            f" install {PACKAGE}) instead of running it from its sources"
+            " install /path/to/meshsplats) instead of running it from its sources"
         )
     wanted = variant or os.environ.get("MESHSPLATS_VARIANT") or available[0]
     if wanted not in available:
