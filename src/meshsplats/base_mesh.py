@@ -93,11 +93,15 @@ class BaseMesh:
     """(3,) float32 direction that points up."""
     origin: np.ndarray = field(default_factory=zero_origin)
     """(3,) float64 point of the world that ``vertices`` are relative to: world = origin + vertices."""
+    tints: np.ndarray | None = None
+    """(n, 4) float32 linear RGBA in [0, 1] of the vertices, by which the textures are multiplied, as COLOR_0
+    of glTF; None: textures are as they are."""
 
     def __repr__(self) -> str:
         parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} faces"]
         parts += ["colours"] if self.colors is not None else []
         parts += [f"{len(self.textures)} textures"] if self.textures else []
+        parts += ["tints"] if self.tints is not None else []
         parts += ["normal map"] if self.normal_map is not None else []
         parts += [f"origin {in_words(self.origin)}"] if self.origin.any() else []
         return f"BaseMesh({', '.join(parts)})"
@@ -112,11 +116,13 @@ class BaseMesh:
             raise ValueError("up must not be the zero vector")
         arrays["origin"] = checked_array("origin", self.origin, np.float64, (3,))
         m = len(faces)
-        if self.colors is not None:
-            colors = checked_array("colors", self.colors, np.float32, (len(vertices), 4))
-            if len(colors) and (colors.min() < 0 or colors.max() > 1):
-                raise ValueError(f"colors must lie in [0, 1], got {colors.min():.4g} to {colors.max():.4g}")
-            arrays["colors"] = colors
+        for name, given in (("colors", self.colors), ("tints", self.tints)):
+            if given is not None:
+                colors = checked_array(name, given, np.float32, (len(vertices), 4))
+                if len(colors) and (colors.min() < 0 or colors.max() > 1):
+                    extent = f"{colors.min():.4g} to {colors.max():.4g}"
+                    raise ValueError(f"{name} must lie in [0, 1], got {extent}")
+                arrays[name] = colors
         if (self.uv is None) != (self.face_texture is None):
             raise ValueError("uv and face_texture must be given together")
         if self.uv is not None and self.face_texture is not None:
@@ -128,9 +134,10 @@ class BaseMesh:
                     f" got {index.min()} to {index.max()}"
                 )
             arrays["face_texture"] = index
+        for name in ("normal_map", "tints"):
+            if getattr(self, name) is not None and self.uv is None:
+                raise ValueError(f"{name} needs uv")
         if self.normal_map is not None:
-            if self.uv is None:
-                raise ValueError("normal_map needs uv")
             arrays["normal_map"] = checked_array("normal_map", self.normal_map, np.uint8, (None, None, 3))
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
@@ -175,8 +182,8 @@ class BaseMesh:
         return rgba
 
     def texture_at(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """(k, 4) float32 display RGBA of the textures at points on ``face`` (k,) with barycentric ``weights``
-        (k, 3); opaque mid grey on faces without a texture."""
+        """(k, 4) float32 display RGBA of the textures, with their tints, at points on ``face`` (k,) with
+        barycentric ``weights`` (k, 3); opaque mid grey on faces without a texture."""
         result = np.full((len(face), 4), 0.5, np.float32)
         result[:, 3] = 1
         if self.uv is None or self.face_texture is None:
@@ -186,4 +193,12 @@ class BaseMesh:
             here = self.face_texture[face] == index
             if here.any():
                 result[here] = texture.at(uv[here])
+        if self.tints is not None:
+            corners = self.tints[self.faces[face]]
+            # White changes nothing, not even by rounding.
+            rows = np.flatnonzero(self.textured_faces()[face] & (corners != 1).any(axis=(1, 2)))
+            tint = np.einsum("kc,kcj->kj", weights[rows].astype(np.float64), corners[rows])
+            tint = np.clip(tint, 0, 1).astype(np.float32)
+            result[rows, :3] = linear_to_srgb(srgb_to_linear(result[rows, :3]) * tint[:, :3])
+            result[rows, 3] *= tint[:, 3]
         return result

@@ -259,6 +259,9 @@ def test_the_factor_of_a_texture_is_drawn_and_what_cannot_be_is_refused():
     )
     shown = red.colors_at(np.zeros(1, int), np.full((1, 3), 1 / 3))[0, :3]
     assert draw_surface(red, camera)[32, 32] == pytest.approx(shown, abs=1e-6)
+    tints = np.tile(np.float32([1, 0.25, 0, 0.5]), (len(points), 1))
+    tinted = replace(red, textures=(Texture(pixels),), tints=tints)
+    np.testing.assert_allclose(draw_surface(tinted, camera), draw_surface(red, camera), atol=1e-5)
     some = np.where(np.arange(len(faces)) < 3, -1, 0)
     with pytest.raises(ValueError, match=f"this mesh has 1, on {len(faces) - 3} of {len(faces)} faces"):
         draw_surface(replace(red, face_texture=some), camera)

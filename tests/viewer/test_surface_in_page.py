@@ -13,6 +13,7 @@ from test_page import block
 
 import meshsplats as ms
 from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.colors import linear_to_srgb
 from meshsplats.images.reading import load_image
 from meshsplats.viewer.page import PageOptions, estimated_size
 from meshsplats.viewer.streams import Unpacker
@@ -73,6 +74,14 @@ def test_a_surface_alone_is_the_image_of_the_core(browser, write_page):
     assert page.problems() == []
     assert page.requests() == [url]
     page.close()
+
+
+def test_the_colours_of_vertices_beside_a_texture_are_in_the_page():
+    tints = np.tile(np.float32([0.5, 1, 0.25, 1]), (8, 1))
+    packed = pack_surface(replace(box(), tints=tints))
+    assert packed.picture == pack_surface(box()).picture
+    colors = unpack_mesh(packed.mesh.data).colors
+    np.testing.assert_allclose(colors[:, :3], linear_to_srgb(tints[:1, :3]).repeat(len(colors), 0), atol=0.01)
 
 
 def press(page, kind: str) -> np.ndarray:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.npz import write_npz
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
 from meshsplats.formats.ply.textures import ply_textures
-from meshsplats.formats.surfaces.corners import check_texture, plain_mesh
+from meshsplats.formats.surfaces.corners import check_texture, plain_mesh, warn_of_tints
 from meshsplats.formats.surfaces.glb import write_surface_glb
 from meshsplats.formats.surfaces.solids import write_3mf, write_stl
 from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_ply
@@ -57,7 +57,8 @@ def load_base(
 ) -> BaseMesh:
     """The mesh in a file that ``load_mesh`` reads, with its vertex colours, if it has any, and textures.
 
-    Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour), from USD
+    Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour, with the
+    colours of vertices that multiply it), from USD
     (``diffuseColor`` of UsdPreviewSurface), from the material library beside an `.obj` (``map_Kd``), and as a
     `.ply` names them (comment TextureFile); image files must lie in the folder of the mesh or below, or in
     the same `.usdz`.
@@ -142,7 +143,8 @@ def save_base(
       as MeshLab has it.
     - `.npz`: of this project; without the texture.
     - A normal map is in `.glb`, with tangents, and USD unless they are unlit, and in `.obj` as ``norm``, a
-      file NAME_normal.png beside; other formats leave it out.
+      file NAME_normal.png beside; other formats leave it out. So do all but `.glb` with tints of the texture,
+      which a DataWarning says.
     - `.stl`, `.3mf`: the shape alone, for printing: z up, from 0 on, a scene unit is a millimetre. A
       DataWarning says where it is no solid, as one whose edges do not have two triangles.
 
@@ -181,6 +183,8 @@ def save_base(
     if not len(base.faces):
         raise ValueError("the surface has no faces")
     check_texture(base)
+    if suffix in (*_BESIDE, ".usdz"):
+        warn_of_tints(base, target)
     own = None if image is None else f".{image}"
     writers: dict[str, Callable[[Path], None]] = {
         ".glb": lambda to: write_surface_glb(
@@ -251,6 +255,18 @@ def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:
     return np.concatenate([pixels, opaque], axis=2)
 
 
+class _Textured(NamedTuple):
+    """The textures of a file."""
+
+    uv: np.ndarray
+    """(m, 3, 2) float32 coordinates of the corners of each face, v down."""
+    index: np.ndarray
+    """(m,) int32 texture of each face; -1: none."""
+    images: tuple[Texture, ...]
+    tints: np.ndarray | None = None
+    """As ``BaseMesh.tints``."""
+
+
 def _read(
     source: Path, origin: Sequence[float] | np.ndarray | None
 ) -> tuple[SplatMesh, list[warnings.WarningMessage]]:
@@ -269,20 +285,19 @@ def _base(
     source: Path,
     mesh: SplatMesh,
     hints: Sequence[warnings.WarningMessage],
-    found: tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None,
+    found: _Textured | None,
 ) -> BaseMesh:
     """The base of ``mesh`` and ``hints`` (of ``_read``), with the textures ``found`` (of ``_textured``)."""
     uncolored = any(issubclass(each.category, NoColorsWarning) for each in hints)
     colors = None if uncolored else _display(mesh)
     base = BaseMesh(mesh.vertices, mesh.faces, colors, up=mesh.up, origin=mesh.origin)
-    if found is None or not (found[1] >= 0).any():
+    if found is None or not (found.index >= 0).any():
         return base
-    uv, index, images = found
-    if len(uv) != len(base.faces):
+    if len(found.uv) != len(base.faces):
         raise FileFormatError(
-            f"{source}: {len(uv):,} faces with texture coordinates, {len(base.faces):,} in all"
+            f"{source}: {len(found.uv):,} faces with texture coordinates, {len(base.faces):,} in all"
         )
-    return replace(base, uv=uv, face_texture=index, textures=images)
+    return replace(base, uv=found.uv, face_texture=found.index, textures=found.images, tints=found.tints)
 
 
 def _display(mesh: SplatMesh) -> np.ndarray:
@@ -296,17 +311,19 @@ def _display(mesh: SplatMesh) -> np.ndarray:
 
 def _textured(
     path: Path, hints: Sequence[warnings.WarningMessage], override: Texture | None
-) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None:
-    """Coordinates (m, 3, 2), v down, texture index (m,) of each face, and textures; None without any.
-    ``hints``: of ``_read``."""
+) -> _Textured | None:
+    """The textures of a file; None without any. ``hints``: of ``_read``."""
     with Content(path) as content:
         if content.is_usd:  # another process takes a while
             hinted = any(issubclass(each.category, NoTextureWarning) for each in hints)
-            return usd_textures(path, read_texture, override) if hinted or override is not None else None
+            wanted = hinted or override is not None
+            return _Textured(*usd_textures(path, read_texture, override)) if wanted else None
     if content.container in ("glb", "json"):
-        return gltf_textures(path, read_texture, override)
+        in_gltf = gltf_textures(path, read_texture, override)
+        return None if in_gltf is None else _Textured(*in_gltf)
     if content.container == "ply":
-        return ply_textures(path, read_texture, override)
+        in_ply = ply_textures(path, read_texture, override)
+        return None if in_ply is None else _Textured(*in_ply)
     if not content.is_obj:
         return None
     found = obj_coordinates(path)
@@ -314,6 +331,6 @@ def _textured(
         return None
     uv, complete, material, libraries = found
     if override is not None:
-        return uv, np.where(complete, 0, -1).astype(np.int32), (override,)
+        return _Textured(uv, np.where(complete, 0, -1).astype(np.int32), (override,))
     index, images = obj_textures(path, libraries, material, read_texture)
-    return uv, np.where(complete, index, -1).astype(np.int32), images
+    return _Textured(uv, np.where(complete, index, -1).astype(np.int32), images)

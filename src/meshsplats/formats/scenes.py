@@ -13,6 +13,7 @@ from meshsplats._kinds import need, need_path
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.meshes import expected_bytes
+from meshsplats.formats.surfaces.corners import warn_of_tints
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -42,7 +43,7 @@ def save_scene(
             up, it is that of ``mesh``, else -y.
         mesh: a mesh of splats, for those that do not.
         surface: a mesh with vertex colours or textures, such as one of photogrammetry. Textures go into
-            `.glb` and `.usdz`.
+            `.glb` and `.usdz`; their tints into `.glb` only, which a DataWarning says.
         collider: triangles that physics engines collide with, and nobody draws. USD: a mesh of the purpose
             'guide' with UsdPhysics' CollisionAPI and MeshCollisionAPI. glTF, which has no such thing: an
             invisible mesh whose node is named ``collider-colonly``, as Godot imports colliders.
@@ -79,6 +80,8 @@ def save_scene(
     _check_up(parts)
     if surface is not None and surface.textured and suffix not in (".glb", ".usdz"):
         raise ValueError(f"{target.name!r} has no place for the textures of the surface: write .glb or .usdz")
+    if surface is not None and suffix != ".glb":
+        warn_of_tints(surface, target)
     with atomic_path(target, needs=_bytes(parts, suffix)) as temporary:
         if suffix == ".glb":
             from meshsplats.formats.gltf.scene_writer import write_scene_glb

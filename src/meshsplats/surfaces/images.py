@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,8 @@ from meshsplats._core.surfaces import (
 from meshsplats._kinds import need
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.camera import Camera
-from meshsplats.formats.surfaces.corners import check_texture, opaque_pixels, plain_mesh
+from meshsplats.formats.surfaces.corners import check_texture, opaque_pixels
+from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
 from meshsplats.mesh import Triangles
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
@@ -167,7 +169,8 @@ def draw_surface(
     threads: int | None = None,
 ) -> np.ndarray:
     """(h, w, 3) float32 image of an opaque mesh with one texture or with vertex colours, unlit: display RGB,
-    the mean over 2 x 2 samples of each pixel.
+    the mean over 2 x 2 samples of each pixel. A texture with tints is drawn as colours of vertices
+    (``texture_to_vertex_colors``).
 
     Args:
         base: the mesh; grey where it has neither.
@@ -181,12 +184,17 @@ def draw_surface(
     need(BaseMesh, base=base)
     need(Camera, camera=camera)
     check_texture(base)
-    if base.textured and base.uv is not None:
+    if base.textured and base.uv is not None and base.tints is None:
         surface = Surface(base.vertices.astype(np.float64), base.faces, *_unrolled(base))
         camera = camera.with_near_plane(base.vertices)
         behind = np.asarray(background, np.float32)
         return SurfaceImage(surface, camera, behind, gradients=False, threads=threads).color
-    return render(plain_mesh(base), camera, background=background, samples=SAMPLES, threads=threads).color
+    colored = texture_to_vertex_colors(base)
+    if base.textured:
+        colors = colored.colors.copy()
+        colors[:, 3] = 1
+        colored = replace(colored, colors=colors)
+    return render(colored, camera, background=background, samples=SAMPLES, threads=threads).color
 
 
 def _unrolled(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:

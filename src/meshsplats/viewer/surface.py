@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats.base_mesh import BaseMesh
+from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.surfaces.corners import check_texture, corners_of, plain_mesh, texture_file
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer.packing import vertex_order
@@ -41,7 +42,7 @@ class PackedSurface:
 
 
 def pack_surface(base: BaseMesh) -> PackedSurface:
-    """``base``, opaque, with its texture or else the colours of its vertices.
+    """``base``, opaque, with its texture and the tints of that, or else the colours of its vertices.
 
     Raises ValueError for a mesh without triangles, and for one that is not textured as surfaces are: with one
     texture on all faces, or none.
@@ -55,8 +56,10 @@ def pack_surface(base: BaseMesh) -> PackedSurface:
         return PackedSurface(plain, quantise_mesh(plain), None, b"")
     corners = corners_of(replace(base, normal_map=None))
     assert corners.uv is not None
-    white = np.ones((len(corners.vertices), 4), np.float32)
-    shape = SplatMesh(corners.vertices, corners.faces, white, up=base.up, origin=base.origin)
+    colors = np.ones((len(corners.vertices), 4), np.float32)
+    if corners.tints is not None:
+        colors[:, :3] = linear_to_srgb(corners.tints[:, :3])
+    shape = SplatMesh(corners.vertices, corners.faces, colors, up=base.up, origin=base.origin)
     packer, texture = Packer(), base.textures[0]
     suffix, picture = texture_file(base)
     header = {

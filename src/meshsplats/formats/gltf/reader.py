@@ -190,13 +190,7 @@ def _piece(
     v = len(vertices)
     faces = placed_faces(document, place, primitive, v)
     document.budget.spend(64 * v + 12 * len(faces), "a mesh")
-    linear = np.ones((v, 4), np.float32)
-    if "COLOR_0" in attributes:
-        shape = document.accessor(attributes["COLOR_0"], "COLOR_0").shape
-        if shape[0] != v or shape[1] < 3:
-            raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {shape}")
-        colors = document.floats(attributes["COLOR_0"], "COLOR_0", fractions=True)
-        linear[:, : colors.shape[1]] = colors
+    linear = linear_colors(document, attributes, v)
     if look.emits:
         linear[:, :3] = 1
     if look.factor is not None:
@@ -220,6 +214,18 @@ def _piece(
             if tables[name].shape != wanted:
                 raise document.error(f"{name} must have shape {wanted}, got {tables[name].shape}")
     return _Piece(place, place.skinning(document, attributes, v), vertices, faces, linear, normals, tables)
+
+
+def linear_colors(document: GltfDocument, attributes: dict[str, Any], v: int) -> np.ndarray:
+    """(v, 4) float32 linear RGBA of the ``v`` vertices of a primitive (COLOR_0); white without any."""
+    linear = np.ones((v, 4), np.float32)
+    if "COLOR_0" in attributes:
+        shape = document.accessor(attributes["COLOR_0"], "COLOR_0").shape
+        if shape[0] != v or shape[1] < 3:
+            raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {shape}")
+        colors = document.floats(attributes["COLOR_0"], "COLOR_0", fractions=True)
+        linear[:, : colors.shape[1]] = colors
+    return linear
 
 
 def placed_faces(document: GltfDocument, place: Placed, primitive: dict[str, Any], v: int) -> np.ndarray:

@@ -137,6 +137,8 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
             linear = base.colors[used].copy()
             linear[:, :3] = srgb_to_linear(linear[:, :3])
             extra["COLOR_0"] = linear
+        elif texture >= 0 and base.tints is not None:
+            extra["COLOR_0"] = base.tints[used]
         if texture >= 0:
             source = base.textures[texture]
             factor = {"baseColorFactor": list(source.factor), "baseColorTexture": {"index": len(images)}}
@@ -145,6 +147,8 @@ def _surface_part(base: BaseMesh, lit: bool) -> Part:
         primitive = _triangles(chunk, base.vertices[used], faces.reshape(-1, 3).astype(np.int32), extra)
         primitives.append(primitive | {"material": len(materials)})
         mode = "OPAQUE" if texture < 0 else alpha_mode(base.textures[texture])
+        if texture >= 0 and base.tints is not None and (base.tints[used, 3] < 1).any():
+            mode = "BLEND"
         material = _material(factor or {}, mode, lit)
         materials.append(material if factor is None else material | relief)
     meshes = [{"name": "surface", "primitives": primitives}]

@@ -17,6 +17,7 @@ from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.looks import Look, look_of
 from meshsplats.formats.gltf.reader import (
     POINTS_TO_LINES,
+    linear_colors,
     placed_faces,
 )
 from meshsplats.formats.gltf.scene_parts import shown_meshes
@@ -28,15 +29,18 @@ _SOURCES = ("EXT_texture_webp",)
 
 def gltf_textures(
     path: Path, read: Callable[[Path, bytes], np.ndarray], override: Texture | None = None
-) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None:
+) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...], np.ndarray | None] | None:
     """Texture coordinates (m, 3, 2) float32, v down, and texture index (m,) int32, -1 for none, of each
-    triangle in the order of ``read_gltf``; and the textures. None if no triangle has any.
+    triangle in the order of ``read_gltf``; the textures; and what the vertices multiply them by, (n, 4)
+    float32 linear RGBA in [0, 1], None where all are white. None if no triangle has a texture.
 
-    ``override`` is a texture for all triangles that have coordinates. Raises FileFormatError.
+    ``override`` is a texture for all triangles that have coordinates, as it is. A DataWarning counts what is
+    left out. Raises FileFormatError.
     """
     document = GltfDocument(path)
     found = _Textures(document, read)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
+    tints: list[tuple[int, np.ndarray | None]] = []
     for place in shown_meshes(document):
         for primitive in document.objects(place.mesh.get("primitives"), "primitives of a mesh"):
             if primitive.get("mode", 4) in POINTS_TO_LINES:
@@ -56,16 +60,28 @@ def gltf_textures(
                 document.budget.spend(24 * len(faces), "texture coordinates")
             corners = np.zeros((len(faces), 3, 2), np.float32) if uv is None else uv[faces]
             parts.append((corners, np.full(len(faces), index, np.int32)))
+            plain = index < 0 or override is not None
+            tints.append((v, None if plain else found.tint_of(look, attributes, v)))
     if found.unread:
         warnings.warn(
             f"{path}: {found.unread} textures are of a kind that is not read; their faces have none",
             DataWarning,
             stacklevel=4,
         )
+    if found.uncut:
+        warnings.warn(
+            f"{path}: opacities of the vertices of {found.uncut} primitives were left out: textures alone"
+            " cut these out",
+            DataWarning,
+            stacklevel=4,
+        )
     if not parts or all((number < 0).all() for _, number in parts):
         return None
     textures = tuple(found.textures) if override is None else (override,)
-    return np.concatenate([c for c, _ in parts]), np.concatenate([n for _, n in parts]), textures
+    tinted = None
+    if any(tint is not None for _, tint in tints):
+        tinted = np.concatenate([np.ones((v, 4), np.float32) if tint is None else tint for v, tint in tints])
+    return np.concatenate([c for c, _ in parts]), np.concatenate([n for _, n in parts]), textures, tinted
 
 
 def cut_out(pixels: np.ndarray, factor: float, cutoff: float) -> np.ndarray:
@@ -113,6 +129,8 @@ class _Textures:
     read: Callable[[Path, bytes], np.ndarray]
     textures: list[Texture] = field(default_factory=list)
     unread: int = 0
+    uncut: int = 0
+    """Primitives whose vertices have opacities, too, by which they should be cut out."""
     _indices: dict[tuple[Any, ...], int] = field(default_factory=dict)
     _images: dict[int, np.ndarray] = field(default_factory=dict)
     _cut: dict[tuple[int, float, float], np.ndarray] = field(default_factory=dict)
@@ -146,6 +164,18 @@ class _Textures:
             self._indices[key] = len(self.textures)
             self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]
         return self._indices[key]
+
+    def tint_of(self, look: Look, attributes: dict[str, Any], v: int) -> np.ndarray | None:
+        """(v, 4) float32 linear RGBA in [0, 1]: what the vertices of a primitive multiply the texture of
+        ``look`` by (glTF 2.0, 3.9.2); None where they are white."""
+        if "COLOR_0" not in attributes or look.emits:
+            return None
+        self.document.budget.spend(16 * v, "colours of vertices")
+        tint = linear_colors(self.document, attributes, v).clip(0, 1)
+        if look.alpha_mode != "BLEND":
+            self.uncut += look.alpha_mode == "MASK" and bool((tint[:, 3] != 1).any())
+            tint[:, 3] = 1
+        return None if (tint == 1).all() else tint
 
     def _cut_out(self, source: int, pixels: np.ndarray, factor: float, cutoff: float) -> np.ndarray:
         """``cut_out``, once for all materials that cut the image ``source`` alike."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +11,7 @@ import numpy as np
 from meshsplats._geometry import vertex_normals
 from meshsplats.base_mesh import BaseMesh, Texture, Wrap
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.errors import DataWarning
 from meshsplats.formats.surfaces.tangents import corner_frames
 from meshsplats.images.writing import encode_image
 from meshsplats.mesh import SplatMesh
@@ -34,6 +37,8 @@ class Corners(NamedTuple):
     """(w, 4) float32 display RGBA."""
     tangents: np.ndarray | None = None
     """(w, 4) float32, for a normal map: unit vectors along u, and the sign of the bitangent."""
+    tints: np.ndarray | None = None
+    """(w, 4) float32 linear RGBA by which the texture is multiplied."""
 
 
 def corners_of(base: BaseMesh) -> Corners:
@@ -62,6 +67,7 @@ def corners_of(base: BaseMesh) -> Corners:
         base.uv.reshape(-1, 2)[first[order]],
         None if base.colors is None else base.colors[rows],
         tangents,
+        None if base.tints is None else base.tints[rows],
     )
 
 
@@ -110,6 +116,17 @@ def check_texture(base: BaseMesh) -> None:
         raise ValueError(
             f"a surface has one texture on all faces, this mesh has {len(base.textures)}, on"
             f" {int(base.textured_faces().sum()):,} of {len(base.faces):,} faces"
+        )
+
+
+def warn_of_tints(base: BaseMesh, target: Path) -> None:
+    """DataWarning where the texture of ``base`` has tints, which the format of ``target`` does not keep."""
+    if base.textured and base.tints is not None:
+        warnings.warn(
+            f"{target.name}: left out are the colours of vertices by which the texture is multiplied, which"
+            " only .glb keeps beside a texture",
+            DataWarning,
+            stacklevel=3,
         )
 
 

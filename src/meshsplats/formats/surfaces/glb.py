@@ -43,6 +43,7 @@ def write_surface_glb(
     material: dict[str, Any] = {"name": "surface", "pbrMetallicRoughness": pbr}
     more: dict[str, Any] = {}
     used: list[str] = []
+    linear = shape.tints
     if shape.uv is not None:
         attributes["TEXCOORD_0"] = chunk.attribute(shape.uv)
         suffix, content = texture_file(base, image)
@@ -73,6 +74,7 @@ def write_surface_glb(
     elif shape.colors is not None:
         linear = shape.colors.copy()
         linear[:, :3] = srgb_to_linear(linear[:, :3])
+    if linear is not None:
         attributes["COLOR_0"] = chunk.attribute(
             (linear * np.float32(65535) + np.float32(0.5)).astype(np.uint16)
         )
