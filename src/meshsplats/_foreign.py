@@ -67,7 +67,7 @@ _KINDS: Sequence[_Kind] = (
         rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|II\*\0|MM\0\*|v/1\x01|....ftyp(heic|heix|mif1|avif)",
         "an image; 'meshsplats train' makes a mesh of a folder of photographs",
     ),
-    _Kind(".insv .360", b"", "a video of a panoramic camera: export it with its program as .mp4"),
+    _Kind(".insv .360", b"", "a video of a panoramic camera: export it with its program as a flat .mp4"),
     _Kind(
         " ".join(VIDEO_SUFFIXES),
         rb"....ftyp(isom|iso2|mp4|qt|M4V|avc1|3gp)|....(moov|mdat|wide)|\x1aE\xdf\xa3|RIFF....AVI ",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
+from contextlib import nullcontext
 from dataclasses import replace
 from io import BytesIO
 
@@ -26,6 +27,7 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.images.reading import read_header, read_shot
 from meshsplats.rendering.previews import save_preview
 from meshsplats.viewpoints.sheet import contact_sheet
 
@@ -166,6 +168,54 @@ def test_up_is_the_edge_that_exif_says(tmp_path, orientation, edge):
     ]
     (x, y), _ = (part[0] for part in view.camera.project(point[None]))
     assert (x, y) == pytest.approx({"top": (6, 0), "bottom": (6, 8), "left": (0, 4), "right": (12, 4)}[edge])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_of_tiff_are_those_stored(tmp_path, orientation):
+    """Pillow turns them by their orientation; cameras mean them as they are in the file, as of JPEG."""
+    folder = simple_colmap(tmp_path, 2)
+    pixels = np.random.default_rng(0).integers(0, 256, (8, 12, 3)).astype(np.uint8)
+    for path in sorted((folder / "images").iterdir()):
+        exif = Image.Exif()
+        exif[0x112] = orientation
+        Image.fromarray(pixels).save(path.with_suffix(".tif"), exif=exif)
+        Image.fromarray(pixels).save(path.with_suffix(".jpg"), exif=exif)
+        path.unlink()
+        assert read_shot(path.with_suffix(".tif")).size == (12, 8)
+        turn = read_header(path.with_suffix(".jpg")).turn
+        path.with_suffix(".jpg").unlink()
+    with pytest.warns(DataWarning, match="another name"):
+        view = load_dataset(folder, test_every=0).train[0]
+    assert np.array_equal(view.load().color, pixels)
+    assert view.turn == turn
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 1), (8, 3)])
+def test_upright_masks_lie_on_photographs_stored_on_their_side(tmp_path, orientation, turns):
+    """Programs that make masks read photographs as they were held, and leave no EXIF data."""
+    folder = simple_colmap(tmp_path, 1)
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.open(folder / "images/p00.png").save(folder / "images/p00.png", exif=exif)
+    mask = np.zeros((8, 12), np.uint8)
+    mask[:3, :5] = 255  # as the photograph is stored
+    save(folder / "masks/p00.png", np.rot90(mask, -turns) if turns != 2 else mask)
+    said = pytest.warns(DataWarning, match="taken upside down, and are used as these are stored")
+    with said if turns == 2 else nullcontext():
+        view = load_dataset(folder, test_every=0).train[0]
+    assert np.array_equal(view.mask, mask > 0)
+    if turns % 2:
+        save(folder / "masks/p00.png", mask)  # as the photograph
+        assert np.array_equal(load_dataset(folder, test_every=0).train[0].mask, mask > 0)
+
+
+def test_a_photograph_taken_upright_is_shown_so(tmp_path):
+    folder = simple_colmap(tmp_path, 2)
+    exif = Image.Exif()
+    exif[0x112] = 6
+    Image.open(folder / "images/p00.png").save(folder / "images/p00.png", exif=exif)
+    opening = load_dataset(folder, test_every=2).opening
+    assert (opening.width, opening.height) == (8, 12)
 
 
 def test_broken_exif_is_no_matter(tmp_path):

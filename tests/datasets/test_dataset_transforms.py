@@ -11,6 +11,7 @@ import pytest
 from _datasets import pinhole_rays, rotation, save, sky, write_json
 
 from meshsplats import load_dataset
+from meshsplats.datasets.points import load_points
 from meshsplats.errors import DataWarning, FileFormatError
 
 EYE = np.eye(4).tolist()
@@ -246,6 +247,53 @@ def test_smaller_copies_of_nested_folders(tmp_path):
     view = load_dataset(tmp_path, downscale=2, test_every=0).train[0]
     assert view.image.min() == 1
     assert view.camera.fx == 5
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_photographs_of_a_neighbour_are_no_smaller_copies(tmp_path, listed):
+    """walk_2/ beside walk/ is another session, whether it is one of the data set or not."""
+    frames = [frame(f"images/{name}/0.png") for name in ("walk", *(["walk_2"] if listed else []))]
+    studio(tmp_path, 0, frames=frames)
+    save(tmp_path / "images/walk/0.png", np.full((8, 12, 3), 250, np.uint8))
+    save(tmp_path / "images/walk_2/0.png", np.full((4, 6, 3) if listed else (8, 12, 3), 20, np.uint8))
+    views = load_dataset(tmp_path, downscale=2, test_every=0).train
+    assert round(255 * float(views[0].image.mean())) == 250
+    assert views[0].camera.width == 6
+
+
+def test_frames_that_are_listed_twice_are_taken_once(tmp_path):
+    names = [f"images/f{i}.png" for i in range(4)]
+    frames = [frame(name, i) for i, name in enumerate([*names, *(f"./{name}" for name in names[:2])])]
+    folder = studio(tmp_path, 4, frames)
+    with pytest.warns(DataWarning, match=r"2 images listed more than once, and taken once .*f0\.png"):
+        data = load_dataset(folder, test_every=2)
+    assert [view.name for view in data.views] == [names[1], names[3], names[0], names[2]]
+    assert np.allclose(data.test[0].camera.center, camera_to_world(0)[:3, 3])
+
+
+def test_masks_and_points_of_another_place_are_found(tmp_path):
+    frames = [frame("images/f0.png", mask_path="/home/me/scan/m/x.png")]
+    save(tmp_path / "m/x.png", np.eye(8, 12).astype(np.uint8) * 255)
+    folder = studio(tmp_path, 1, frames, ply_file_path="/home/me/scan/points.ply")
+    with pytest.warns(DataWarning, match=r"1 masks have paths of another place.*m/x\.png\)"):
+        (view,) = load_dataset(folder, test_every=0).train
+    assert view.mask.sum() == 8
+    with pytest.warns(DataWarning, match=r"its points, '/home/me/scan/points\.ply', are not in the folder"):
+        assert load_points(folder) is None
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    (folder / "points.ply").write_text(header + "end_header\n1 2 3\n")
+    assert load_points(folder).positions.tolist() == [[1, 2, 3]]
+
+
+def test_masks_of_zeros_and_ones(tmp_path):
+    mask = np.zeros((8, 12), np.uint8)
+    mask[:, :5] = 1
+    folder = studio(tmp_path, 1, [frame("images/f0.png", mask_path="m.png")])
+    save(tmp_path / "m.png", mask)
+    assert np.array_equal(load_dataset(folder, test_every=0).train[0].mask, mask > 0)
+    save(tmp_path / "m.png", 0 * mask)
+    assert not load_dataset(folder, test_every=0).train[0].mask.any()
 
 
 @pytest.mark.parametrize(

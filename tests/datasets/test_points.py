@@ -12,7 +12,7 @@ from _datasets import simple_colmap
 
 from meshsplats.datasets import points as reader
 from meshsplats.datasets.points import load_points
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 
 POSITIONS = np.array([[0.5, -1, 2], [3, 4, 5.25]])
 COLORS = np.array([[255, 0, 10], [1, 2, 3]], np.uint8)
@@ -132,8 +132,9 @@ def test_the_points_that_a_transforms_file_names_are_read(tmp_path):
 
 def test_no_path_leaves_the_folder(tmp_path):
     nerfstudio(tmp_path / "scene", "../points.ply")
-    with pytest.raises(FileFormatError, match="only files inside"):
-        load_points(tmp_path / "scene")
+    (tmp_path / "points.ply").write_text("none")
+    with pytest.warns(DataWarning, match="are not in the folder, and are left out"):
+        assert load_points(tmp_path / "scene") is None
 
 
 @pytest.mark.parametrize(

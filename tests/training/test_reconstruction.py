@@ -7,6 +7,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+import warnings
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,14 +16,16 @@ import numpy as np
 import pytest
 from _balls import cameras_around
 from _datasets import save, simple_colmap
+from _local import make_link
 from PIL import Image, TiffImagePlugin
 
 from meshsplats.camera import Camera
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.points import load_points
-from meshsplats.errors import DataWarning, MissingDependencyError, OptionsError
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionsError
 from meshsplats.images.reading import Shot, load_image, read_shot
 from meshsplats.training import poses, reconstruction
+from meshsplats.training.feature_masks import FeatureMasks
 from meshsplats.training.photographs import PhotographOptions
 from meshsplats.training.reconstruction import bare_photographs, ensure_cameras, find_cameras
 
@@ -92,6 +95,8 @@ class Colmap:
     class Device:
         cpu = "cpu"
 
+    ImageReaderOptions = SimpleNamespace
+
     def __init__(self, cameras: dict[str, Camera], methods: bool) -> None:
         self.logging = SimpleNamespace()
         self.octave = -1  # for small images
@@ -107,7 +112,13 @@ class Colmap:
     def set_random_seed(self, seed):
         self.calls.append("seed")
 
-    def extract_features(self, database, folder, names, *, camera_mode, device, sift_options):
+    def extract_features(
+        self, database, folder, names, *, camera_mode, device, sift_options, reader_options=None
+    ):
+        self.masks = {}
+        if reader_options is not None:
+            files = Path(reader_options.mask_path).iterdir()
+            self.masks = {path.name: np.asarray(Image.open(path)) for path in files}
         assert sift_options == {"max_image_size": 1600, "max_num_features": 3000, "first_octave": self.octave}
         self.lenses.append((camera_mode, names))
         self.names, self.folder = sorted(name for _, names in self.lenses for name in names), Path(folder)
@@ -238,12 +249,12 @@ def test_cameras_and_points_are_written_both_or_not_at_all(scene, monkeypatch):
     assert sorted(os.listdir(folder)) == [f"p{i}.png" for i in range(5)]
 
 
-def write_jpeg(path, side, focal=None, focal_of_film=None):
+def write_jpeg(path, side, focal=None, focal_of_film=None, more=None):
     """A JPEG ``side`` x 40 pixels large, with focal lengths in its EXIF data."""
     exif = Image.Exif()
     exif[0x0110] = "Phone"
     values = {0x920A: focal, 0xA405: focal_of_film}
-    exif[0x8769] = {tag: value for tag, value in values.items() if value is not None}
+    exif[0x8769] = {tag: value for tag, value in (values | (more or {})).items() if value is not None}
     Image.new("RGB", (side, 40)).save(path, exif=exif)
 
 
@@ -254,13 +265,19 @@ def test_photographs_of_one_size_and_focal_length_share_a_lens(scene):
     write_jpeg(folder / "q0.jpg", 60, 4.2, 26)
     write_jpeg(folder / "q1.jpg", 60, 4.2, 52)
     write_jpeg(folder / "q2.jpg", 60, 4.2)
-    write_jpeg(folder / "q3.jpg", 60, 4.3, 26)
+    write_jpeg(folder / "q3.jpg", 60, 4.2, 26)
+    write_jpeg(folder / "q4.jpg", 60, 2.2, 26)  # the wide lens, cut to the same field
+    for name, zoom in (("r0", 1.0), ("r1", 2.0), ("r2", 2.0), ("r3", 0.0)):
+        write_jpeg(folder / f"{name}.jpg", 60, 5.4, 23, {0xA404: zoom})
+    write_jpeg(folder / "r4.jpg", 60, 5.4, 23, {0xA434: "ultra-wide"})
     with pytest.warns(DataWarning):
         find_cameras(folder)
     assert colmap.lenses == [
         ("single", ["p0.png", "p1.png", "p2.png", "p3.png"]),
         ("single", ["q0.jpg", "q3.jpg"]),
-        ("per image", ["p4.png", "q1.jpg", "q2.jpg"]),
+        ("single", ["r0.jpg", "r3.jpg"]),
+        ("single", ["r1.jpg", "r2.jpg"]),
+        ("per image", ["p4.png", "q1.jpg", "q2.jpg", "q4.jpg", "r4.jpg"]),
     ]
 
 
@@ -276,8 +293,10 @@ def test_exif_data_that_are_none_do_not_matter(tmp_path):
 def test_formats_that_the_library_does_not_read_are_copied(scene):
     """By what a file holds, whatever it is called; the others are not written anew."""
     folder, colmap, _ = scene()
-    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(folder / "p1.webp", lossless=True)
+    pixels = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x8769] = {0xA405: 26}
+    Image.fromarray(pixels).save(folder / "p1.webp", lossless=True, exif=exif)
     Image.fromarray(pixels).save(folder / "p2.jpg", "WEBP", lossless=True)
     for name in ("p1.png", "p2.png"):
         (folder / name).unlink()
@@ -286,17 +305,138 @@ def test_formats_that_the_library_does_not_read_are_copied(scene):
 
     def match(database, **options):
         held.update({path.name: (path.is_symlink(), load_image(path)) for path in colmap.folder.iterdir()})
+        held["lens"] = read_shot(colmap.folder / "000001.jpg").lens
         real(database, **options)
 
     colmap.match_exhaustive = match
-    colmap.cameras = {f"{i:06d}.png": camera for i, camera in enumerate(colmap.cameras.values())}
+    names = ["000000.png", "000001.jpg", "000002.jpg", "000003.png"]
+    colmap.cameras = dict(zip(names, colmap.cameras.values(), strict=True))
+    said: list[str] = []
     with pytest.warns(DataWarning, match=r"p4\.png"):
-        find_cameras(folder)
-    assert sorted(held) == [f"{i:06d}.png" for i in range(5)]
-    for name in ("000001.png", "000002.png"):
+        find_cameras(folder, said.append)
+    assert "finding the cameras of 5 photographs: copies of 2, as JPEG" in said
+    assert "26" in held.pop("lens")  # where the search for the focal length begins
+    assert sorted(held) == [*names, "000004.png"]
+    for name in ("000001.jpg", "000002.jpg"):
         assert not held[name][0]
-        np.testing.assert_array_equal(held[name][1], pixels)
+        assert np.abs(held[name][1].astype(int) - pixels).max() < 12
     assert load_dataset(folder, test_every=0).train[1].name.endswith("p1.webp")
+
+
+def test_images_of_kinds_that_are_not_read_are_named(scene):
+    """But for raw photographs beside what was developed of them."""
+    folder, _, _ = scene()
+    for name in ("p0.dng", "p7.dng", "p8.avif", "p9.JFIF", ".p6.avif"):
+        (folder / name).write_bytes(b"x")
+    with pytest.warns(DataWarning) as warned:
+        find_cameras(folder)
+    assert str(warned[0].message).endswith(
+        "3 images are of kinds that are not read, and are left out: p7.dng, p8.avif, p9.JFIF"
+    )
+
+
+def test_links_out_of_the_folder_are_refused_before_the_search(scene, tmp_path):
+    folder, colmap, _ = scene()
+    (folder / "p2.png").rename(tmp_path / "other.png")
+    make_link(folder / "p2.png", tmp_path / "other.png")
+    with pytest.raises(FileFormatError, match=r"'p2\.png' is a link that leads out"):
+        find_cameras(folder)
+    assert not colmap.lenses
+
+
+def test_panoramas_are_refused_before_the_search(scene):
+    folder, colmap, _ = scene()
+    said = b'<x:xmpmeta><rdf:li GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    for i in range(2):
+        Image.new("RGB", (80, 40)).save(folder / f"q{i}.jpg", xmp=said)
+    Image.new("RGB", (80, 40)).save(folder / "q2.jpg")
+    with pytest.raises(
+        ValueError, match=r"2 of 8 photographs are panoramas, .*: q0\.jpg, q1\.jpg; export flat"
+    ):
+        find_cameras(folder)
+    assert not colmap.lenses
+
+
+def masked(folder, dark: slice, turn: int = 0) -> np.ndarray:
+    """Masks of the photographs, dark in some of their rows."""
+    mask = np.full((40, 60), 255, np.uint8)
+    mask[dark] = 0
+    for i in range(4):
+        save(folder / f"masks/p{i}.png", np.rot90(mask, turn))
+    return mask
+
+
+@pytest.mark.parametrize("turn", [0, -1])
+def test_features_of_what_passed_by_do_not_count(scene, turn):
+    folder, colmap, _ = scene()
+    mask = masked(folder, slice(0, 15), turn)
+    if turn:  # as the photographs were held
+        exif = Image.Exif()
+        exif[0x112] = 6
+        for i in range(4):
+            Image.open(folder / f"p{i}.png").save(folder / f"p{i}.png", exif=exif)
+    with pytest.warns(DataWarning):
+        find_cameras(folder)
+    assert sorted(colmap.masks) == [f"p{i}.png.png" for i in range(4)]
+    assert all(np.array_equal(found, mask) for found in colmap.masks.values())
+
+
+@pytest.mark.parametrize("still", [True, False])
+def test_the_surroundings_of_a_subject_count_unless_they_stand_still(scene, monkeypatch, still):
+    folder, colmap, _ = scene()
+    mask = masked(folder, slice(0, 30))
+    monkeypatch.setattr(FeatureMasks, "surroundings_stand_still", lambda self, database, images: still)
+    said: list[str] = []
+    with pytest.warns(DataWarning):
+        find_cameras(folder, said.append)
+    assert any("stands still, so features there do not count" in line for line in said) == still
+    assert len(colmap.lenses) == 1 + still
+    assert all(np.array_equal(found, mask) for found in colmap.masks.values())
+    assert len(colmap.masks) == 4 * still
+
+
+@pytest.mark.parametrize(
+    ("moving", "still", "answer"), [(0, 120, True), (50, 120, True), (130, 120, False), (0, 90, False)]
+)
+def test_surroundings_that_stand_still_are_told_by_their_matches(tmp_path, moving, still, answer):
+    """Those of the subject, which turns, are inside of the masks."""
+    photographs(tmp_path, 2)
+    masked(tmp_path, slice(0, 30))
+    names, rng = ["p0.png", "p1.png"], np.random.default_rng(0)
+    count = moving + still
+    first = rng.uniform(0, 1, (count + 200, 2)) * (58, 25)
+    first[count:, 1] += 31  # the subject
+    second = first + rng.uniform(-0.1, 0.1, first.shape)
+    second[:moving, 0] = (first[:moving, 0] + 20) % 58
+    second[count:, 0] = (first[count:, 0] + 10) % 58
+    with closing(sqlite3.connect(tmp_path / "database.db")) as connection:
+        connection.execute("create table images (image_id integer, name text)")
+        connection.execute("create table keypoints (image_id integer, rows, cols, data blob)")
+        connection.execute("create table two_view_geometries (pair_id integer, rows, data blob)")
+        for image, points in ((1, first), (2, second)):
+            table = np.column_stack([points, np.ones((len(points), 4))]).astype(np.float32)
+            connection.execute("insert into images values (?, ?)", (image, names[image - 1]))
+            connection.execute(
+                "insert into keypoints values (?, ?, 6, ?)", (image, len(table), table.tobytes())
+            )
+        matches = np.repeat(np.arange(len(first), dtype=np.uint32)[:, None], 2, axis=1)
+        values = (1 * (2**31 - 1) + 2, len(matches), matches.tobytes())
+        connection.execute("insert into two_view_geometries values (?, ?, ?)", values)
+        connection.commit()
+    masks = FeatureMasks(tmp_path, names, [(60, 40)] * 2)
+    assert masks.are_of_a_subject()
+    images = [tmp_path / name for name in names]
+    assert masks.surroundings_stand_still(tmp_path / "database.db", images) == answer
+
+
+def test_masks_that_do_not_fit_are_refused_before_the_search(scene):
+    folder, colmap, _ = scene()
+    save(folder / "masks/p1.png", np.zeros((60, 40), np.uint8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        with pytest.raises(FileFormatError, match=r"p1\.png: 40 x 60 pixels do not fit"):
+            find_cameras(folder)
+    assert not colmap.lenses
 
 
 def test_broken_photographs_are_left_out_before_the_search(scene):

@@ -169,7 +169,7 @@ def _by_number(frame: Frame) -> tuple[str, int, str]:
 
 def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
     content = read_transforms(path)
-    frames = sorted(content.frames, key=lambda frame: frame.name)
+    frames = _each_once(path, sorted(content.frames, key=lambda frame: frame.name))
     names = [frame.name for frame in frames]
     listed = {
         part: {name.removeprefix("./") for name in some} for part, some in content.splits.items() if some
@@ -185,6 +185,24 @@ def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
     if not listed or not test:
         return _views(*split(taken, test_every))
     return _apart(path, *(_members(taken, [name in part for name in names]) for part in (train, test)))
+
+
+def _each_once(where: Path, frames: Sequence[Frame]) -> list[Frame]:
+    """``frames`` without those of an image that is one before's, with a DataWarning: they would be trained on
+    and held out."""
+    first: dict[str, Frame] = {}
+    for frame in frames:
+        first.setdefault(frame.file.removeprefix("./"), frame)
+    if len(first) < len(frames):
+        kept = list(map(id, first.values()))
+        again = [frame.name for frame in frames if id(frame) not in kept]
+        warnings.warn(
+            f"{where}: {plural(len(again), 'image')} listed more than once, and taken once"
+            f" ({first_names(again)})",
+            DataWarning,
+            stacklevel=2,
+        )
+    return list(first.values())
 
 
 def _views(train: list[Taken], test: list[Taken]) -> Views:

@@ -7,15 +7,15 @@ import re
 import unicodedata
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.choices import Masks, Missing
-from meshsplats.datasets.lens import Lens, Pinhole, pinholes
+from meshsplats.datasets.lens import Lens, Pinhole, check_shape, fits, pinholes
 from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.views import ImageCache
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
@@ -26,13 +26,11 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", "
 READABLE = (*dict.fromkeys(suffix.lower() for suffix in SUFFIXES), ".ppm", ".heic", ".heif")
 """Suffixes of photographs, in letters of any case."""
 UNREADABLE = (
-    *(".exr", ".hdr", ".tga", ".avif", ".jxl", ".jp2", ".gif"),
+    *(".exr", ".hdr", ".tga", ".avif", ".jxl", ".jp2", ".gif", ".jfif", ".jpe"),
     *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".raw"),
 )
 """Suffixes of images that are not read."""
 MAX_NAME = 1000
-MAX_STRETCH = 0.02
-"""Largest difference between the scales of width and height at which an image still fits its camera."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +136,17 @@ class Shelf:
         listed = self._listed(PurePosixPath())[0].values()
         return sorted(name for names in listed for name in names if is_readable(name))
 
+    def unread(self) -> list[str]:
+        """The names of the images in the folder itself that are of kinds that are not read, sorted, but for
+        those that are there of a kind that is, too."""
+        listed = self._listed(PurePosixPath())[0].values()
+        return sorted(
+            name
+            for names in listed
+            for name in names
+            if not is_hidden(name) and not any(map(is_readable, names))
+        )
+
     def _listed(self, place: PurePosixPath) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
         """Images of a folder by their stems, and folders in it by their names, both folded."""
         if place not in self._files:
@@ -189,6 +198,8 @@ class Album:
     missing: list[str] = field(default_factory=list)
     no_mask: list[str] = field(default_factory=list)
     renamed: list[str] = field(default_factory=list)
+    upside_down: list[str] = field(default_factory=list)
+    """Masks that may be meant as they are stored or upright: of photographs that were taken upside down."""
     _shelf: Shelf = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -196,7 +207,7 @@ class Album:
 
     def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
         """Cameras and photographs of each frame, in order."""
-        self.missing, self.no_mask, self.renamed = [], [], []
+        self.missing, self.no_mask, self.renamed, self.upside_down = [], [], [], []
         result: list[Taken] = []
         frames = list(frames)
         masks = self._mask_folder(frames, where)
@@ -209,29 +220,32 @@ class Album:
             path = small or full
             assert path is not None
             header = read_header(path)
-            _check_shape(frame.lens, header, path)
+            whole = header if full in (None, path) else _header(full)
+            if full is not None and whole is not None and not _is_smaller(header, whole):
+                path, header, small = full, whole, None  # a folder of other photographs has that name
+            check_shape(frame.lens, header, path)
             width, height = header.width, header.height
             if small is None:
                 width, height = (max(1, round(side / self.downscale)) for side in (width, height))
-            turn = header.turn if full in (None, path) else _turn(full)
+            turn = 0 if whole is None else whole.turn
             mask = self._mask(frame, full, label, masks)
-            if mask is not None:
-                _check_shape(frame.lens, read_header(mask), mask)
+            mask_turn = 0 if mask is None else self._turn_of(mask, frame.lens, whole)
             lens = frame.lens.scaled(width, height)
             taken = []
             for pinhole in pinholes(lens):
                 cut_out = mask is not None and self.masks == "subject"
                 has_alpha = header.has_alpha or cut_out
-                photo = (frame.name, path, lens, pinhole, mask, has_alpha, self.store, cut_out, turn)
-                taken.append((_camera(frame, pinhole, label), PhotoFile(*photo)))
+                photo = (frame.name, path, lens, pinhole, mask, has_alpha, self.store, cut_out)
+                taken.append((_camera(frame, pinhole, label), PhotoFile(*photo, turn, mask_turn)))
             result.append(taken)
         return result
 
     def _files(self, frames: Sequence[Frame], labels: Sequence[str]) -> list[tuple[Path | None, Path | None]]:
         """The image of each frame and its smaller copy, if they are there: under the name that the file
         gives, else the only image that can be meant by it and by no other."""
+        whole = {place for frame in frames for place in PurePosixPath(frame.file.replace("\\", "/")).parents}
         found = [
-            (find(self.folder, frame.file, label), self._smaller(frame.file, label))
+            (find(self.folder, frame.file, label), self._smaller(frame.file, label, whole))
             for frame, label in zip(frames, labels, strict=True)
         ]
         if any(full is not None for full, _ in found):
@@ -245,7 +259,8 @@ class Album:
         claims.update(full for full, _ in found if full is not None)
         for i, names in alike.items():
             if len(names) == 1 and claims[self.folder / names[0]] == 1:
-                found[i] = inside(self.folder, names[0], labels[i]), self._smaller(names[0], labels[i])
+                small = self._smaller(names[0], labels[i], whole)
+                found[i] = inside(self.folder, names[0], labels[i]), small
                 self.renamed.append(f"{frames[i].file}: {names[0]}")
         return found
 
@@ -254,14 +269,15 @@ class Album:
         many as possible, or by the last one in the folder of the images."""
         return self._shelf.by_last_parts(name, self.images)
 
-    def _smaller(self, name: str, where: str) -> Path | None:
-        """The copy in ``images_<downscale>/``, if there is one."""
+    def _smaller(self, name: str, where: str, whole: Container[PurePosixPath]) -> Path | None:
+        """The copy in ``images_<downscale>/``, if there is one. Folders of photographs that the data set
+        names itself, ``whole``, hold no copies."""
         parts = PurePosixPath(name.replace("\\", "/")).parts
         if self.downscale == 1 or len(parts) < 2:
             return None
         for i in reversed(range(len(parts) - 1)):
             beside = PurePosixPath(*parts[:i], f"{parts[i]}_{self.downscale}")
-            if (self.folder / beside).is_dir():
+            if beside not in whole and (self.folder / beside).is_dir():
                 name = str(beside.joinpath(*parts[i + 1 :]))
                 return find(self.folder, name, where, other_suffix=True)
         return None
@@ -281,6 +297,21 @@ class Album:
                 text = "looks like masks of the photographs, which are read from masks/: rename it"
                 warnings.warn(f"{where}: {name}/ {text}", DataWarning, stacklevel=4)
         return ""
+
+    def masks_of(
+        self, names: Sequence[str], sizes: Sequence[tuple[int, int]], where: str
+    ) -> list[tuple[Path, int] | None]:
+        """For each of the photographs ``names``, of these ``sizes``, its mask in ``masks/`` and the
+        quarter turns after which that lies on it; None where there is none."""
+        frames = [Frame(name, name, None, np.eye(4)) for name in names]
+        folder = self._mask_folder(frames, where)
+        found: list[tuple[Path, int] | None] = []
+        for frame, (width, height) in zip(frames, sizes, strict=True):
+            image = self.folder / frame.file
+            mask = self._mask(frame, image, where, folder)
+            lens = Lens("PINHOLE", 1, 1, 0, 0, width, height)
+            found.append(None if mask is None else (mask, self._turn_of(mask, lens, read_header(image))))
+        return found
 
     def _mask(self, frame: Frame, image: Path | None, where: str, folder: str) -> Path | None:
         if frame.mask is not None:
@@ -304,12 +335,28 @@ class Album:
         self.no_mask.append(str(inner))
         return None
 
+    def _turn_of(self, mask: Path, lens: Lens, photograph: Header | None) -> int:
+        """Quarter turns counter-clockwise after which the mask lies on its photograph as that is stored:
+        programs that make masks turn photographs upright, and leave no EXIF data."""
+        header = read_header(mask)
+        if photograph is None or header.orientation != 1 or photograph.orientation not in (3, 6, 8):
+            check_shape(lens, header, mask)
+            return 0
+        turned = replace(header, width=header.height, height=header.width)
+        if photograph.orientation != 3 and not fits(lens, header) and fits(lens, turned):
+            return photograph.turn
+        check_shape(lens, header, mask)
+        if photograph.orientation == 3:
+            self.upside_down.append(str(mask.relative_to(self.folder)))
+        return 0
+
     def report(self, where: str, found: int, *, needed: bool = True) -> None:
         """Warns of what differs from the file. FileFormatError if images are missing, unless they may be, or
         if nothing is left, unless nothing is ``needed``."""
         refused = self.on_missing == "error" or (self.on_missing == "few" and len(self.missing) >= found)
         if not found and (needed or refused or not self.missing):
             what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
+            what += "" if needed else "; ``missing`` skip goes on without them"
             raise FileFormatError(f"{where}: {what}")
         if self.missing and refused:
             remedy = "" if self.on_missing == "error" else "; ``missing`` skip leaves them out"
@@ -322,6 +369,11 @@ class Album:
             (self.missing, f"images are missing{near}; their views are left out"),
             (self.renamed, "images have another name than the file gives them, and are taken"),
             (self.no_mask, "images have no mask and count wholly"),
+            (
+                self.upside_down,
+                "masks are of photographs taken upside down, and are used as these are stored: if they are"
+                " upright, turn them",
+            ),
         ):
             if names:
                 warnings.warn(
@@ -377,27 +429,16 @@ def _camera(frame: Frame, pinhole: Pinhole, where: str) -> Camera:
         raise FileFormatError(f"{where}: {error}") from None
 
 
-def _turn(photograph: Path) -> int:
-    """``Header.turn`` of a photograph whose smaller copy is used, which may lack EXIF data; 0 for one that
-    cannot be read, as it need not be."""
+def _header(photograph: Path) -> Header | None:
+    """Of a photograph whose smaller copy may be used; None for one that cannot be read, as it need not be."""
     try:
-        return read_header(photograph).turn
+        return read_header(photograph)
     except (FileFormatError, MissingDependencyError):
-        return 0
+        return None
 
 
-def _check_shape(lens: Lens, header: Header, path: Path) -> None:
-    """FileFormatError unless the image is the camera's, but for its scale and a pixel of rounding."""
-    width, height = header.width, header.height
-    stretch = (width / lens.width) / (height / lens.height)
-    if abs(stretch - 1) > MAX_STRETCH + 1 / min(width, height):
-        turned = ""
-        if abs(stretch / (width / height) ** 2 - 1) < 0.05:
-            turned = ". It is turned: cameras belong to images as they are stored, before any rotation"
-        raise FileFormatError(
-            f"{path}: {width} x {height} pixels do not fit its camera, which took {lens.width} x"
-            f" {lens.height}{turned}"
-        )
+def _is_smaller(copy: Header, photograph: Header) -> bool:
+    return copy.width * copy.height < photograph.width * photograph.height
 
 
 def split(taken: Sequence[Taken], test_every: int) -> tuple[list[Taken], list[Taken]]:

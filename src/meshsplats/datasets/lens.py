@@ -11,15 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from meshsplats._core.resampling import resample
+from meshsplats.errors import FileFormatError
+from meshsplats.images.reading import Header
 
 ROWS_BYTES = 4 << 20
 """Images are undistorted in strips of rows, so that each array of a strip takes at most about this much."""
 WHOLE = 0.999
 """A pixel between others counts only if all of those it mixes count, but for rounding."""
+MAX_STRETCH = 0.02
+"""Largest difference between the scales of width and height at which an image still fits its camera."""
 
 Point = tuple[np.ndarray, np.ndarray]
 
@@ -321,6 +326,29 @@ def undistort(image: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.ndarr
     values = image if image.dtype == np.uint8 else image.astype(np.float32, copy=False)
     result = resample(values, points, wraps=lens.model == "EQUIRECTANGULAR", threads=1)
     return result.astype(image.dtype, copy=False), ~np.isnan(points[..., 0])
+
+
+def fits(lens: Lens, header: Header) -> bool:
+    """Whether the image is that of ``lens``, but for its scale and a pixel of rounding."""
+    return abs(_stretch(lens, header) - 1) <= MAX_STRETCH + 1 / min(header.width, header.height)
+
+
+def check_shape(lens: Lens, header: Header, path: Path) -> None:
+    """FileFormatError unless the image at ``path`` ``fits``."""
+    if fits(lens, header):
+        return
+    width, height = header.width, header.height
+    turned = ""
+    if abs(_stretch(lens, header) / (width / height) ** 2 - 1) < 0.05:
+        turned = ". It is turned: cameras belong to images as they are stored, before any rotation"
+    raise FileFormatError(
+        f"{path}: {width} x {height} pixels do not fit its camera, which took {lens.width} x"
+        f" {lens.height}{turned}"
+    )
+
+
+def _stretch(lens: Lens, header: Header) -> float:
+    return (header.width / lens.width) / (header.height / lens.height)
 
 
 @lru_cache(maxsize=1)

@@ -29,6 +29,8 @@ class PhotoFile:
     """Whether the mask is the subject's outline: what is outside is clear."""
     turn: int = 0
     """``Header.turn`` of the photograph."""
+    mask_turn: int = 0
+    """Quarter turns counter-clockwise after which the mask lies on the photograph as it is stored."""
 
     def load(self) -> ViewImage:
         image = self.store.find(self)
@@ -47,8 +49,9 @@ class PhotoFile:
         color = pixels[..., :3]
         share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
         size = (self.lens.width, self.lens.height)
-        if self.cut_out:
-            inside = _resized(self._light(), (color.shape[1], color.shape[0]))
+        light = None if self.mask is None else light_of_mask(self.mask, self.mask_turn)
+        if self.cut_out and light is not None:
+            inside = _resized(light, (color.shape[1], color.shape[0]))
             share = inside if share is None else share * inside
         if share is None:
             color = _resized(color, size)
@@ -56,7 +59,7 @@ class PhotoFile:
             # Colours of clear pixels mean nothing: mixing must see each as much as it is opaque.
             layers = [*(color[..., i].astype(np.float32) / 255 * share for i in range(3)), share]
             color = np.stack([_resized(layer, size) for layer in layers], axis=-1).astype(np.float16)
-        mask = None if self.mask is None or self.cut_out else _resized(self._light(), size) >= WHOLE
+        mask = None if light is None or self.cut_out else _resized(light, size) >= WHOLE
         if not self.lens.is_pinhole:
             color, seen = undistort(color, self.lens, self.pinhole)
             if mask is not None:
@@ -67,14 +70,15 @@ class PhotoFile:
             return ViewImage(color, None, mask)
         return ViewImage(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
 
-    def _light(self) -> np.ndarray:
-        """(h, w) float32: 1 where the mask is light (128 of 255 or more) and, with alpha, opaque; else 0."""
-        assert self.mask is not None
-        pixels = load_image(self.mask)
-        light = pixels[..., :3].max(axis=2)
-        if pixels.shape[2] == 4:
-            light = np.minimum(light, pixels[..., 3])
-        return (light >= 128).astype(np.float32)
+
+def light_of_mask(path: Path, turn: int = 0) -> np.ndarray:
+    """(h, w) float32: 1 where the mask at ``path`` is light (128 of 255 or more; of 0 and 1 alone, 1) and,
+    with alpha, opaque; else 0. Turned counter-clockwise by so many quarter turns."""
+    pixels = np.rot90(load_image(path), turn)
+    light = pixels[..., :3].max(axis=2)
+    if pixels.shape[2] == 4:
+        light = np.minimum(light, pixels[..., 3])
+    return (light >= (1 if light.max() == 1 else 128)).astype(np.float32)
 
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:

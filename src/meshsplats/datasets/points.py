@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import warnings
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,10 +14,10 @@ import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._kinds import need_path
-from meshsplats.datasets.image_files import inside
+from meshsplats.datasets.image_files import inside, leads_out
 from meshsplats.datasets.layouts import find_layout
 from meshsplats.datasets.transforms import points_file
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.ply.header import read_header
 from meshsplats.formats.ply.table import FloatTable
 
@@ -56,7 +57,8 @@ def load_points(
 
     ``origin``: (3,) point of the world that positions shall be relative to, that of the data set.
 
-    Raises FileFormatError for broken files, which names file and record.
+    Raises FileFormatError for broken files, which names file and record. Warns with a DataWarning of points
+    outside of the folder, which are not read.
     """
     need_path(path=path)
     point = checked_array("origin", origin, np.float64, (3,))
@@ -70,6 +72,13 @@ def load_points(
         return None
     named = points_file(layout.source)
     if named is None:
+        return None
+    if leads_out(named):
+        warnings.warn(
+            f"{layout.source}: its points, {named[:200]!r}, are not in the folder, and are left out",
+            DataWarning,
+            stacklevel=2,
+        )
         return None
     file = inside(layout.source.parent, named, f"{layout.source}: 'ply_file_path'")
     return _ply(file, point) if file.is_file() else None

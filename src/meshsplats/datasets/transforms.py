@@ -62,23 +62,26 @@ def read_transforms(path: Path) -> Transforms:
     common = {key: value for key, value in content.items() if key != "frames"}
     shelf = Shelf(path.parent)
     found = [_frame(path, shelf, common, f, i) for i, f in enumerate(frames)]
-    moved = [f"{f.name}: {f.file}" for f in found if leads_out(f.name) and not leads_out(f.file)]
-    if moved:
-        warnings.warn(
-            f"{path}: {len(moved)} images have paths of another place, and are taken from this folder by the"
-            f" last parts of these ({moved[0][:200]})",
-            DataWarning,
-            stacklevel=2,
-        )
+    masks = [(str(given.get("mask_path")), frame.mask) for given, frame in zip(frames, found, strict=True)]
+    for what, pairs in (("images", [(frame.name, frame.file) for frame in found]), ("masks", masks)):
+        moved = [f"{a}: {b}" for a, b in pairs if b and leads_out(a) and not leads_out(b)]
+        if moved:
+            warnings.warn(
+                f"{path}: {len(moved)} {what} have paths of another place, and are taken from this folder by"
+                f" the last parts of these ({moved[0][:200]})",
+                DataWarning,
+                stacklevel=2,
+            )
     return Transforms(found, splits)
 
 
 def points_file(path: Path) -> str | None:
-    """The point cloud that ``path`` names, relative to its folder; None if it names none."""
+    """The point cloud that ``path`` names, relative to its folder, found as images are; None if it names
+    none."""
     named = _read_json(path).get("ply_file_path")
     if named is not None and not isinstance(named, str):
         raise FileFormatError(f"{path}: 'ply_file_path' must be a file name")
-    return named or None
+    return _here(path.parent, named) if named else None
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -103,6 +106,7 @@ def _frame(path: Path, shelf: Shelf, common: dict[str, Any], frame: object, i: i
     values = common | {key: value for key, value in frame.items() if value is not None}
     values = {key: value for key, value in values.items() if value is not None}
     lens = _lens(shelf, values, file, where)
+    mask = _here(path.parent, mask) if mask else None
     return Frame(name, file, lens, _world_to_camera(frame, where), mask)
 
 

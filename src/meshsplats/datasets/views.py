@@ -196,9 +196,9 @@ class Dataset:
 
     @property
     def opening(self) -> Camera | None:
-        """The first held-out view, or the first of all, from which the scene is shown; None: from anywhere.
-        Of a place, and of what was photographed, other views show what no image shows."""
-        return None if self.around or not self.views else (self.test or self.train)[0].camera
+        """The first held-out view, or the first of all, upright, from which the scene is shown; None: from
+        anywhere. Of a place, and of what was photographed, other views show what no image shows."""
+        return None if self.around or not self.views else (self.test or self.train)[0].upright
 
     @property
     def memory(self) -> int:
@@ -257,6 +257,15 @@ def _counts(view: View) -> bool:
         return True
     mask = view.mask
     return mask is None or bool(mask.any())
+
+
+def check_counting(views: Sequence[View]) -> None:
+    """ValueError if no pixel of any of ``views`` counts. Reads those with masks, up to one that has some."""
+    if views and not any(map(_counts, views)):
+        raise ValueError(
+            f"no pixel of the {len(views)} training views counts: their masks are dark throughout, and light"
+            " pixels count (128 of 255 or more)"
+        )
 
 
 def with_near_planes(views: Sequence[View], points: np.ndarray) -> tuple[View, ...]:

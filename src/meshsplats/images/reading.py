@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import struct
@@ -21,17 +22,24 @@ MAX_PIXELS = 1 << 26
 """Images of more pixels than this (67 million) are refused: a small file can claim any size."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 """Formats that Pillow may read here. Others start programs, or hold no photographs."""
-_ORIENTATION = 0x112
+_WIDTH, _HEIGHT, _ORIENTATION = 0x100, 0x101, 0x112
 _TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 """``Header.turn`` by EXIF's orientation; 0 for others."""
+_UNTURNED = {
+    **{2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM", 5: "TRANSPOSE"},
+    **{6: "ROTATE_90", 7: "TRANSVERSE", 8: "ROTATE_270"},
+}
+"""Pillow's names of what leads from an upright image to one of EXIF's orientations."""
 MAX_PROFILE = 1 << 22
 """Bytes of a colour profile; those of printers have up to three million."""
 ROUNDING = 3
 """Levels of 255 by which a profile that is sRGB by another name differs from it, at most."""
 _HEIF = re.compile(rb"....ftyp(heic|heix|heim|heis|hevc|hevx|mif1|msf1)", re.DOTALL)
 """How HEIF files begin, as iPhones take photographs."""
-_MODEL, _EXIF_IFD, _FOCAL, _FOCAL_OF_FILM = 0x0110, 0x8769, 0x920A, 0xA405
-"""Tags of EXIF data: camera, the part about the photograph, focal length in mm, and in mm of 35 mm film."""
+_MAKE, _MODEL, _EXIF_IFD = 0x010F, 0x0110, 0x8769
+"""Tags of EXIF data: maker and name of the camera, and the part about the photograph."""
+_LENS, _FOCAL, _FOCAL_OF_FILM, _ZOOM = 0xA434, 0x920A, 0xA405, 0xA404
+"""Tags of that part: name of the lens, focal length in mm, the same of 35 mm film, digital zoom."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,13 @@ class Header:
     width: int
     height: int
     has_alpha: bool
-    turn: int = 0
-    """Quarter turns clockwise after which the image, as it is stored, is upright: EXIF's orientation, without
-    its mirroring."""
+    orientation: int = 1
+    """EXIF's: how the image, as it is stored, is turned and mirrored, from 1, not at all, to 8."""
+
+    @property
+    def turn(self) -> int:
+        """Quarter turns clockwise after which the image, as it is stored, is upright, without mirroring."""
+        return _TURNS.get(self.orientation, 0)
 
 
 @dataclass(frozen=True)
@@ -54,16 +66,17 @@ class Shot:
     """Width and height in pixels."""
     format: str
     """As Pillow names it."""
-    camera: str = ""
-    """Model; empty if it is not known."""
-    focal: float = 0.0
-    """Focal length in mm, of 35 mm film where that is known; 0 if none is."""
+    lens: tuple[str, ...] = ()
+    """What tells lenses apart, as far as it is known: maker and name of the camera, name of the lens, focal
+    length, the same of 35 mm film, digital zoom."""
+    is_panorama: bool = False
+    """Whether it shows all sides, and says so."""
 
 
 def read_header(path: Path) -> Header:
     """Size and kind of an image, without its pixels. FileFormatError if it is none, or too large."""
     with _opened(path) as image:
-        return Header(image.width, image.height, _has_alpha(image), _turn(image))
+        return Header(*_stored_size(image), _has_alpha(image), _orientation(image))
 
 
 def load_image(
@@ -79,8 +92,9 @@ def load_image(
     Raises:
         FileFormatError: the image is broken, too large, or of no known format.
     """
-    with _opened(path, data) as image:
+    with _opened(path, data) as opened:
         try:
+            image = _as_stored(opened)
             if image.mode.startswith("I;16") or image.mode == "I":
                 grey = np.asarray(image, np.int64)
                 if grey.min(initial=0) < 0 or grey.max(initial=0) > 65535:
@@ -143,7 +157,8 @@ def _srgb_transform(profile: bytes) -> tuple[str, Any]:
 def read_shot(path: Path) -> Shot:
     """How a photograph was taken. FileFormatError if it is broken: it is decoded, a JPEG coarsely."""
     with _opened(path) as image:
-        size, kind = image.size, str(image.format)
+        size, kind = _stored_size(image), str(image.format)
+        is_panorama = size[0] == 2 * size[1] and _is_equirectangular(image)
         try:
             image.draft("RGB", (1, 1))
             image.load()
@@ -152,10 +167,18 @@ def read_shot(path: Path) -> Shot:
         try:
             exif = image.getexif()
             more = exif.get_ifd(_EXIF_IFD)
-            focal = float(more.get(_FOCAL_OF_FILM) or more.get(_FOCAL) or 0)
-            return Shot(size, kind, str(exif.get(_MODEL, "")), focal if focal > 0 else 0.0)
+            names = (exif.get(_MAKE), exif.get(_MODEL), more.get(_LENS))
+            numbers = (more.get(_FOCAL), more.get(_FOCAL_OF_FILM), more.get(_ZOOM))
+            lens = (*(str(name or "") for name in names), *map(_positive, numbers))
+            return Shot(size, kind, lens if any(lens) else (), is_panorama)
         except (OSError, ValueError, SyntaxError, TypeError, ArithmeticError, LookupError, struct.error):
-            return Shot(size, kind)  # as any program may write there what it likes
+            return Shot(size, kind, (), is_panorama)  # as any program may write there what it likes
+
+
+def _positive(value: Any) -> str:
+    """A number of EXIF data; empty for one that says nothing, as a zoom of 1."""
+    number = float(value or 0)
+    return f"{number:g}" if 0 < number < math.inf and number != 1 else ""
 
 
 def read_exif(path: Path) -> bytes:
@@ -212,16 +235,41 @@ def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:
     return image
 
 
-def _turn(image: Any) -> int:
-    # Pillow turns the pixels of these formats itself, and looks for EXIF behind the pixels if none is before.
-    if image.format in ("TIFF", "HEIF") or "exif" not in image.info:
-        return 0
+def _orientation(image: Any) -> int:
+    """``Header.orientation``."""
+    # pillow-heif turns the pixels itself. Pillow looks for EXIF behind the pixels if none is before.
+    if image.format == "HEIF" or (image.format != "TIFF" and "exif" not in image.info):
+        return 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # EXIF that is broken says nothing
         try:
-            return _TURNS.get(image.getexif().get(_ORIENTATION), 0)
+            found = image.getexif().get(_ORIENTATION)
+            return int(found) if found in _UNTURNED else 1
         except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error):
-            return 0
+            return 1
+
+
+def _stored_size(image: Any) -> tuple[int, int]:
+    """Width and height in pixels as they are stored; Pillow may give those of a TIFF upright."""
+    if image.format == "TIFF":
+        return image.tag_v2[_WIDTH], image.tag_v2[_HEIGHT]
+    return image.width, image.height
+
+
+def _as_stored(image: Any) -> Any:
+    """``image`` with its pixels as they are stored: Pillow turns those of a TIFF upright."""
+    method = _UNTURNED.get(_orientation(image)) if image.format == "TIFF" else None
+    if method is None:
+        return image
+    from PIL import Image
+
+    return image.transpose(Image.Transpose[method])
+
+
+def _is_equirectangular(image: Any) -> bool:
+    """Whether the XMP data of a photograph says that it shows all sides, one angle a pixel."""
+    texts = image.info.get("xmp")
+    return isinstance(texts, bytes) and b"GPano" in texts and b"equirectangular" in texts
 
 
 def _has_alpha(image: Any) -> bool:

@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
@@ -22,14 +23,15 @@ import numpy as np
 from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together, write_bytes, write_text
 from meshsplats._json import read_json
-from meshsplats.datasets.image_files import Shelf
+from meshsplats.datasets.image_files import Shelf, inside
 from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.outputs import PREVIEW
 from meshsplats.images.reading import Shot
+from meshsplats.training.feature_masks import FeatureMasks
 from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
 from meshsplats.training.poses import find_poses
-from meshsplats.training.pycolmap_input import by_lens, for_pycolmap, read_shots
+from meshsplats.training.pycolmap_input import by_lens, for_pycolmap, needs_copy, read_shots
 from meshsplats.training.suspects import shortened
 
 CAMERAS, POINTS = "transforms.json", "sparse_points.ply"
@@ -134,15 +136,22 @@ def find_cameras(
     ``say`` is called with a line about each stage. ``threads``: None for all processors.
     ``replacing``: both files are there, and are replaced. Takes minutes.
 
+    Features outside of ``masks/`` do not count where these leave out what passed by (``FeatureMasks``), nor
+    where they are of a subject that turns before what stands still.
+
     Raises:
         MissingDependencyError: pycolmap is not installed.
-        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other.
+        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other; some
+            are panoramas.
+        FileFormatError: photographs that are links out of the folder, which are not read as a data set; masks
+            that do not fit their photographs.
         FileExistsError: ``sparse_points.ply`` is there already, unless ``replacing`` it.
         OSError: the folder cannot be written.
 
-    Warns with a DataWarning about photographs that are broken or found no place, and about places that
-    contradict matches.
+    Warns with a DataWarning about photographs that are broken, of kinds that are not read, or found no place,
+    and about places that contradict matches.
     """
+    began = time.perf_counter()
     photographs = _photographs(folder) if replacing else bare_photographs(folder)
     tried = [path.relative_to(folder).as_posix() for path in photographs]
     if len(photographs) < FEWEST:
@@ -150,6 +159,8 @@ def find_cameras(
             f"{folder}: {len(photographs)} photographs without cameras; at least {FEWEST} are needed, some"
             " thirty for a good result"
         )
+    for name in tried:
+        inside(folder, name, str(folder))
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder}: no permission to write the cameras beside the photographs")
     if not replacing and (folder / POINTS).exists():
@@ -158,27 +169,37 @@ def find_cameras(
             "is in the place of the points that come with the cameras: move it away",
             str(folder / POINTS),
         )
+    if unread := Shelf(photographs[0].parent).unread():
+        warnings.warn(
+            f"{folder}: {len(unread)} images are of kinds that are not read, and are left out:"
+            f" {shortened(unread)}",
+            DataWarning,
+            stacklevel=2,
+        )
     pycolmap = _imported()
+    say(f"looking at {len(photographs)} photographs")
     shots = _whole(folder, photographs, threads)
     photographs = list(shots)
     place = photographs[0].parent
     prefix = f"{place.name}/" if place != folder else ""
+    names = [path.relative_to(folder).as_posix() for path in photographs]
+    masks = FeatureMasks(folder, names, [shot.size for shot in shots.values()])
     pycolmap.logging.minloglevel = 3
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as work:
-        database = Path(work, "database.db")
-        images = for_pycolmap(shots, Path(work))
+        if copied := sum(map(needs_copy, shots.values())):
+            say(f"finding the cameras of {len(photographs)} photographs: copies of {copied}, as JPEG")
+        images = for_pycolmap(shots, Path(work), thread_count(threads))
         place = images[0].parent
         say(f"finding the cameras of {len(photographs)} photographs: features")
-        _extract(pycolmap, database, images, list(shots.values()), threads)
-        _match(pycolmap, database, [path.name for path in images], say, threads)
+        database = _matched(pycolmap, Path(work), images, list(shots.values()), masks, say, threads)
         poses = find_poses(pycolmap, database, place, Path(work), len(images), say, threads)
     count = 0 if poses is None else poses.model.num_reg_images()
     if poses is None or count < FEWEST:
         raise ValueError(
             f"{folder}: {count} of {len(photographs)} photographs match each other, at least {FEWEST} must."
-            " Photographs must overlap by two thirds, be sharp, and show a subject with texture that does not"
-            " move"
+            " Photographs must overlap by two thirds, be sharp and flat, not panoramas, and show a subject"
+            " with texture that does not move"
         )
     best = poses.model
     named = {image.name: path.name for image, path in zip(images, photographs, strict=True)}
@@ -209,7 +230,8 @@ def find_cameras(
     with together():
         write_bytes(folder / POINTS, _points(best))
         write_text(folder / CAMERAS, json.dumps(cameras, indent=1) + "\n")
-    say(f"cameras of {count} photographs and {len(best.points3D):,} points: {folder / CAMERAS}")
+    made = f"cameras of {count} photographs and {len(best.points3D):,} points"
+    say(f"{made}, in {time.perf_counter() - began:.0f} s: {folder / CAMERAS}")
 
 
 def check_library() -> None:
@@ -249,14 +271,54 @@ def _whole(folder: Path, photographs: list[Path], threads: int | None) -> dict[P
             DataWarning,
             stacklevel=3,
         )
+    if panoramas := [path.name for path, shot in shots.items() if shot.is_panorama]:
+        raise ValueError(
+            f"{folder}: {len(panoramas)} of {len(photographs)} photographs are panoramas, whose cameras are"
+            f" not found here: {shortened(panoramas)}; export flat pictures of them, of 90 degrees, say"
+        )
     return shots
 
 
+def _matched(
+    pycolmap: Any,
+    work: Path,
+    images: list[Path],
+    shots: list[Shot],
+    masks: FeatureMasks,
+    say: Callable[[str], None],
+    threads: int | None,
+) -> Path:
+    """COLMAP's database of ``images``, in the folder ``work``, with their features and matches."""
+    names, database = [path.name for path in images], work / "database.db"
+    whole = not masks or masks.are_of_a_subject()
+    if not whole:
+        masks.write(work / "masks", images)
+    _extract(pycolmap, database, images, shots, None if whole else work / "masks", threads)
+    _match(pycolmap, database, names, say, threads)
+    if masks and whole and masks.surroundings_stand_still(database, images):
+        say("finding the cameras: what masks leave out stands still, so features there do not count")
+        masks.write(work / "masks", images)
+        database = work / "masked.db"
+        _extract(pycolmap, database, images, shots, work / "masks", threads)
+        _match(pycolmap, database, names, say, threads)
+    return database
+
+
 def _extract(
-    pycolmap: Any, database: Path, images: list[Path], shots: list[Shot], threads: int | None
+    pycolmap: Any,
+    database: Path,
+    images: list[Path],
+    shots: list[Shot],
+    masks: Path | None,
+    threads: int | None,
 ) -> None:
-    """Writes the features of ``images`` to COLMAP's database, with a camera for each lens of ``shots``."""
-    options = _feature_options(pycolmap, max(max(shot.size) for shot in shots), len(images), threads)
+    """Writes the features of ``images`` to COLMAP's database, with a camera for each lens of ``shots``;
+    without those outside of the ``masks`` in a folder."""
+    side = int(np.median([max(shot.size) for shot in shots]))
+    options = _feature_options(pycolmap, side, len(images), threads)
+    if masks is not None:
+        options["reader_options"] = pycolmap.ImageReaderOptions()
+        options["reader_options"].mask_path = masks
     shared, alone = by_lens(shots)
     modes = pycolmap.CameraMode
     for places, mode in (*((group, modes.SINGLE) for group in shared), (alone, modes.PER_IMAGE)):
