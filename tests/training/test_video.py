@@ -244,6 +244,39 @@ def test_the_frames_of_a_video_are_made_once(tmp_path):
         photographs_of(folder, 5)
     assert photographs_of(folder) == folder
     assert not is_video(folder)
+    first[0].unlink()  # a blurred one
+    for count in (None, 4, 5):  # the same command goes on
+        assert photographs_of(clip, count) == folder
+
+
+def test_a_video_of_fewer_frames_than_are_wanted_is_taken_again(tmp_path):
+    clip = write_video(tmp_path / "walk.mp4", passing([0, 5, 10, 15, 20, 25]))
+    folder = photographs_of(clip, 9)
+    assert len(list((folder / "images").iterdir())) < 9
+    assert photographs_of(clip, 9) == folder
+
+
+def test_colours_are_those_of_the_matrix_that_the_video_names(tmp_path):
+    """BT.709, in pictures of the size that other programs take for BT.601."""
+    y, cb, cr = 63, 102, 240  # red, of 16 to 235 and 16 to 240
+    path = tmp_path / "red.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=RATE)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = 1
+        context.color_range = 1
+        for i in range(3):
+            frame = av.VideoFrame(64, 48, "yuv420p")
+            frame.colorspace, frame.color_range = 1, 1
+            for plane, value in zip(frame.planes, (y + i, cb, cr), strict=True):
+                plane.update(bytes([value]) * plane.buffer_size)
+            frame.pts = i
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    save_frames(path, tmp_path / "frames", 2)
+    seen = np.asarray(Image.open(tmp_path / "frames/images/0001.jpg"))[24, 32].astype(int)
+    assert np.abs(seen - (255, 0, 0)).max() < 8
 
 
 def test_frames_of_another_video_of_that_name_are_refused(tmp_path):

@@ -19,6 +19,7 @@ from meshsplats._json import read_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image
+from meshsplats.training.hdr import as_srgb, is_hdr
 
 FRAMES_PER_SECOND = 2.0
 FEWEST_FRAMES, MOST_FRAMES = 40, 120
@@ -40,6 +41,8 @@ LONG = 600.0
 too long."""
 SAID_EVERY = 10.0
 """Seconds after which it is said how far the look at a video has come."""
+RGB_MATRIX = "ITU601"
+"""Matrix that is asked for: older versions of PyAV heed a frame's own only if it is another. RGB has none."""
 NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
 
 
@@ -82,9 +85,10 @@ def photographs_of(
     if not (folder / IMAGES).is_dir():
         save_frames(path, folder, frames, say)
         return folder
-    record = folder / RECORD
+    record, wanted = folder / RECORD, None
     if record.is_file():
         made_of = read_json(record, RECORD_BYTES)
+        wanted = made_of.get("wanted") if isinstance(made_of, dict) else None
         if not isinstance(made_of, dict) or made_of.get("sha256") != _digest(path):
             name = made_of.get("name") if isinstance(made_of, dict) else None
             raise OptionValueError(
@@ -92,7 +96,7 @@ def photographs_of(
                 " the folder"
             )
     there = len(list((folder / IMAGES).glob("*.jpg")))
-    if frames not in (None, there):
+    if frames not in (None, there, wanted):
         raise OptionValueError(
             f"{folder} has {there} frames, not {frames}: remove it, or keep them: leave out ``frames``"
         )
@@ -135,14 +139,18 @@ def save_frames(
     chosen = choose_frames(frames, count or usual_count(frames.seconds))
     say(f"{len(chosen)} of {len(frames.sharpness):,} frames: {folder / IMAGES}")
     wanted = {int(frame): place for place, frame in enumerate(chosen)}
-    record = {"name": video.name, "sha256": _digest(video)}
+    # A video may have fewer frames that differ than were wanted, and the user may throw some away.
+    record = {"name": video.name, "sha256": _digest(video), "wanted": count}
+    transfer, primaries = _colors(video)
+    if is_hdr(transfer, primaries):
+        say("the video is HDR: its colours are brought to sRGB")
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as beside:
         made = Path(beside) / folder.name
         (made / IMAGES).mkdir(parents=True)
         for index, frame in enumerate(_decoded(video)):
             if index in wanted:
-                turned = _turned(frame.to_ndarray(format="rgb24"), frame.rotation)
-                save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", turned / np.float32(255))
+                pixels = _turned(_pixels(frame, transfer, primaries), frame.rotation)
+                save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", pixels)
             if index == chosen[-1]:
                 break
         write_json(made / RECORD, record)
@@ -237,6 +245,22 @@ def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
         if warn:
             text = f"{video}: cannot be read beyond frame {count:,} ({error.strerror})"
             warnings.warn(text, DataWarning, stacklevel=3)
+
+
+def _colors(video: Path) -> tuple[int, int]:
+    """FFmpeg's numbers of the transfer function and of the primaries of a video that was decoded."""
+    import av
+
+    with av.open(str(video)) as container:
+        context = container.streams.video[0].codec_context
+        return int(context.color_trc), int(context.color_primaries)
+
+
+def _pixels(frame: Any, transfer: int, primaries: int) -> np.ndarray:
+    """(h, w, 3) float32 sRGB in [0, 1] of a frame with these numbers of FFmpeg."""
+    if is_hdr(transfer, primaries):
+        return as_srgb(frame.to_ndarray(format="rgb48le", dst_colorspace=RGB_MATRIX), transfer, primaries)
+    return frame.to_ndarray(format="rgb24", dst_colorspace=RGB_MATRIX) / np.float32(255)
 
 
 def _turned(pixels: np.ndarray, degrees: float) -> np.ndarray:
