@@ -59,6 +59,12 @@ def test_fitted_splats_are_nearer_to_photographs_that_were_held_out(ball, traine
     assert psnr_of(fitted, ball.test) > psnr_of(splats_of_fans(trained), ball.test) + 2
 
 
+def test_splats_of_a_training_know_which_way_is_up(trained, fitted):
+    turned = replace(trained, up=np.array([0, 0.6, 0.8], np.float32))
+    np.testing.assert_allclose(splats_of_fans(turned).up, [0, 0.6, 0.8], atol=1e-6)
+    np.testing.assert_allclose(fitted.up, trained.up)
+
+
 def test_half_of_the_fans_become_two_splats_where_their_colours_change(ball, trained):
     count = fan_count(trained)
     more = _halved(trained, ball.train, CONFIG)

@@ -68,7 +68,7 @@ def splats_of_fans(mesh: SplatMesh) -> GaussianCloud:
     sh = (rgb[:, None] - 0.5) / SH_C0
     if mesh.harmonics is not None:
         sh = np.concatenate([sh, mesh.harmonics], axis=1)
-    return GaussianCloud(middle, quaternions_of(axes), sigma, opacity, sh, origin=mesh.origin)
+    return GaussianCloud(middle, quaternions_of(axes), sigma, opacity, sh, up=mesh.up, origin=mesh.origin)
 
 
 def check_fans(mesh: SplatMesh) -> None:
@@ -113,7 +113,8 @@ def fit_splats(
     config = for_views(_fitting(config, mesh, dataset, run.threads), dataset.train)
     halved = _halved(mesh, dataset.train, config)
     fans = fans_of(splats_of_fans(halved), FITTED_SIDES)
-    fans = replace(fans, harmonics=halved.harmonics, order="splat", filter_px2=DILATION, origin=mesh.origin)
+    fans = replace(fans, harmonics=halved.harmonics, order="splat", filter_px2=DILATION)
+    fans = replace(fans, up=mesh.up, origin=mesh.origin)
     start = run_start(fans, dataset, config, run, None, kind=_FansOfSplats)
     loop = TrainingLoop(start, start.clock(run), Blended(config), run, on_progress, plain=False)
     return splats_of_fans(loop.run())
