@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -318,6 +319,35 @@ def test_checkpoints_come_back_to_the_last_bit(tmp_path):
     header = load_checkpoint(tmp_path / "c.safetensors", only_header=True)
     assert (header.step, header.planned, header.arrays) == (3, {"steps": 7}, {})
     assert [p.name for p in tmp_path.iterdir()] == ["c.safetensors"]
+
+
+def test_the_schedule_of_a_run_by_minutes_begins_with_its_first_step(tmp_path):
+    """However long the set-up takes; a run that goes on is where it was."""
+    from meshsplats.finetuning.checkpoint import load_checkpoint, save_checkpoint
+    from meshsplats.finetuning.clock import Clock
+
+    config = FinetuneConfig(steps=None, minutes=10)
+    clock = Clock(config, 5, seconds=270)
+    assert clock.fraction < 1e-3
+    time.sleep(0.02)
+    clock.begin_steps()
+    assert clock.fraction < 1e-5
+    assert clock.setup_seconds >= 270.02
+    assert clock.seconds_left == pytest.approx(330, abs=5)  # the whole command still ends in time
+    halfway = Clock(config, 5, step=7, seconds=435, setup_seconds=270)
+    assert halfway.fraction == pytest.approx(0.5, abs=0.01)
+    assert Clock(config, 5, seconds=600).done
+    save_checkpoint(replace(checkpoint(), setup_seconds=1.25), tmp_path / "c.safetensors")
+    assert load_checkpoint(tmp_path / "c.safetensors").setup_seconds == 1.25
+    content = (tmp_path / "c.safetensors").read_bytes()
+    part = b', \\"setup_seconds\\": 1.25'
+    (tmp_path / "c.safetensors").write_bytes(content.replace(part, b" " * len(part)))  # by an earlier version
+    earlier = load_checkpoint(tmp_path / "c.safetensors")
+    assert earlier.setup_seconds == 0
+    assert Clock(config, 5, step=7, seconds=300, setup_seconds=0).fraction == pytest.approx(0.5, abs=0.01)
+    (tmp_path / "c.safetensors").write_bytes(content.replace(b": 1.25", b": 9.25"))  # more than all seconds
+    with pytest.raises(FileFormatError, match="broken: step"):
+        load_checkpoint(tmp_path / "c.safetensors")
 
 
 def test_broken_checkpoints_are_refused(tmp_path):

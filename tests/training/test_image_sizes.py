@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import time
 from pathlib import Path
 
 import pytest
 from _balls import cameras_around
+from _datasets import write_json
 from _photographs import write_photographs
+from PIL import Image
 
 from meshsplats import _toml as toml
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
+from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.rendering import render_splats
 from meshsplats.training import image_sizes
 from meshsplats.training.image_sizes import worthwhile_downscale
+from meshsplats.training.photographs import PhotographOptions
 
 SIDE = 48
 
@@ -47,6 +53,36 @@ def test_more_minutes_and_threads_make_larger_images(photographs, monkeypatch, m
 def test_no_time_is_enough_for_the_largest_photographs(photographs, monkeypatch):
     monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2 / 9)
     assert worthwhile_downscale(photographs, None, None) == 3
+
+
+def test_one_large_photograph_does_not_make_all_others_small(photographs, monkeypatch):
+    monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2)
+    content = json.loads((photographs / "transforms.json").read_text())
+    frame = content["frames"][0]
+    frame |= {"w": 4 * SIDE, "h": 4 * SIDE, "cx": 2 * SIDE, "cy": 2 * SIDE}
+    Image.new("RGB", (4 * SIDE, 4 * SIDE)).save(photographs / frame["file_path"])
+    write_json(photographs / "transforms.json", content)
+    assert worthwhile_downscale(photographs, None, None) == 1
+
+
+@pytest.mark.slow
+def test_images_suit_the_minutes_that_the_search_for_cameras_leaves(photographs, tmp_path, monkeypatch):
+    asked = []
+
+    def late(self, source, say, threads=None, *, resumed=False):
+        time.sleep(0.6)
+        return source
+
+    def sized(folder, minutes, *rest):
+        asked.append(minutes)
+        raise FileFormatError("enough")
+
+    monkeypatch.setattr(PhotographOptions, "with_cameras", late)
+    monkeypatch.setattr(image_sizes, "worthwhile_downscale", sized)
+    for minutes in ("0.1", "0.002", None):
+        length = ["--steps", "1"] if minutes is None else ["--minutes", minutes]
+        assert main(["train", str(photographs), "-o", str(tmp_path / "mesh.npz"), *length]) == 1
+    assert asked == [pytest.approx(0.09, abs=0.003), 0.0002, None]
 
 
 @pytest.mark.slow(keep=1)

@@ -20,7 +20,7 @@ from meshsplats._core.kernels import round_fans
 from meshsplats.cli import main
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.splat_targets import splat_dataset
-from meshsplats.datasets.views import Dataset, View, ViewImage
+from meshsplats.datasets.views import Dataset, View, ViewImage, check_counting
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, MissingDependencyError, OtherRunError
 from meshsplats.evaluation.report import evaluate
@@ -770,6 +770,28 @@ def test_no_growth_event_happens_twice(ball, start, monkeypatch):
     for clock.step in (9, 11, 9, 11, 21):
         _, state = phase.after_step(state, Moment(clock, views, None))
     assert grown == [11, 21]
+
+
+def test_a_long_search_for_cameras_leaves_the_whole_schedule(ball, start, monkeypatch):
+    """Growth, small images and high rates come first, whatever came before."""
+    config, options = train_config(minutes=10, **SMALL), RunOptions(spent=420)
+    clock = run_start(start, ball, config, options, None).clock(options)
+    phase = growing.Growing(config, start, ball.train, clock.fraction, 0)
+    assert phase._events == 0
+    assert phase.views(ball.train, clock.fraction)[0].camera.width == 16
+    monkeypatch.setattr(run_module, "starting_fans", lambda *_: start)
+    late = RunOptions(spent=480, report_every=0)
+    with pytest.warns(DataWarning, match=r"8\.\d of 8 minutes were over before the first step: more minutes"):
+        train(ball, replace(config, minutes=8), run=late)
+
+
+def test_masks_that_are_dark_throughout_are_refused(ball):
+    none = np.zeros((64, 64), bool)
+    views = [replace(view, source=replace(view.load(), mask=none)) for view in ball.train]
+    with pytest.raises(ValueError, match=r"no pixel of the 20 training views counts: their masks are dark"):
+        train(Dataset(tuple(views)), train_config(steps=1, **SMALL))
+    views[7] = ball.train[7]
+    check_counting(views)
 
 
 def test_the_estimate_of_memory_holds_reduced_images_and_silhouettes(ball, room):

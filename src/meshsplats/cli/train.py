@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import tyro
@@ -79,8 +80,10 @@ class Train(TrainingCommand):
         super().check()
 
     def prepared(self, config: FinetuneConfig) -> Self:
+        start = perf_counter()
         folder = self.target.with_cameras(self.input, say, self.threads, resumed=self.resume)
-        return replace(self, input=folder)._sized(folder, config)
+        left = config.minutes and max(config.minutes - (perf_counter() - start) / 60, config.minutes / 10)
+        return replace(self, input=folder)._sized(folder, left)
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         assert isinstance(config, TrainConfig)

@@ -125,9 +125,9 @@ class TrainingCommand(Command):
     def prepared(self, config: FinetuneConfig) -> Self:
         """The command with the size of the photographs, if it reads some: as given, as in the run that is
         resumed, or what suits the length of ``config``, as the run began."""
-        return self if self.target.data is None else self._sized(self.target.data, config)
+        return self if self.target.data is None else self._sized(self.target.data, config.minutes)
 
-    def _sized(self, folder: Path, config: FinetuneConfig) -> Self:
+    def _sized(self, folder: Path, minutes: float | None) -> Self:
         from meshsplats._core.library import thread_count
         from meshsplats.training.image_sizes import worthwhile_downscale
 
@@ -138,7 +138,7 @@ class TrainingCommand(Command):
         factor = recorded.get("downscale")
         if not isinstance(factor, int):
             threads = None if self.device == "gpu" else thread_count(self.threads)
-            factor = worthwhile_downscale(folder, config.minutes, threads, target.missing, target.masks)
+            factor = worthwhile_downscale(folder, minutes, threads, target.missing, target.masks)
             if factor > 1:
                 say(f"images: 1/{factor} of the photographs' sides, as time allows (--downscale 1: whole)")
         return replace(self, target=replace(target, downscale=factor))

@@ -56,11 +56,13 @@ class Checkpoint:
     ``config``."""
     loss: str = DEFAULT
     """``loss_name`` of the run's. The name only: what it computes cannot be compared."""
+    setup_seconds: float = 0.0
+    """``Clock.setup_seconds``. In checkpoints of earlier versions 0: their fractions count from the start."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     """Writes ``checkpoint`` to ``path``, atomically replacing an earlier one."""
-    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "planned", "loss")
+    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "planned", "loss", "setup_seconds")
     header = {name: getattr(checkpoint, name) for name in names}
     save_safetensors(path, checkpoint.arrays, {_KEY: json.dumps({"version": VERSION, **header})})
 
@@ -86,12 +88,14 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
             f"{path}: a checkpoint of version {header['version']}, this program reads version {VERSION}"
         )
     step, seconds, config, losses = (header[name] for name in ("step", "seconds", "config", "losses"))
-    planned, loss = header.get("planned"), header.get("loss", DEFAULT)
+    planned, loss, setup = header.get("planned"), header.get("loss", DEFAULT), header.get("setup_seconds", 0)
     if (
         not isinstance(step, int)
         or step < 0
         or not isinstance(seconds, (int, float))
         or not 0 <= seconds < LONGEST
+        or not isinstance(setup, (int, float))
+        or not 0 <= setup <= seconds
         or not isinstance(config, dict)
         or not isinstance(losses, list)
         or not all(isinstance(loss, float) for loss in losses)
@@ -100,7 +104,9 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
     ):
         raise FileFormatError(f"{path}: broken: step {step!r}, seconds {seconds!r}")
     fingerprints = str(header["mesh"]), str(header["dataset"])
-    return Checkpoint(step, float(seconds), config, *fingerprints, arrays, tuple(losses), planned, loss)
+    return Checkpoint(
+        step, float(seconds), config, *fingerprints, arrays, tuple(losses), planned, loss, float(setup)
+    )
 
 
 def planned_length(checkpoint: Checkpoint) -> dict[str, Any]:

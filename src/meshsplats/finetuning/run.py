@@ -64,7 +64,7 @@ class Progress:
     steps: int | None
     """Total number of steps; None if the length is given in minutes."""
     fraction: float
-    """Share of the run that is over, 0 to 1."""
+    """Share of the steps that is over, 0 to 1."""
     loss: float | None
     """Loss of the last step; None before the first."""
     held_out: float | None
@@ -195,12 +195,19 @@ class RunStart:
     """``Checkpoint.planned``."""
     arrays: dict[str, np.ndarray] | None = None
     """Those of the phase, from a checkpoint."""
+    setup_seconds: float = 0.0
+    """``Checkpoint.setup_seconds``."""
 
     def clock(self, options: RunOptions) -> Clock:
         """The clock of the run, which is now at its start."""
-        seconds = self.seconds or options.spent
-        views = len(self.dataset.train)
-        return Clock(self.config, views, step=self.step, seconds=seconds, reserve=options.reserve)
+        return Clock(
+            self.config,
+            len(self.dataset.train),
+            step=self.step,
+            seconds=self.seconds or options.spent,
+            setup_seconds=self.setup_seconds,
+            reserve=options.reserve,
+        )
 
 
 def run_start(
@@ -252,6 +259,7 @@ def run_start(
         found.losses,
         planned_length(found),
         {name: found.arrays[name] for name in PHASE_ARRAYS if name in found.arrays},
+        found.setup_seconds,
     )
 
 
@@ -291,6 +299,7 @@ class TrainingLoop:
                 self._report()
                 self._save_preview()
                 self._save_first_checkpoint()
+                clock.begin_steps()
             while not clock.done:
                 if signals.received is not None:
                     self._save_checkpoint()
@@ -396,6 +405,7 @@ class TrainingLoop:
                 tuple(self.losses),
                 self.planned,
                 loss_name(self.loss),
+                self.clock.setup_seconds,
             )
         )
         self.clock.save_cost = time.perf_counter() - self.save_time

@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+import numpy as np
+
 from meshsplats.choices import Masks, Missing
 from meshsplats.datasets.folder import MOST_DOWNSCALE, load_dataset
 from meshsplats.errors import DataWarning
@@ -26,7 +28,8 @@ def worthwhile_downscale(
 ) -> int:
     """The factor by which the images of the photographs in ``folder`` should be smaller than these: the whole
     one that comes nearest to the sides of the pixels that are worth while. So 2.25 times as many stay whole:
-    a quarter of them, by the next factor, would be further from these.
+    a quarter of them, by the next factor, would be further from these. Where sizes differ, that of the median
+    counts, so that one large photograph does not make all others small.
 
     Args:
         folder, missing, masks: as in ``load_dataset``, which does not warn here.
@@ -36,7 +39,7 @@ def worthwhile_downscale(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         views = load_dataset(folder, missing=missing, masks=masks).views
-    pixels = max(view.camera.width * view.camera.height for view in views)
+    pixels = float(np.median([view.camera.width * view.camera.height for view in views]))
     affordable = MOST_PIXELS
     if minutes is not None and threads is not None:
         affordable = min(affordable, max(1, int(PIXELS_PER_MINUTE * minutes * threads)))

@@ -83,6 +83,7 @@ class PhotographOptions:
         if there are fewer than two to train on."""
         from meshsplats.datasets.folder import load_dataset
         from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_masked
+        from meshsplats.datasets.views import check_counting
         from meshsplats.evaluation.backgrounds import BLACK, Background
 
         dataset = load_dataset(
@@ -98,6 +99,7 @@ class PhotographOptions:
                 f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
                 " are needed to train on (``test_every`` 0 holds none out)"
             )
+        check_counting(dataset.train)
         dataset = with_clear_pixels_masked(dataset).scorable()
         if config.background in BACKGROUNDS:
             found = Background(BACKGROUNDS[config.background], "given")

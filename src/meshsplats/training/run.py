@@ -15,7 +15,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import reduced_views
 from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_masked
-from meshsplats.datasets.views import Dataset, ImageCache, View
+from meshsplats.datasets.views import Dataset, ImageCache, View, check_counting
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal, claimed
@@ -39,6 +39,8 @@ from meshsplats.training.patches import Patches, flat_splats
 from meshsplats.training.stereo import matching_bytes
 from meshsplats.training.suspects import find_suspects
 
+LATE = 0.5
+"""Share of the minutes of a run that may be over before its first step without a word."""
 SHOWN_NAMES = 10
 """Maximum number of such photographs that are named."""
 START, SO_FAR, COVERAGE = "start.npz", "interrupted.npz", "coverage.png"
@@ -79,15 +81,16 @@ def train(
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: fewer than two training views, points that are not finite, or masks that do not fit the
-            cameras.
+        ValueError: fewer than two training views, none in which a pixel counts, points that are not finite,
+            or masks that do not fit the cameras.
         FileExistsError, OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError,
             Interrupted: as by ``finetune``. Interrupted leaves the mesh so far in the folder, too, as
             ``interrupted.npz``.
 
-    Warns with a DataWarning of points if no photograph shows most of them, and of photographs that do not fit
-    the others: before the first step of those that have clear pixels though no subject is cut out, which do
-    not count then, and of those that are blurred or double; at the end of those that the mesh cannot show.
+    Warns with a DataWarning of points if no photograph shows most of them, if most of the time is over before
+    the first step, and of photographs that do not fit the others: before the first step of those that have
+    clear pixels though no subject is cut out, which do not count then, and of those that are blurred or
+    double; at the end of those that the mesh cannot show.
     """
     need(Dataset, dataset=dataset)
     need(TrainConfig, config=config, optional=True)
@@ -97,6 +100,7 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
+    check_counting(dataset.train)
     dataset = with_clear_pixels_masked(dataset).scorable()
     config = for_views(with_number_of_fans(config, dataset.train), dataset.train)
     engine(run.device, run.threads).check()
@@ -130,6 +134,13 @@ def train(
         if journal is not None and not run.resume:
             picture = coverage_picture(mesh, dataset.train, run.threads)
         run = replace(run, spent=run.spent + time.perf_counter() - began)
+        if not run.resume and config.minutes is not None and run.spent > LATE * 60 * config.minutes:
+            warnings.warn(
+                f"{run.spent / 60:.1f} of {config.minutes:g} minutes were over before the first step: more"
+                " ``minutes`` help (cameras are found only once)",
+                DataWarning,
+                stacklevel=2,
+            )
         start = run_start(mesh, dataset, config, run, journal)
         if journal is not None and picture is not None:
             (journal.folder / SO_FAR).unlink(missing_ok=True)
