@@ -10,13 +10,16 @@ from pathlib import Path
 import pytest
 
 from meshsplats._core import library
+from meshsplats._options import settings
 from meshsplats.cli import COMMANDS
 from meshsplats.cli.arguments import options_of
 from meshsplats.cli.messages import flag
+from meshsplats.cli.train import Train
 from meshsplats.errors import PACKAGE
 from meshsplats.finetuning import cells, journal, pace
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.training import run as training
+from meshsplats.training.config import USUAL_SPLATS
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
@@ -77,6 +80,12 @@ def test_files_of_a_run_in_documents_are_written():
     }
     assert len(named) > 4
     assert [each for each in sorted(named) if each[1] not in FILES_OF_A_RUN] == []
+
+
+def test_help_and_page_say_how_many_fans_become_splats():
+    text = (ROOT / "docs" / "training.md").read_text("utf-8").partition("`--as-splats splats.ply`")[2]
+    for said in (settings(Train)["as_splats"].help, text):
+        assert f"{USUAL_SPLATS:,}" in said
 
 
 def test_no_index_is_asked_for_a_package_that_is_on_none(monkeypatch):
