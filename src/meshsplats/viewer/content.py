@@ -3,12 +3,14 @@ surface beside them or alone."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import block_means
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
@@ -17,6 +19,7 @@ from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.gaps import with_usual_look
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.merging_views import merging_views, views_of_place
+from meshsplats.conversion.recovery import recover_splats
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -33,6 +36,12 @@ TRIANGLES = 4_000_000
 """Usual limit: more take seconds to sort and draw, and pages of more than 40 MB."""
 COARSE_TRIANGLES = 300_000
 """Triangles of the coarse level, which any phone draws; meshes with more get one."""
+WHOLE = 0.9
+"""Share of the fans of a mesh that must be complete for a coarse level of them."""
+ALIKE_SIDE, AREA = 200, 8
+"""Sides in pixels of the images that tell whether splats show what a mesh does, and of areas of them."""
+ALIKE_LEVEL, ALIKE_SHARE = 0.1, 0.01
+"""By how much the mean colours of an area differ at most, and share of the areas that differ by more."""
 MOST_TRIANGLES = 20_000_000
 """Triangles of a page at most: browsers hold no more."""
 
@@ -124,14 +133,55 @@ def content_of_splats(
 
 
 def content_of_mesh(
-    mesh: SplatMesh, splats: GaussianCloud | None = None, threads: int | None = None
+    mesh: SplatMesh,
+    splats: GaussianCloud | None = None,
+    threads: int | None = None,
+    say: Callable[[str], object] = lambda text: None,
 ) -> Content:
-    """The content of a page of a mesh, with ``splats`` to compare it with. Raises TooManyTrianglesError above
-    ``MOST_TRIANGLES``."""
+    """The content of a page of a mesh, with ``splats`` to compare it with. ``say`` gets a line where there
+    are no splats for a coarse level that show what the mesh does.
+
+    Raises TooManyTrianglesError above ``MOST_TRIANGLES``.
+    """
     _check_size(len(mesh.faces))
     if splats is None:
         return Content(mesh, None)
-    return Content(mesh, splats.of_degree(0), _coarse(mesh, splats, threads=threads))
+    coarse = None
+    if len(mesh.faces) > COARSE_TRIANGLES:
+        source = _splats_of_coarse(mesh, splats.relative_to(mesh.origin), threads)
+        if source is None:
+            say(
+                "no coarse level: the splats do not look like the mesh, which is drawn whole while it moves"
+                " and on phones"
+            )
+        else:
+            coarse = _coarse(mesh, source, threads=threads)
+    return Content(mesh, splats.of_degree(0), coarse)
+
+
+def _show_the_same(mesh: SplatMesh, splats: GaussianCloud, threads: int | None) -> bool:
+    """Whether images of both, from two opposite sides, differ in hardly any area: where something was moved,
+    removed or recoloured, they do."""
+    degree, errors = min(mesh.sh_degree, splats.sh_degree), []
+    bare = replace(mesh.of_degree(degree), filter_px2=0.0)
+    for camera in orbit(mesh, 2, azimuth=USUAL, width=ALIKE_SIDE, height=ALIKE_SIDE):
+        camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
+        drawn = render(bare, camera, samples=2, threads=threads)
+        # Neither is widened by a filter: in images so small, it would cover gaps.
+        shown = render_splats(splats, camera, samples=2, sh_degree=degree, dilation=0.0, threads=threads)
+        difference = np.dstack([drawn.color - shown.color, drawn.alpha - shown.alpha])
+        errors.append(np.abs(block_means(difference, AREA)).max(axis=2).ravel())
+    return bool((np.concatenate(errors) > ALIKE_LEVEL).mean() <= ALIKE_SHARE)
+
+
+def _splats_of_coarse(mesh: SplatMesh, splats: GaussianCloud, threads: int | None) -> GaussianCloud | None:
+    """What shows ``mesh`` with few triangles: the splats that its fans are, wherever they have been moved or
+    recoloured; if too many are incomplete, ``splats``, if they show the same."""
+    with suppress(ValueError):  # which splats its triangles were is not known
+        own, whole = recover_splats(mesh.of_degree(min(mesh.sh_degree, splats.sh_degree)))
+        if whole.mean() >= WHOLE:
+            return own
+    return splats if _show_the_same(mesh, splats, threads) else None
 
 
 def measured(

@@ -132,8 +132,8 @@ def shown_file(
     say: Callable[[str], object] = lambda text: None,
     threads: int | None = None,
 ) -> ShownFile:
-    """Reads the file or folder ``source`` for a page. ``say`` gets a line that says where views come from.
-    ``threads``: at most this many.
+    """Reads the file or folder ``source`` for a page. ``say`` gets lines that say where views come from, and
+    why there is no coarse level of a large mesh. ``threads``: at most this many.
 
     Raises OptionsError as ``ViewingOptions.check`` does, and for options without effect on this file or with
     more triangles than a page can hold, FileFormatError and OSError for files that cannot be read.
@@ -148,7 +148,7 @@ def shown_file(
     if options.data is not None:
         photographs = load_dataset(options.data, missing=options.missing, origin=scene.origin)
     cameras = _cameras(scene, source, options, photographs, say, threads)
-    content = _content(scene, options, cameras, threads)
+    content = _content(scene, options, cameras, say, threads)
     return ShownFile(source, options, content, cameras, photographs, threads)
 
 
@@ -165,7 +165,11 @@ def _check_effects(scene: Shown, source: Path, options: ViewingOptions) -> None:
 
 
 def _content(
-    scene: Shown, options: ViewingOptions, cameras: Sequence[Camera], threads: int | None
+    scene: Shown,
+    options: ViewingOptions,
+    cameras: Sequence[Camera],
+    say: Callable[[str], object],
+    threads: int | None,
 ) -> Content:
     beside = None if options.surface is None else load_base(options.surface, origin=scene.origin)
     try:
@@ -184,7 +188,7 @@ def _content(
             splats = cropped(drawn, options.part.crop)
         if isinstance(scene, BaseMesh):
             return Content(None, splats, surface=scene)
-        return replace(content_of_mesh(scene, splats, threads), surface=beside)
+        return replace(content_of_mesh(scene, splats, threads, say), surface=beside)
     except TooManyTrianglesError as error:
         raise OptionsError(f"{error}: {advice}") from None
 
