@@ -62,7 +62,10 @@ def test_other_names_of_this_machine_are_refused(server):
     """A page elsewhere can make its own name lead to 127.0.0.1, but asks with that name."""
     port = server.server_port
     for host in ("evil.example", f"evil.example:{port}", f"localhost.evil.example:{port}", "localhost:a", ""):
-        assert ask(server, server.path, Host=host)[0] == 404
+        status, _, body = ask(server, server.path, Host=host)
+        assert status == 404
+        assert f"open it as http://localhost:{port}{server.path}, from elsewhere" in body.decode()
+        assert server.path not in ask(server, "/", Host=host)[2].decode()
 
 
 def test_a_tunnel_may_have_any_port(server):

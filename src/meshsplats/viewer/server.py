@@ -39,10 +39,15 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(body=False)
 
     def _answer(self, *, body: bool) -> None:
-        # A page elsewhere whose name was made to lead here asks with its own name.
-        known = _THIS_MACHINE.fullmatch(self.headers.get("Host", ""))
-        if not known or not hmac.compare_digest(self.path.encode(), self.server.path.encode()):
+        if not hmac.compare_digest(self.path.encode(), self.server.path.encode()):
             self.send_error(404)
+            return
+        # A page elsewhere whose name was made to lead here asks with its own name.
+        if not _THIS_MACHINE.fullmatch(self.headers.get("Host", "")):
+            port = self.server.server_port
+            at, tunnel = f"http://localhost:{port}{self.path}", f"ssh -L {port}:127.0.0.1:{port} SERVER"
+            explained = f"This page is for its own machine: open it as {at}, from elsewhere after {tunnel}"
+            self.send_error(404, explain=explained)
             return
         self.send_response(200)
         for name, value in {
