@@ -362,7 +362,9 @@ def test_coordinates_of_a_map_are_told_of(tmp_path, capsys):
         out = tmp_path / f"{name}{len(more)}"
         words = ["tiles", str(tmp_path / f"{name}.ply"), "-o", str(out), "--alpha", "mask"]
         assert main([*words, *more]) == 0
-        assert (text in capsys.readouterr().err) is told
+        out, err = capsys.readouterr()
+        assert (text in err) is told
+        assert ("next: docs/tiles.md has a page for CesiumJS" in out) is (name == "map")
 
 
 def test_boxes_lie_in_those_of_their_parents(tmp_path):

@@ -71,13 +71,12 @@ class Tiles(Command):
             if self.origin == "keep" and not found.on_globe:
                 say("coordinates of a map, not of the globe: docs/tiles.md says how CesiumJS can show them")
         table = self.output / "tileset.json"
-        line = found.alpha.in_words() if found.alpha else None
-        self.finish(
-            {"tileset": str(table), **asdict(found), "seconds": round(seconds, 2)},
-            f"{found.in_words()}, in {seconds:.1f} s",
-            *([line] if line else []),
-            f"{table}: geometric error of the root {found.error:.3g}",
-        )
+        lines = [f"{found.in_words()}, in {seconds:.1f} s", found.alpha.in_words() if found.alpha else None]
+        lines += [f"{table}: geometric error of the root {found.error:.3g}"]
+        if not found.on_globe:
+            lines += ["next: docs/tiles.md has a page for CesiumJS, whose globe would hide it in the Earth"]
+        result = {"tileset": str(table), **asdict(found), "seconds": round(seconds, 2)}
+        self.finish(result, *filter(None, lines))
 
     def resolved(self) -> dict[str, Any]:
         return asdict(self._checked().resolved())
