@@ -23,14 +23,14 @@ PAGE = """<!doctype html><style>body {margin: 0}</style><canvas id="c"></canvas>
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 PREPARE
-const load = async (name, prepared) => {
+const load = async (name, prepared, renderer) => {
   const gltf = await new GLTFLoader().loadAsync(name);
   const scene = new THREE.Scene();
   scene.background = new THREE.Color(1, 1, 1);
   scene.add(gltf.scene);
   scene.updateMatrixWorld(true);
   gltf.scene.traverse(o => {
-    if (o.isMesh) { o.frustumCulled = false; if (prepared) window.prepare(o); scene.ours = o; }
+    if (o.isMesh) { o.frustumCulled = false; if (prepared) window.prepare(o, renderer); scene.ours = o; }
   });
   return scene;
 };
@@ -38,7 +38,7 @@ window.draw = async (k, prepared, before) => {
   const canvas = document.getElementById('c');
   const renderer = new THREE.WebGLRenderer({ canvas, preserveDrawingBuffer: true });
   renderer.setSize(k.width, k.height);
-  const scene = await load('./mesh.glb', prepared);
+  const scene = await load('./mesh.glb', prepared, renderer);
   const camera = new THREE.PerspectiveCamera(), m = k.world_to_camera, s = [1, -1, -1, 1], view = [];
   for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) view.push(s[r] * m[r][c]);
   camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
@@ -51,7 +51,7 @@ window.draw = async (k, prepared, before) => {
   renderer.debug.onShaderError = (gl, program, vertex, fragment) => {
     message = gl.getShaderInfoLog(vertex) + gl.getShaderInfoLog(fragment) + gl.getProgramInfoLog(program);
   };
-  if (before) renderer.render(await load('./before.glb', prepared), camera);
+  if (before) renderer.render(await load('./before.glb', prepared, renderer), camera);
   renderer.render(scene, camera);
   const gl = renderer.getContext(), pixels = new Uint8Array(4 * w * h);
   gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
