@@ -100,7 +100,8 @@ class View(Command):
             {"page": str(output), **result},
             f"{named(output)}: {content.in_words(result)}",
             content.errors_in_words(result),
-            "next: open it with a double click, or send it to someone; it needs no network",
+            "next: open it with a double click, or send it to someone: it needs no network; iPhones and iPads"
+            " open it from a web server only",
         )
 
     def _serve(self, page: Page, result: dict[str, Any]) -> None:
