@@ -260,7 +260,7 @@ class _Textured(NamedTuple):
 
     uv: np.ndarray
     """(m, 3, 2) float32 coordinates of the corners of each face, v down."""
-    index: np.ndarray
+    of_face: np.ndarray
     """(m,) int32 texture of each face; -1: none."""
     images: tuple[Texture, ...]
     tints: np.ndarray | None = None
@@ -291,13 +291,13 @@ def _base(
     uncolored = any(issubclass(each.category, NoColorsWarning) for each in hints)
     colors = None if uncolored else _display(mesh)
     base = BaseMesh(mesh.vertices, mesh.faces, colors, up=mesh.up, origin=mesh.origin)
-    if found is None or not (found.index >= 0).any():
+    if found is None or not (found.of_face >= 0).any():
         return base
     if len(found.uv) != len(base.faces):
         raise FileFormatError(
             f"{source}: {len(found.uv):,} faces with texture coordinates, {len(base.faces):,} in all"
         )
-    return replace(base, uv=found.uv, face_texture=found.index, textures=found.images, tints=found.tints)
+    return replace(base, uv=found.uv, face_texture=found.of_face, textures=found.images, tints=found.tints)
 
 
 def _display(mesh: SplatMesh) -> np.ndarray:
