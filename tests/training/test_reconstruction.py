@@ -429,6 +429,27 @@ def test_surroundings_that_stand_still_are_told_by_their_matches(tmp_path, movin
     assert masks.surroundings_stand_still(tmp_path / "database.db", images) == answer
 
 
+def test_the_library_heeds_masks(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    folder, names = photographs(tmp_path / "scene", 3), ["p0.png", "p1.png", "p2.png"]
+    masked(folder, slice(0, 20))
+    (folder / "masks/p3.png").unlink()
+    images = [folder / name for name in names]
+    FeatureMasks(folder, names, [(60, 40)] * 3).write(tmp_path / "masks", images)
+    heights = []
+    for masks in (None, tmp_path / "masks"):
+        database = tmp_path / f"{masks is None}.db"
+        reconstruction._extract(pycolmap, database, images, [read_shot(path) for path in images], masks, 1)
+        with closing(sqlite3.connect(database)) as connection:
+            tables = connection.execute("select rows, cols, data from keypoints").fetchall()
+        points = [np.frombuffer(data, np.float32).reshape(rows, cols) for rows, cols, data in tables]
+        heights.append(np.concatenate(points)[:, 1])
+    everywhere, inside = heights
+    assert (everywhere < 20).any()
+    assert len(inside) > 10
+    assert (inside >= 20).all()
+
+
 def test_masks_that_do_not_fit_are_refused_before_the_search(scene):
     folder, colmap, _ = scene()
     save(folder / "masks/p1.png", np.zeros((60, 40), np.uint8))
