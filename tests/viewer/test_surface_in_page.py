@@ -84,6 +84,16 @@ def test_the_colours_of_vertices_beside_a_texture_are_in_the_page():
     np.testing.assert_allclose(colors[:, :3], linear_to_srgb(tints[:1, :3]).repeat(len(colors), 0), atol=0.01)
 
 
+def test_a_tinted_texture_is_the_image_of_the_core(browser, write_page):
+    """Dark times dark, where products of display values are far from those of light."""
+    tinted = replace(box(), tints=np.tile(np.float32([0.05, 0.4, 0.02, 1]), (8, 1)))
+    page = open_page(browser, write_page(tinted, "box", cameras=[camera()]), SIDE, SIDE)
+    plain(page)
+    same(page.screenshot(), expected(tinted, camera()))
+    assert page.problems() == []
+    page.close()
+
+
 def press(page, kind: str) -> np.ndarray:
     """The screen with that content."""
     page.run(f"document.querySelector('[name=content][value={kind}]').click()")

@@ -13,8 +13,15 @@ ivec2 place(uint i) { return ivec2(i & 4095u, i >> 12); }
 const HEAD = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 `;
+// Display colours to linear light, and back (sRGB).
+const CURVES = `
+vec3 decode(vec3 c) { return mix(c / 12.92, pow((max(c, 0.) + .055) / 1.055, vec3(2.4)), step(.04045, c)); }
+vec3 encode(vec3 c) {
+  return mix(c * 12.92, 1.055 * pow(max(c, 0.), vec3(1. / 2.4)) - .055, step(.0031308, c));
+}
+`;
 // terms: spherical harmonics of each splat, in the order of the core; 0 for none. textured: whether vertices
-// have coordinates in a picture, which is multiplied with their colours.
+// have coordinates in a picture, which is multiplied with their colours in linear light.
 const textures = textured => textured ? "#define TEXTURED\n" : "";
 export const meshVertex = (terms, textured) => HEAD + textures(textured) + LENS + `
 #define TERMS ${terms}
@@ -58,7 +65,7 @@ void main() {
 #endif
   gl_Position = clip(seen(position));
 }`;
-export const meshFragment = textured => HEAD + textures(textured) + `
+export const meshFragment = textured => HEAD + textures(textured) + CURVES + `
 uniform float solid; // opacity of all fragments; negative: that of the vertices
 centroid in vec4 rgba;
 #ifdef TEXTURED
@@ -70,7 +77,7 @@ void main() {
   float alpha = solid < 0. ? rgba.a : solid;
   vec3 rgb = rgba.rgb;
 #ifdef TEXTURED
-  rgb *= texture(picture, uv).rgb;
+  rgb = encode(decode(rgb) * decode(texture(picture, uv).rgb));
 #endif
   result = vec4(rgb * alpha, alpha);
 }`;
@@ -119,13 +126,9 @@ void main() {
 export const PRESENT_VERTEX = HEAD + `
 out vec2 uv;
 void main() { uv = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(2. * uv - 1., 0, 1); }`;
-export const PRESENT_FRAGMENT = HEAD + `
+export const PRESENT_FRAGMENT = HEAD + CURVES + `
 uniform sampler2D image; uniform vec3 background; uniform float gain; uniform bool linear;
 in vec2 uv; out vec4 result;
-vec3 decode(vec3 c) { return mix(c / 12.92, pow((max(c, 0.) + .055) / 1.055, vec3(2.4)), step(.04045, c)); }
-vec3 encode(vec3 c) {
-  return mix(c * 12.92, 1.055 * pow(max(c, 0.), vec3(1. / 2.4)) - .055, step(.0031308, c));
-}
 void main() {
   vec4 c = texture(image, uv);
   vec3 rgb = c.rgb;
