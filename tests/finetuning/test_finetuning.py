@@ -557,17 +557,6 @@ def test_a_length_in_minutes_is_kept(scene):
     assert progress[-1].step == 0
 
 
-def test_time_before_the_first_step_takes_nothing_from_the_schedule(scene, tmp_path):
-    _, dataset, mesh = scene
-    progress = []
-    run = RunOptions(tmp_path / "run", spent=60.0, report_every=0, preview_every=0)
-    finetune(mesh, dataset, make_config(minutes=1.05), run=run, on_progress=progress.append)
-    assert progress[0].fraction < 0.6 < 60 / 63
-    assert progress[0].seconds_left < 3
-    assert progress[-1].fraction == 1
-    assert 60 <= load_checkpoint(run.folder / "checkpoint.safetensors").setup_seconds < progress[0].seconds
-
-
 def test_what_cannot_be_tuned(scene):
     _, dataset, mesh = scene
     with pytest.raises(ValueError, match="no training views"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -774,12 +775,20 @@ def test_no_growth_event_happens_twice(ball, start, monkeypatch):
 
 def test_a_long_search_for_cameras_leaves_the_whole_schedule(ball, start, monkeypatch):
     """Growth, small images and high rates come first, whatever came before."""
-    config, options = train_config(minutes=10, **SMALL), RunOptions(spent=420)
-    clock = run_start(start, ball, config, options, None).clock(options)
-    phase = growing.Growing(config, start, ball.train, clock.fraction, 0)
-    assert phase._events == 0
-    assert phase.views(ball.train, clock.fraction)[0].camera.width == 16
+    config, phases = train_config(minutes=10, **SMALL), []
     monkeypatch.setattr(run_module, "starting_fans", lambda *_: start)
+
+    def begun(*given):
+        phases.append((growing.Growing(*given), given[3]))
+        raise InterruptedError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "Growing", begun)
+        with pytest.warns(DataWarning, match="before the first step"), suppress(InterruptedError):
+            train(ball, config, run=RunOptions(spent=420))
+    ((phase, fraction),) = phases
+    assert fraction < 0.1
+    assert phase._events == 0
     late = RunOptions(spent=480, report_every=0)
     with pytest.warns(DataWarning, match=r"8\.\d of 8 minutes were over before the first step: more minutes"):
         train(ball, replace(config, minutes=8), run=late)

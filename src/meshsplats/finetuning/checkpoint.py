@@ -57,7 +57,7 @@ class Checkpoint:
     loss: str = DEFAULT
     """``loss_name`` of the run's. The name only: what it computes cannot be compared."""
     setup_seconds: float = 0.0
-    """``Clock.setup_seconds``. In checkpoints of earlier versions 0: their fractions count from the start."""
+    """``Clock.setup_seconds``; 0 in checkpoints of earlier versions."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:

@@ -23,13 +23,13 @@ class Clock:
         views: number of training views.
         step: number of steps already taken.
         seconds: time already used.
-        setup_seconds: of a run that goes on, the time that it had used before its first step.
+        setup_seconds: the part of it that came before the run, and of which its schedule knows nothing.
         reserve: seconds to leave at the end.
 
     Attributes:
         step: number of steps taken, counted by the loop.
         steps: total number of steps; None if the length is given in minutes.
-        setup_seconds: time used before the first step.
+        setup_seconds: time used before the run.
         step_cost, report_cost, save_cost: seconds of the last step, report and checkpoint.
         plain_images: number of images for the plain colours of the result, each of which takes about as long
             as a step; 0: it has none.
@@ -51,11 +51,7 @@ class Clock:
         self._minutes, self._reserve = config.minutes, reserve
         self._began = time.perf_counter() - seconds
         self._first_step, self._first_seconds = step, self.seconds
-        self.setup_seconds = setup_seconds if step else self.seconds
-
-    def begin_steps(self) -> None:
-        """Ends the set-up: the first step is next."""
-        self.setup_seconds = self.seconds
+        self.setup_seconds = setup_seconds
 
     @property
     def seconds(self) -> float:
@@ -79,8 +75,8 @@ class Clock:
 
     @property
     def fraction(self) -> float:
-        """Share of the steps that is over, 0 to 1: from the first one on, as what came before may take most
-        of the time of a run with a length in minutes."""
+        """Share of the run that is over, 0 to 1. What came before it, as the search for cameras, may have
+        taken most of a length in minutes."""
         if self.limit is not None:
             length = self.limit - self.setup_seconds
             return min(1.0, (self.seconds - self.setup_seconds) / length) if length > 0 else 1.0

@@ -53,8 +53,7 @@ class FinetuneConfig:
     """Length in steps, of one view each."""
     minutes: Annotated[float | None, Range(0, 1e5)] = None
     """Length in minutes, including what came before (reading, finding cameras, converting, rendering the
-    targets). The schedule of the steps, such as that of their rates, goes by the time that is left. The only
-    length whose result depends on the machine's speed."""
+    targets). The only length whose result depends on the machine's speed."""
     color_rate: Annotated[float, Range(1e-9, 1), Advanced] = 0.02
     """Adam's learning rate of red, green, blue and opacity, in [0, 1]: about how much one step changes
     them."""

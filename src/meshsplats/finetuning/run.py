@@ -64,7 +64,7 @@ class Progress:
     steps: int | None
     """Total number of steps; None if the length is given in minutes."""
     fraction: float
-    """Share of the steps that is over, 0 to 1."""
+    """Share of the run that is over, 0 to 1."""
     loss: float | None
     """Loss of the last step; None before the first."""
     held_out: float | None
@@ -196,7 +196,7 @@ class RunStart:
     arrays: dict[str, np.ndarray] | None = None
     """Those of the phase, from a checkpoint."""
     setup_seconds: float = 0.0
-    """``Checkpoint.setup_seconds``."""
+    """``Clock.setup_seconds``."""
 
     def clock(self, options: RunOptions) -> Clock:
         """The clock of the run, which is now at its start."""
@@ -299,7 +299,6 @@ class TrainingLoop:
                 self._report()
                 self._save_preview()
                 self._save_first_checkpoint()
-                clock.begin_steps()
             while not clock.done:
                 if signals.received is not None:
                     self._save_checkpoint()

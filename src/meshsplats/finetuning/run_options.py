@@ -37,7 +37,7 @@ class RunOptions:
     device: Device = "cpu"
     """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
     spent: Annotated[float, Range(0, math.inf)] = 0.0
-    """Seconds already spent. They count towards ``minutes``; the schedule of the steps goes by the rest."""
+    """Seconds already spent. They count towards ``minutes``; the schedule of a training goes by the rest."""
     reserve: Annotated[float, Range(0, math.inf)] = 0.0
     """Seconds that the caller needs afterwards. They count, too."""
     cache_bytes: Annotated[int, Range(0, math.inf)] = CACHE_BYTES

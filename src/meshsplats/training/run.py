@@ -133,7 +133,7 @@ def train(
         picture = None
         if journal is not None and not run.resume:
             picture = coverage_picture(mesh, dataset.train, run.threads)
-        run = replace(run, spent=run.spent + time.perf_counter() - began)
+        before, run = run.spent, replace(run, spent=run.spent + time.perf_counter() - began)
         if not run.resume and config.minutes is not None and run.spent > LATE * 60 * config.minutes:
             warnings.warn(
                 f"{run.spent / 60:.1f} of {config.minutes:g} minutes were over before the first step: more"
@@ -142,6 +142,8 @@ def train(
                 stacklevel=2,
             )
         start = run_start(mesh, dataset, config, run, journal)
+        if not run.resume:
+            start = replace(start, setup_seconds=before)
         if journal is not None and picture is not None:
             (journal.folder / SO_FAR).unlink(missing_ok=True)
             save_mesh(mesh, journal.folder / START)
