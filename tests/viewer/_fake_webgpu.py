@@ -1,7 +1,9 @@
 """A WebGPU that draws nothing, at once: what the page asks of a device, without shaders to compile."""
 
 FAKE_WEBGPU = """
-window.gpu = { asked: 0, devices: 0, refuses: false, full: false, frames: [], lose: null, wait: null };
+window.gpu = {
+  asked: 0, devices: 0, destroyed: 0, refuses: false, full: false, frames: [], lose: null, wait: null,
+};
 const anything = () => new Proxy(() => {}, {
   get: (_, name) => name === 'then' ? undefined : anything(), apply: () => anything(),
 });
@@ -24,6 +26,7 @@ class FakeDevice {
     } };
   }
   addEventListener() {}
+  destroy() { gpu.destroyed++; }
   createShaderModule() { return { getCompilationInfo: async () => ({ messages: [] }) }; }
   async createComputePipelineAsync() { return anything(); }
   async createRenderPipelineAsync() { return anything(); }
@@ -52,5 +55,6 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...words) {
 };
 """
 """A script for ``browser.page(before=...)``. ``window.gpu``: how often an adapter was ``asked`` for, how many
-``devices`` there were, the sizes of the ``frames`` that were drawn; ``lose(message)`` takes the device; no
-adapter where it ``refuses``, no buffer where it is ``full``; each frame waits for ``wait()``."""
+``devices`` there were and how many the page ``destroyed``, the sizes of the ``frames`` that were drawn;
+``lose(message)`` takes the device; no adapter where it ``refuses``, no buffer where it is ``full``; each
+frame waits for ``wait()``."""

@@ -78,7 +78,8 @@ def test_the_near_plane_is_that_of_the_camera_until_one_comes_nearer(browser):
     cutting = planes(8, "view.orbit(1, 1)", "view.pan(9, 9, 9, 9)", "zoom(0.8)", "zoom(0.5)")
     assert cutting == pytest.approx([8, 8, 0.8, 0.4])
     flying = planes(0.1, "view.move(0, 0, 1, 5)", "zoom(1.25)", "view.orbit(1, 1)")
-    assert flying == pytest.approx([0.1 * 5e-3] * 3)
+    assert flying == pytest.approx([5e-3] * 3)
+    assert planes(0.1, "view.move(0, 0, 1, 5)", "zoom(0.5, 60)")[1] == pytest.approx(0.1 * 5e-3)
     assert planes(1e-5, "view.move(0, 0, 1, 5)", "zoom(0.8)") == pytest.approx([1e-5] * 2)
     page.close()
 
@@ -100,6 +101,25 @@ def test_what_one_zooms_at_does_not_vanish(browser, write_page):
     page.still(PATIENCE)
     for kind in ("mesh", "surface"):
         assert np.ptp(press(page, kind) - np.uint8([255, 0, 0])) == 0
+    page.close()
+
+
+def test_a_depth_buffer_sorts_after_a_flight(browser, write_page):
+    """A red square close before a blue one, at two radii of the scene."""
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    red, blue = (np.tile(np.float32([*rgb, 1]), (4, 1)) for rgb in ((1, 0, 0), (0, 0, 1)))
+    places = np.concatenate([square - np.float32([0, 0, 0.004]), square])
+    both = BaseMesh(places, np.concatenate([faces, faces + 4]), np.concatenate([blue, red]))
+    view = ms.look_at([0, 3, 6.0], [0, 0, 0], up=(0, -1, 0), width=SIDE, height=SIDE, fov=30)
+    page = open_page(browser, write_page(both, "flight", cameras=[view]), SIDE, SIDE)
+    plain(page)
+    page.key("d")
+    page.key("a")
+    page.still(PATIENCE)
+    image = page.screenshot()
+    assert (image[..., 0] > 250).all()
+    assert (image[..., 1] < 50).sum() > 5000
     page.close()
 
 
@@ -267,6 +287,16 @@ def test_brackets_may_need_alt(keyboard):
         assert keyboard.run("document.querySelector('[name=content]:checked').value") == content
 
 
+def test_a_plus_at_the_place_of_a_digit_zooms(keyboard):
+    """That of Czech keyboards is at 1, that of Swiss ones is Shift + 1, of Hungarian ones Shift + 3."""
+    chosen = keyboard.run("document.querySelector('[name=content]:checked').value")
+    for code in ("Digit1", "Digit3"):
+        before = pose(keyboard)
+        strike(keyboard, "+", code, shiftKey=True)
+        assert moved(before, pose(keyboard)) > 0
+        assert keyboard.run("document.querySelector('[name=content]:checked').value") == chosen
+
+
 def test_the_command_key_ends_a_flight_by_letters(keyboard):
     """macOS does not tell that W goes up while it is down."""
     strike(keyboard, "w", "KeyW")
@@ -392,6 +422,15 @@ def test_what_webgl_cannot_draw_leaves_the_other_contents(browser, url):
     page.close()
 
 
+FULL_FOR_MESHES = """
+const create = FakeDevice.prototype.createBuffer;
+FakeDevice.prototype.createBuffer = function (words) {
+  gpu.full = words.size > 1 << 16; // larger than those of a renderer without a mesh
+  return create.call(this, words);
+};
+"""
+
+
 def fake_page(browser: Browser, url: str, before: str = "", **more: bool) -> Page:
     page = browser.page(url, WIDTH, HEIGHT, before=FAKE_WEBGPU + SHORT_TIMES + before, **more)
     page.wait("document.body.dataset.renderer === 'exact'", PATIENCE)
@@ -425,6 +464,20 @@ def test_a_device_that_is_not_back_is_not_asked_for_without_end(browser, url):
     page.wait("document.querySelector('#renderer option').disabled")
     page.run("new Promise(done => setTimeout(done, 200))")
     assert page.run("[gpu.asked, gpu.devices]") == [4, 1]
+    page.close()
+
+
+def test_a_device_of_webgpu_that_does_not_draw_is_given_back(browser, url):
+    page = fake_page(browser, url)
+    page.run("gpu.wait = () => { throw new Error('broken'); }; document.querySelector('#home').click()")
+    page.wait("document.querySelector('#renderer option').disabled")
+    page.still(PATIENCE)
+    assert page.text("#messageText").startswith("The exact image failed (broken)")
+    assert page.run("[gpu.devices, gpu.destroyed]") == [1, 1]
+    page.close()
+    page = browser.page(url, WIDTH, HEIGHT, before=FAKE_WEBGPU + FULL_FOR_MESHES)
+    page.wait("document.querySelector('#renderer option').disabled")
+    assert page.run("[gpu.devices, gpu.destroyed]") == [1, 1]
     page.close()
 
 
@@ -467,6 +520,7 @@ def test_a_mesh_that_webgl_cannot_draw_is_drawn_by_webgpu(browser, url):
     page.still(PATIENCE)  # without either, the splats are left
     assert page.text("#messageText") == "The mesh cannot be drawn here: no room"
     assert page.text("#status") == "splats"
+    assert page.run("document.querySelectorAll('[name=style]:disabled, #renderer:disabled').length") == 0
     assert page.problems() == []
     page.close()
 

@@ -89,12 +89,14 @@ export class App extends Pilot {
 
   async #prepareExact(problems) {
     this.preparing = true;
+    let exact = null;
     try {
-      const exact = await ExactRenderer.create(this.canvases.exact, this.kernels, lost => this.#lose(lost));
+      exact = await ExactRenderer.create(this.canvases.exact, this.kernels, lost => this.#lose(lost));
       for (const level of this.meshes) this.#give(exact, level);
       if (exact.lost) throw new Error(`the graphics device was lost (${exact.lost})`);
       this.exact = exact;
     } catch (error) {
+      exact?.free();
       problems.push(error.message);
     }
     this.preparing = this.awaited = false;
@@ -161,8 +163,10 @@ export class App extends Pilot {
 
   // From now on without the exact renderer.
   #fall(message) {
+    this.exact?.free();
     this.exact = null;
     this.awaited = false;
+    if (this.exactOnly.size) this.#offer(true);
     this.exactOnly.clear();
     this.options.renderer = "sorted";
     element("renderer").value = "sorted";
@@ -301,7 +305,7 @@ export class App extends Pilot {
       Object.assign(this.options, { style: "blended", renderer: "exact" });
       document.querySelector("[name=style][value=blended]").checked = true;
       element("renderer").value = "exact";
-      for (const input of document.querySelectorAll("[name=style], #renderer")) input.disabled = true;
+      this.#offer(false);
       note(`WebGL does not draw the mesh here: ${message}`);
     } else if (part === "mesh" && level === "fine" && this.levels.coarse) {
       this.#dropFine(message);
@@ -313,6 +317,11 @@ export class App extends Pilot {
     }
     this.changed();
     return true;
+  }
+
+  // Whether the settings have other images of the mesh than the exact one.
+  #offer(others) {
+    for (const input of document.querySelectorAll("[name=style], #renderer")) input.disabled = !others;
   }
 
   #busy() { return this.dirty || this.moves || !this.finished; }

@@ -97,9 +97,10 @@ export class View {
     this.position = add(pivot, this.forward, -this.distance);
   }
 
-  // Along right, down, forward in scene units, to anything: the near plane is as near as zooming brings it.
+  // Along right, down, forward in scene units, to anything: the near plane is as near as zooming brings the
+  // pivot. Nearer ones would leave a depth buffer without precision at the distance of the scene.
   move(x, y, z, radius) {
-    this.near = this.mostNear = Math.min(this.mostNear, NEAR * NEAREST * radius);
+    this.near = this.mostNear = Math.min(this.mostNear, NEAREST * radius);
     this.position = add(add(add(this.position, this.right, x), this.down, y), this.forward, z);
   }
 

@@ -153,6 +153,9 @@ export function connect(stage, pilot, radius) {
     if (flies) {
       keys.add(place);
       pilot.fly(keys, event.shiftKey, !event.repeat);
+    } else if (ZOOMS.test(key)) { // before commands: a + may be at the place of a digit
+      view.zoom(key === "-" ? 1 / ZOOM : ZOOM, radius);
+      pilot.changed();
     } else if (command) {
       if (!event.repeat) pilot.command(command);
     } else if (key.startsWith("Arrow")) {
@@ -161,9 +164,6 @@ export function connect(stage, pilot, radius) {
       if (event.shiftKey) pan(-x * STEP * shorter(), -y * STEP * shorter());
       else if (pilot.flying) view.look(-x * STEP, y * STEP);
       else view.orbit(x * STEP * 2, -y * STEP * 2);
-      pilot.changed();
-    } else if (ZOOMS.test(key)) {
-      view.zoom(key === "-" ? 1 / ZOOM : ZOOM, radius);
       pilot.changed();
     } else {
       return;

@@ -94,6 +94,9 @@ export class ExactRenderer {
     return self;
   }
 
+  // Gives back what it has on the device, which the canvas holds for good; it cannot be used any more.
+  free() { this.device.destroy(); }
+
   async #compile() {
     const { device, kernels } = this, modules = this.modules = {};
     for (const [name, code] of Object.entries({ ...kernels.sources, present: PRESENT })) {

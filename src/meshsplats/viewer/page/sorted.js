@@ -418,8 +418,10 @@ async function shrunk(image, most, note) {
   if (side <= most) return image;
   note(`WebGL takes textures of ${most} texels here: that of the surface, of ${side}, is made smaller.`);
   const [resizeWidth, resizeHeight] = [width, height].map(texels => Math.ceil(texels * most / side));
-  return createImageBitmap(image, { resizeWidth, resizeHeight, resizeQuality: "high",
+  const smaller = await createImageBitmap(image, { resizeWidth, resizeHeight, resizeQuality: "high",
     colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  image.close();
+  return smaller;
 }
 
 // The texture of a surface.
