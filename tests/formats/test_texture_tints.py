@@ -26,12 +26,16 @@ MIDDLE = np.full((1, 3), 1 / 3)
 TINTS = np.array([[1, 0, 0.25, 1], [0.25, 0.5, 1, 1], [0.25, 1, 0.25, 1]], np.float32)
 
 
-def write(folder: Path, colors: np.ndarray | None, material: dict | None = None, **more) -> Path:
-    """A triangle with a texture of one pixel, COLOR_0 ``colors``, and what ``material`` has beyond that."""
+def write(
+    folder: Path, colors: np.ndarray | None, material: dict | None = None, *, flag: bool = False, **more
+) -> Path:
+    """A triangle with a texture of one pixel, COLOR_0 ``colors``, normalized by ``flag``, and what
+    ``material`` has beyond that."""
     arrays = [(TRIANGLE, "VEC3", False), (TRIANGLE[:, :2].copy(), "VEC2", False)]
     attributes = {"POSITION": 0, "TEXCOORD_0": 1}
     if colors is not None:
-        arrays.append((np.array(colors, "<f4"), "VEC4", False))
+        values = np.asarray(colors)
+        arrays.append((values if values.dtype.kind == "u" else values.astype("<f4"), "VEC4", flag))
         attributes["COLOR_0"] = 2
     image = "data:image/png;base64," + base64.b64encode(png_of(PIXEL.reshape(1, 1, 4))).decode()
     look = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}} | (material or {})
@@ -64,6 +68,20 @@ def test_colours_of_vertices_multiply_a_texture_in_linear_light(tmp_path):
     np.testing.assert_allclose(mesh.colors[mesh.faces[0], :3], wanted, atol=1e-6)
     laid = ms.bind(base, triangles=1, layers=1).mesh
     assert np.abs(laid.colors[:, :3] - wanted).min(axis=0).max() < 1e-6
+
+
+@pytest.mark.parametrize("dtype", ["u1", "<u2"])
+@pytest.mark.parametrize("flag", [True, False])
+def test_whole_numbers_are_fractions_and_warned_of_once(tmp_path, dtype, flag):
+    most = np.iinfo(dtype).max
+    path = write(tmp_path, np.round(TINTS * most).astype(dtype), flag=flag)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        base = ms.load_base(path)
+    np.testing.assert_allclose(base.tints, TINTS, atol=0.5 / most)
+    assert ["COLOR_0 has integers without the flag" in str(each.message) for each in found] == [True] * (
+        not flag
+    )
 
 
 def test_white_changes_nothing(tmp_path):

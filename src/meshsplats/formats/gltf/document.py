@@ -66,7 +66,8 @@ class GltfDocument:
         self._refuse_extensions()
         self._buffers: dict[int, memoryview] = {}
         self._unpacked: dict[int, memoryview] = {}
-        self._unflagged: set[str] = set()
+        self.unflagged: set[str] = set()
+        """Attributes of which a warning has said that ``floats`` takes them for fractions."""
 
     def uses(self, extension: str) -> bool:
         """Whether the file names the extension among those that it uses."""
@@ -230,8 +231,8 @@ class GltfDocument:
         if flag or fractions:
             result /= np.float32(np.iinfo(values.dtype).max)
             np.maximum(result, -1, out=result)
-        if fractions and not flag and what not in self._unflagged:
-            self._unflagged.add(what)
+        if fractions and not flag and what not in self.unflagged:
+            self.unflagged.add(what)
             warnings.warn(
                 f"{self.path}: {what} has integers without the flag 'normalized', which they need; they are"
                 f" read as fractions of {np.iinfo(values.dtype).max:,}",

@@ -38,6 +38,7 @@ def gltf_textures(
     left out. Raises FileFormatError.
     """
     document = GltfDocument(path)
+    document.unflagged.add("COLOR_0")  # which ``read_gltf`` has said
     found = _Textures(document, read)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     tints: list[tuple[int, np.ndarray | None]] = []
