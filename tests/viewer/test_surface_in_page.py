@@ -85,8 +85,11 @@ def test_the_colours_of_vertices_beside_a_texture_are_in_the_page():
 
 
 def test_a_tinted_texture_is_the_image_of_the_core(browser, write_page):
-    """Dark times dark, where products of display values are far from those of light."""
-    tinted = replace(box(), tints=np.tile(np.float32([0.05, 0.4, 0.02, 1]), (8, 1)))
+    """Dark times dark, where products of display values are far from those of light, and gradients, which
+    are, too."""
+    tints = np.tile(np.float32([0.05, 0.4, 0.02, 1]), (8, 1))
+    tints[:4] = 1
+    tinted = replace(box(), tints=tints)
     page = open_page(browser, write_page(tinted, "box", cameras=[camera()]), SIDE, SIDE)
     plain(page)
     same(page.screenshot(), expected(tinted, camera()))

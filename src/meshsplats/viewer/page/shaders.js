@@ -21,9 +21,10 @@ vec3 encode(vec3 c) {
 }
 `;
 // terms: spherical harmonics of each splat, in the order of the core; 0 for none. textured: whether vertices
-// have coordinates in a picture, which is multiplied with their colours in linear light.
+// have coordinates in a picture, which is multiplied with their colours in linear light, where these are
+// interpolated, too.
 const textures = textured => textured ? "#define TEXTURED\n" : "";
-export const meshVertex = (terms, textured) => HEAD + textures(textured) + LENS + `
+export const meshVertex = (terms, textured) => HEAD + textures(textured) + CURVES + LENS + `
 #define TERMS ${terms}
 in vec3 position; in vec4 color;
 #ifdef TEXTURED
@@ -61,6 +62,7 @@ void main() {
   rgba.rgb = max(rgba.rgb + shade(normalize(position - eye)), 0.);
 #endif
 #ifdef TEXTURED
+  rgba.rgb = decode(rgba.rgb);
   uv = coordinate;
 #endif
   gl_Position = clip(seen(position));
@@ -77,7 +79,7 @@ void main() {
   float alpha = solid < 0. ? rgba.a : solid;
   vec3 rgb = rgba.rgb;
 #ifdef TEXTURED
-  rgb = encode(decode(rgb) * decode(texture(picture, uv).rgb));
+  rgb = encode(rgb * decode(texture(picture, uv).rgb));
 #endif
   result = vec4(rgb * alpha, alpha);
 }`;
