@@ -422,6 +422,30 @@ def test_what_webgl_cannot_draw_leaves_the_other_contents(browser, url):
     page.close()
 
 
+DYING = """
+const ask = WebGL2RenderingContext.prototype.getProgramParameter;
+WebGL2RenderingContext.prototype.getProgramParameter = function (...words) {
+  if (!window.dying) return ask.apply(this, words);
+  const loss = this.getExtension('WEBGL_lose_context');
+  for (const [call, time] of [['loseContext', 50], ['restoreContext', 400]])
+    setTimeout(() => { window.dying = false; loss[call](); window.called = call; }, time);
+  return false;
+};
+"""
+
+
+def test_nothing_is_withdrawn_as_a_device_of_webgl_goes(browser, url):
+    page = open_page(browser, url, before=DYING)
+    page.run("window.dying = true")
+    page.key("3")
+    page.wait("window.called === 'restoreContext'", PATIENCE)
+    page.still(PATIENCE)
+    assert page.text("#status") == "splats"
+    assert page.run("document.querySelectorAll('[name=content]:enabled').length") == 3
+    assert page.problems() == []
+    page.close()
+
+
 FULL_FOR_MESHES = """
 const create = FakeDevice.prototype.createBuffer;
 FakeDevice.prototype.createBuffer = function (words) {

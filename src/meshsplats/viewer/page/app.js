@@ -285,7 +285,7 @@ export class App extends Pilot {
       try {
         await this.#frame(now);
       } catch (error) {
-        if (this.#waits() || await this.#without(error)) continue;
+        if (await this.#without(error)) continue;
         say(`Drawing failed: ${error.message}`, true);
         document.body.dataset.state = "failed";
         return;
@@ -295,9 +295,11 @@ export class App extends Pilot {
 
   // Whether drawing goes on without what failed: a part of the image by one of the renderers.
   async #without({ renderer, part, level, message }) {
+    const { sorted } = this;
+    await new Promise(done => setTimeout(done, 200)); // a device that is lost may say so only now
+    if (sorted !== this.sorted || part && sorted.lost || this.#waits()) return true;
     if (renderer) {
-      await new Promise(done => setTimeout(done, 200)); // a device that is lost may say so only now
-      if (renderer === this.exact && !this.sorted) return false;
+      if (renderer === this.exact && !sorted) return false;
       if (renderer === this.exact)
         this.#fall(`The exact image failed (${message}); triangles are drawn by WebGL now.`);
     } else if (part === "mesh" && (this.exact || this.awaited)) {
