@@ -187,6 +187,16 @@ def test_a_material_that_was_changed_stays(ball, capfd):
     assert fresh.use_fake_user
 
 
+def test_a_material_that_was_changed_for_some_faces_is_not_that_of_all(ball, capfd):
+    some = ball.data.materials[0].copy()
+    some.pass_index = 3
+    ball.data.materials[1] = some
+    bpy.ops.object.meshsplats_shading(shading="unlit")
+    assert [material.pass_index for material in ball.data.materials] == [0]
+    assert some.use_fake_user
+    assert f"your material {some.name} stays in the file" in capfd.readouterr().out
+
+
 def test_convert_again_names_what_is_lost(ball, capfd):
     bpy.ops.object.meshsplats_convert_again()
     assert_kept(ball)

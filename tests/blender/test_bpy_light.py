@@ -261,6 +261,25 @@ def test_a_rigid_body_of_splats_is_one_body(ball):
     assert homes.shown_by(bpy.context.view_layer, obj) == home
 
 
+def test_a_collection_of_the_artist_may_be_that_of_physics(ball):
+    obj, view = lit_ball(ball), bpy.context.scene
+    bodies = bpy.data.collections.new("Bodies")
+    view.collection.children.link(bodies)
+    for part in (obj, *obj.children):
+        homes.put(part, {view.collection: "INCLUDE"}, {bodies: "INCLUDE"})
+    bpy.ops.rigidbody.world_add()
+    view.rigidbody_world.collection = bodies  # which makes bodies of all that is in it
+    stand_ins.remove_strays(view)
+    assert not stand_ins.has_strays(view)
+    assert obj.users_collection == (bodies,)
+    assert [child.users_collection for child in obj.children] == [(view.collection,)] * 2
+    before = np.array(obj.matrix_world)
+    for frame in range(1, 9):
+        view.frame_set(frame)
+    assert obj.matrix_world.translation.z < before[2, 3] - 0.01, "they fall"
+    assert obj[stand_ins.SURFACE].matrix_world == obj.matrix_world, "with what is made for them"
+
+
 @pytest.mark.parametrize("rays", [(False, True), (True, False)])
 def test_rays_that_the_artist_has_chosen_see_unlit_splats_again(ball, rays):
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -144,6 +144,20 @@ def test_colours_stay_where_a_rotation_is_applied(followed):
     assert np.abs(mirrored - before.harmonics).max() > 0.2
 
 
+def test_a_file_of_an_earlier_release_may_be_in_edit_mode(followed):
+    """Blender opens a file in the mode that it was saved in: other objects are brought up to date."""
+    edited, other = balls(followed, 2)
+    for obj in (edited, other):
+        obj.data.attributes.remove(obj.data.attributes[turning.REST])
+    other.select_set(False)
+    bpy.ops.object.mode_set(mode="EDIT")
+    far_to_near.renew()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert [turning.REST in obj.data.attributes for obj in (edited, other)] == [False, True]
+    far_to_near.renew()
+    assert turning.REST in edited.data.attributes
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_colours_stay_where_objects_are_joined(followed, count):
     objs = balls(followed, count)

@@ -127,7 +127,8 @@ class SceneOptions:
     """How Blender renders the mesh."""
 
     light: LightOptions | None = None
-    """None: unlit colours, the image of ``meshsplats.render``. Otherwise lit by these."""
+    """None: unlit colours, the image of ``meshsplats.render``. Otherwise lit by these as they are: for an
+    environment image alone, give ``sun_strength`` 0."""
     engine: Engine = "cycles"
     """cycles: exact order and ray-traced light. eevee: fast; triangles are sorted for each camera."""
     samples: Annotated[int, Range(1, 65536)] = 1

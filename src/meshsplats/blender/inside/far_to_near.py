@@ -49,8 +49,10 @@ def renew() -> None:
     """Has the modifiers of files that an earlier release saved sort by where splats are, not by where they
     are at rest, and their meshes know when they are turned, as those of the command."""
     for obj in bpy.data.objects:
-        if obj.type == "MESH" and not obj.data.library and turning.REST not in obj.data.attributes:
-            turning.remember(obj.data)
+        mesh = obj.data if obj.type == "MESH" else None
+        # In edit mode, in which files are opened that were saved in it, attributes cannot be read.
+        if mesh and not (mesh.library or mesh.is_editmode or turning.REST in mesh.attributes):
+            turning.remember(mesh)
         found = modifier_of(obj) if obj.type == "MESH" and not obj.library else None
         if found is None or obj.override_library or _is_latest(found.node_group):
             continue

@@ -132,16 +132,18 @@ def _ours(slots: Any) -> list[int]:
 
 
 def _chosen(old: Iterable[Any], material: Any, *, shared: bool = False) -> Any:
-    """``material``, which is new, or in its place the first of the ``old`` ones that is of its kind and that
-    an artist has changed or renamed. Others of these stay in the file, and a note names them. ``shared``:
-    others use the old ones, too."""
+    """``material``, which is new, or in its place the first of the ``old`` ones if that is of its kind and an
+    artist has changed or renamed it. Others that were changed, such as those of some faces alone, stay in the
+    file, and a note names them. ``shared``: others use the old ones, too."""
     chosen = material
-    for other in filter(_is_changed, old):
-        if chosen == material and other[LOOK] == material[LOOK]:
+    for i, other in enumerate(old):
+        if not _is_changed(other):
+            continue
+        if i == 0 and other[LOOK] == material[LOOK]:
             chosen = _like(other, material, shared=shared or other.users - other.use_fake_user > 1)
         else:
             other.use_fake_user = True
-            notes.add(f"your material {other.name} stays in the file, and gave its place to {material.name}")
+            notes.add(f"your material {other.name} stays in the file, and gave its place to {chosen.name}")
     if chosen != material:
         bpy.data.materials.remove(material)
     return chosen

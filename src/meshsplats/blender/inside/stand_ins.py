@@ -109,7 +109,7 @@ def has_strays(scene: Any) -> bool:
     made = [obj for obj in scene.objects if STAND_IN in obj]
     return any(obj.parent is None for obj in made) or any(
         mine != wanted or not (_is_points(obj) or _is_hidden_alike(obj, obj.parent))
-        for obj, mine, wanted in _places(made)
+        for obj, mine, wanted in _places(scene, made)
     )
 
 
@@ -117,7 +117,7 @@ def follow(scene: Any) -> None:
     """Moves what was made for splats to the collections that they were moved to, so that it is excluded and
     hidden with these, and light linking takes it for them; and hides it in viewports where they are hidden.
     It is no rigid body where they are."""
-    for obj, mine, wanted in _places([obj for obj in scene.objects if obj.get(STAND_IN)]):
+    for obj, mine, wanted in _places(scene, [obj for obj in scene.objects if obj.get(STAND_IN)]):
         if not wanted:  # they were deleted
             continue
         homes.put(obj, mine, wanted)
@@ -132,14 +132,16 @@ def follow(scene: Any) -> None:
             _tie(obj)
 
 
-def _places(made: Iterable[Any]) -> Iterator[tuple[Any, homes.Homes, homes.Homes]]:
+def _places(scene: Any, made: Iterable[Any]) -> Iterator[tuple[Any, homes.Homes, homes.Homes]]:
     """Of those that were ``made`` here and have splats: the object, the collections that it is in, and those
-    that it belongs in."""
+    that it belongs in: where its splats are, or that of the ``scene`` where only physics has these."""
     parts = [obj for obj in made if obj.parent is not None]
     if parts:
         found = homes.of([*parts, *(part.parent for part in parts)])
         for part in parts:
-            yield part, found[part], homes.without_physics(found[part.parent])
+            theirs = found[part.parent]
+            last = {scene.collection: "INCLUDE"} if theirs else {}
+            yield part, found[part], homes.without_physics(theirs) or last
 
 
 def _is_points(obj: Any) -> bool:
