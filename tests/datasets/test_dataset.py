@@ -200,13 +200,25 @@ def test_upright_masks_lie_on_photographs_stored_on_their_side(tmp_path, orienta
     mask = np.zeros((8, 12), np.uint8)
     mask[:3, :5] = 255  # as the photograph is stored
     save(folder / "masks/p00.png", np.rot90(mask, -turns) if turns != 2 else mask)
-    said = pytest.warns(DataWarning, match="taken upside down, and are used as these are stored")
+    said = pytest.warns(DataWarning, match="taken upside down, or .*, and are used as these are stored")
     with said if turns == 2 else nullcontext():
         view = load_dataset(folder, test_every=0).train[0]
     assert np.array_equal(view.mask, mask > 0)
     if turns % 2:
         save(folder / "masks/p00.png", mask)  # as the photograph
         assert np.array_equal(load_dataset(folder, test_every=0).train[0].mask, mask > 0)
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_masks_of_turned_square_photographs_are_named(tmp_path, orientation):
+    folder = simple_colmap(tmp_path, 1, size=(8, 8))
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.open(folder / "images/p00.png").save(folder / "images/p00.png", exif=exif)
+    save(folder / "masks/p00.png", np.full((8, 8), 255, np.uint8))
+    said = pytest.warns(DataWarning, match="1 masks are of .* turned square ones, and are used as these")
+    with said if orientation == 6 else nullcontext():
+        load_dataset(folder, test_every=0)
 
 
 def test_a_photograph_taken_upright_is_shown_so(tmp_path):

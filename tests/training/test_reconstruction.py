@@ -265,7 +265,7 @@ def test_photographs_of_one_size_and_focal_length_share_a_lens(scene):
     write_jpeg(folder / "q0.jpg", 60, 4.2, 26)
     write_jpeg(folder / "q1.jpg", 60, 4.2, 52)
     write_jpeg(folder / "q2.jpg", 60, 4.2)
-    write_jpeg(folder / "q3.jpg", 60, 4.2, 26)
+    write_jpeg(folder / "q3.jpg", 60, 4.2003, 26, {0xA404: 1.004})  # as some cameras focus
     write_jpeg(folder / "q4.jpg", 60, 2.2, 26)  # the wide lens, cut to the same field
     for name, zoom in (("r0", 1.0), ("r1", 2.0), ("r2", 2.0), ("r3", 0.0)):
         write_jpeg(folder / f"{name}.jpg", 60, 5.4, 23, {0xA404: zoom})
@@ -344,17 +344,31 @@ def test_links_out_of_the_folder_are_refused_before_the_search(scene, tmp_path):
     assert not colmap.lenses
 
 
+def panoramas(folder, count):
+    said = b'<x:xmpmeta><rdf:li GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    for i in range(count):
+        Image.new("RGB", (80, 40)).save(folder / f"q{i}.jpg", xmp=said)
+    Image.new("RGB", (80, 40)).save(folder / "r.jpg")
+
+
 def test_panoramas_are_refused_before_the_search(scene):
     folder, colmap, _ = scene()
-    said = b'<x:xmpmeta><rdf:li GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
-    for i in range(2):
-        Image.new("RGB", (80, 40)).save(folder / f"q{i}.jpg", xmp=said)
-    Image.new("RGB", (80, 40)).save(folder / "q2.jpg")
+    panoramas(folder, 7)
     with pytest.raises(
-        ValueError, match=r"2 of 8 photographs are panoramas, .*: q0\.jpg, q1\.jpg; export flat"
+        ValueError, match=r"7 of 13 photographs are panoramas, .*: q0\.jpg, q1\.jpg.*; export flat"
     ):
         find_cameras(folder)
     assert not colmap.lenses
+
+
+def test_panoramas_among_flat_photographs_are_left_out(scene):
+    folder, colmap, _ = scene()
+    panoramas(folder, 2)
+    with pytest.warns(DataWarning) as warned:
+        find_cameras(folder)
+    assert "2 of 8 photographs are panoramas" in str(warned[0].message)
+    assert str(warned[0].message).endswith("not found here: q0.jpg, q1.jpg; they are left out")
+    assert colmap.names == ["p0.png", "p1.png", "p2.png", "p3.png", "p4.png", "r.jpg"]
 
 
 def masked(folder, dark: slice, turn: int = 0) -> np.ndarray:
@@ -377,7 +391,8 @@ def test_features_of_what_passed_by_do_not_count(scene, turn):
             Image.open(folder / f"p{i}.png").save(folder / f"p{i}.png", exif=exif)
     with pytest.warns(DataWarning):
         find_cameras(folder)
-    assert sorted(colmap.masks) == [f"p{i}.png.png" for i in range(4)]
+    assert sorted(colmap.masks) == [f"p{i}.png.png" for i in range(5)]
+    assert colmap.masks.pop("p4.png.png").all()  # that has none
     assert all(np.array_equal(found, mask) for found in colmap.masks.values())
 
 
@@ -391,8 +406,9 @@ def test_the_surroundings_of_a_subject_count_unless_they_stand_still(scene, monk
         find_cameras(folder, said.append)
     assert any("stands still, so features there do not count" in line for line in said) == still
     assert len(colmap.lenses) == 1 + still
+    assert len(colmap.masks) == 5 * still
+    assert not still or colmap.masks.pop("p4.png.png").all()
     assert all(np.array_equal(found, mask) for found in colmap.masks.values())
-    assert len(colmap.masks) == 4 * still
 
 
 @pytest.mark.parametrize(
@@ -431,19 +447,24 @@ def test_surroundings_that_stand_still_are_told_by_their_matches(tmp_path, movin
 
 def test_the_library_heeds_masks(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
-    folder, names = photographs(tmp_path / "scene", 3), ["p0.png", "p1.png", "p2.png"]
+    folder, names = photographs(tmp_path / "scene", 4), [f"p{i}.png" for i in range(4)]
     masked(folder, slice(0, 20))
     (folder / "masks/p3.png").unlink()
     images = [folder / name for name in names]
-    FeatureMasks(folder, names, [(60, 40)] * 3).write(tmp_path / "masks", images)
+    FeatureMasks(folder, names, [(60, 40)] * 4).write(tmp_path / "masks", images)
     heights = []
     for masks in (None, tmp_path / "masks"):
         database = tmp_path / f"{masks is None}.db"
         reconstruction._extract(pycolmap, database, images, [read_shot(path) for path in images], masks, 1)
         with closing(sqlite3.connect(database)) as connection:
-            tables = connection.execute("select rows, cols, data from keypoints").fetchall()
-        points = [np.frombuffer(data, np.float32).reshape(rows, cols) for rows, cols, data in tables]
-        heights.append(np.concatenate(points)[:, 1])
+            query = "select name, rows, cols, data from keypoints join images using (image_id)"
+            tables = connection.execute(query).fetchall()
+        points = {
+            name: np.frombuffer(data, np.float32).reshape(rows, cols) for name, rows, cols, data in tables
+        }
+        whole = points.pop("p3.png")[:, 1]
+        assert (whole < 20).any()  # it has no mask
+        heights.append(np.concatenate(list(points.values()))[:, 1])
     everywhere, inside = heights
     assert (everywhere < 20).any()
     assert len(inside) > 10

@@ -198,8 +198,8 @@ class Album:
     missing: list[str] = field(default_factory=list)
     no_mask: list[str] = field(default_factory=list)
     renamed: list[str] = field(default_factory=list)
-    upside_down: list[str] = field(default_factory=list)
-    """Masks that may be meant as they are stored or upright: of photographs that were taken upside down."""
+    unclear: list[str] = field(default_factory=list)
+    """Masks that may be meant as they are stored or upright: of photographs taken upside down, or square."""
     _shelf: Shelf = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -207,7 +207,7 @@ class Album:
 
     def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
         """Cameras and photographs of each frame, in order."""
-        self.missing, self.no_mask, self.renamed, self.upside_down = [], [], [], []
+        self.missing, self.no_mask, self.renamed, self.unclear = [], [], [], []
         result: list[Taken] = []
         frames = list(frames)
         masks = self._mask_folder(frames, where)
@@ -346,8 +346,8 @@ class Album:
         if photograph.orientation != 3 and not fits(lens, header) and fits(lens, turned):
             return photograph.turn
         check_shape(lens, header, mask)
-        if photograph.orientation == 3:
-            self.upside_down.append(str(mask.relative_to(self.folder)))
+        if photograph.orientation == 3 or fits(lens, turned):
+            self.unclear.append(str(mask.relative_to(self.folder)))
         return 0
 
     def report(self, where: str, found: int, *, needed: bool = True) -> None:
@@ -370,9 +370,9 @@ class Album:
             (self.renamed, "images have another name than the file gives them, and are taken"),
             (self.no_mask, "images have no mask and count wholly"),
             (
-                self.upside_down,
-                "masks are of photographs taken upside down, and are used as these are stored: if they are"
-                " upright, turn them",
+                self.unclear,
+                "masks are of photographs taken upside down, or of turned square ones, and are used as these"
+                " are stored: if they are upright, turn them",
             ),
         ):
             if names:

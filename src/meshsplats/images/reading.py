@@ -176,9 +176,11 @@ def read_shot(path: Path) -> Shot:
 
 
 def _positive(value: Any) -> str:
-    """A number of EXIF data; empty for one that says nothing, as a zoom of 1."""
+    """A number of EXIF data; empty for one that says nothing, as a zoom of 1. To three digits: some cameras
+    write the last ones anew for each photograph, as they focus."""
     number = float(value or 0)
-    return f"{number:g}" if 0 < number < math.inf and number != 1 else ""
+    text = f"{number:.3g}" if 0 < number < math.inf else ""
+    return "" if text == "1" else text
 
 
 def read_exif(path: Path) -> bytes:

@@ -65,14 +65,16 @@ class FeatureMasks:
         return np.asarray(light.resize(self._sizes[place], Image.Resampling.NEAREST))
 
     def write(self, folder: Path, images: Sequence[Path]) -> None:
-        """Writes them to ``folder`` for COLMAP, which knows the photographs as ``images``."""
+        """Writes them to ``folder`` for COLMAP, which knows the photographs as ``images``, and takes none
+        without a mask: those that have none get a light one."""
         from PIL import Image
 
         folder.mkdir()
         for place, image in enumerate(images):
             counts = self.counts(place)
-            if counts is not None:
-                Image.fromarray(counts).convert("L").save(folder / f"{image.name}.png", compress_level=1)
+            if counts is None:
+                counts = np.ones(self._sizes[place][::-1], bool)
+            Image.fromarray(counts).convert("L").save(folder / f"{image.name}.png", compress_level=1)
 
     def surroundings_stand_still(self, database: Path, images: Sequence[Path]) -> bool:
         """Whether most matches outside of the masks, in COLMAP's ``database`` of ``images``, stand still:

@@ -141,15 +141,15 @@ def find_cameras(
 
     Raises:
         MissingDependencyError: pycolmap is not installed.
-        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other; some
+        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other; most
             are panoramas.
         FileFormatError: photographs that are links out of the folder, which are not read as a data set; masks
             that do not fit their photographs.
         FileExistsError: ``sparse_points.ply`` is there already, unless ``replacing`` it.
         OSError: the folder cannot be written.
 
-    Warns with a DataWarning about photographs that are broken, of kinds that are not read, or found no place,
-    and about places that contradict matches.
+    Warns with a DataWarning about photographs that are broken, of kinds that are not read, panoramas, or
+    found no place, and about places that contradict matches.
     """
     began = time.perf_counter()
     photographs = _photographs(folder) if replacing else bare_photographs(folder)
@@ -256,7 +256,7 @@ def _imported() -> Any:
 
 
 def _whole(folder: Path, photographs: list[Path], threads: int | None) -> dict[Path, Shot]:
-    """How ``photographs`` were taken, without those that are broken."""
+    """How ``photographs`` were taken, without those that are broken, or panoramas among flat ones."""
     shots, broken = read_shots(photographs, thread_count(threads))
     if len(shots) < FEWEST and broken:
         reason = next(iter(broken.values()))
@@ -271,12 +271,16 @@ def _whole(folder: Path, photographs: list[Path], threads: int | None) -> dict[P
             DataWarning,
             stacklevel=3,
         )
-    if panoramas := [path.name for path, shot in shots.items() if shot.is_panorama]:
-        raise ValueError(
+    flat = {path: shot for path, shot in shots.items() if not shot.is_panorama}
+    if panoramas := [path.name for path in shots if path not in flat]:
+        text = (
             f"{folder}: {len(panoramas)} of {len(photographs)} photographs are panoramas, whose cameras are"
-            f" not found here: {shortened(panoramas)}; export flat pictures of them, of 90 degrees, say"
+            f" not found here: {shortened(panoramas)}"
         )
-    return shots
+        if len(flat) < max(FEWEST, len(panoramas)):
+            raise ValueError(f"{text}; export flat pictures of them, of 90 degrees, say")
+        warnings.warn(f"{text}; they are left out", DataWarning, stacklevel=3)
+    return flat
 
 
 def _matched(
