@@ -145,17 +145,35 @@ def test_colours_stay_where_a_rotation_is_applied(followed):
 
 
 def test_a_file_of_an_earlier_release_may_be_in_edit_mode(followed):
-    """Blender opens a file in the mode that it was saved in: other objects are brought up to date."""
+    """Blender opens a file in the mode that it was saved in: other objects are brought up to date at once."""
     edited, other = balls(followed, 2)
     for obj in (edited, other):
         obj.data.attributes.remove(obj.data.attributes[turning.REST])
     other.select_set(False)
     bpy.ops.object.mode_set(mode="EDIT")
     far_to_near.renew()
+    assert turning.REST in other.data.attributes
     bpy.ops.object.mode_set(mode="OBJECT")
-    assert [turning.REST in obj.data.attributes for obj in (edited, other)] == [False, True]
-    far_to_near.renew()
+    bpy.context.view_layer.update()
     assert turning.REST in edited.data.attributes
+
+
+def test_colours_of_appended_splats_stay_where_a_rotation_is_applied(followed, tmp_path):
+    """Of a file of the command, or of an earlier release: nothing is called when they are appended."""
+    (saved,) = balls(followed, 1)
+    saved.data.attributes.remove(saved.data.attributes[turning.REST])
+    bpy.data.libraries.write(str(tmp_path / "ball.blend"), {saved})
+    bpy.data.objects.remove(saved)
+    with bpy.data.libraries.load(str(tmp_path / "ball.blend")) as (_, given):
+        given.objects = ["ball"]
+    (obj,) = given.objects
+    followed.collection.objects.link(obj)
+    obj.select_set(True)
+    bpy.context.view_layer.objects.active = obj
+    bpy.context.view_layer.update()
+    before = exporting.exported([obj])
+    bpy.ops.object.transform_apply()
+    assert_seen_alike(obj, before)
 
 
 @pytest.mark.parametrize("count", [2, 3])

@@ -157,8 +157,13 @@ def after_update(depsgraph: Any) -> None:
             for obj in sorted_objects(depsgraph.scene):
                 if obj.data == changed and sorted_copies.is_stale(modifier_of(obj)):
                     sorted_copies.drop(modifier_of(obj))
-            if not changed.is_editmode and set_centers(changed):
+            if changed.is_editmode:
+                continue
+            if set_centers(changed):
                 turning.follow(changed)
+            elif turning.REST not in changed.attributes and not changed.library:
+                # Appended from a file of an earlier release, or of the command.
+                turning.remember(changed)
 
 
 def drop_copies() -> None:
