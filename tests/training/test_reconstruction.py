@@ -345,10 +345,13 @@ def test_links_out_of_the_folder_are_refused_before_the_search(scene, tmp_path):
 
 
 def panoramas(folder, count):
-    said = b'<x:xmpmeta><rdf:li GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
-    for i in range(count):
-        Image.new("RGB", (80, 40)).save(folder / f"q{i}.jpg", xmp=said)
     Image.new("RGB", (80, 40)).save(folder / "r.jpg")
+    flat = (folder / "r.jpg").read_bytes()
+    said = b'<x:xmpmeta><rdf:li GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    segment = b"http://ns.adobe.com/xap/1.0/\0" + said
+    segment = b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment
+    for i in range(count):
+        (folder / f"q{i}.jpg").write_bytes(flat[:2] + segment + flat[2:])
 
 
 def test_panoramas_are_refused_before_the_search(scene):

@@ -159,20 +159,28 @@ def read_shot(path: Path) -> Shot:
     with _opened(path) as image:
         size, kind = _stored_size(image), str(image.format)
         is_panorama = size[0] == 2 * size[1] and _is_equirectangular(image)
+        # EXIF data of TIFF are in the file, which older versions of Pillow close as they load it; those of
+        # PNG may be behind the pixels.
+        lens = _lens(image) if kind == "TIFF" else None
         try:
             image.draft("RGB", (1, 1))
             image.load()
         except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
             raise _broken(path, error) from None
-        try:
-            exif = image.getexif()
-            more = exif.get_ifd(_EXIF_IFD)
-            names = (exif.get(_MAKE), exif.get(_MODEL), more.get(_LENS))
-            numbers = (more.get(_FOCAL), more.get(_FOCAL_OF_FILM), more.get(_ZOOM))
-            lens = (*(str(name or "") for name in names), *map(_positive, numbers))
-            return Shot(size, kind, lens if any(lens) else (), is_panorama)
-        except (OSError, ValueError, SyntaxError, TypeError, ArithmeticError, LookupError, struct.error):
-            return Shot(size, kind, (), is_panorama)  # as any program may write there what it likes
+        return Shot(size, kind, _lens(image) if lens is None else lens, is_panorama)
+
+
+def _lens(image: Any) -> tuple[str, ...]:
+    """``Shot.lens``."""
+    try:
+        exif = image.getexif()
+        more = exif.get_ifd(_EXIF_IFD)
+        names = (exif.get(_MAKE), exif.get(_MODEL), more.get(_LENS))
+        numbers = (more.get(_FOCAL), more.get(_FOCAL_OF_FILM), more.get(_ZOOM))
+        lens = (*(str(name or "") for name in names), *map(_positive, numbers))
+        return lens if any(lens) else ()
+    except (OSError, ValueError, SyntaxError, TypeError, ArithmeticError, LookupError, struct.error):
+        return ()  # as any program may write there what it likes
 
 
 def _positive(value: Any) -> str:
@@ -270,8 +278,9 @@ def _as_stored(image: Any) -> Any:
 
 def _is_equirectangular(image: Any) -> bool:
     """Whether the XMP data of a photograph says that it shows all sides, one angle a pixel."""
-    texts = image.info.get("xmp")
-    return isinstance(texts, bytes) and b"GPano" in texts and b"equirectangular" in texts
+    parts = [content for name, content in getattr(image, "applist", ()) if name == "APP1"]  # of JPEG
+    texts = [*parts, image.info.get("xmp")]
+    return any(isinstance(t, bytes) and b"GPano" in t and b"equirectangular" in t for t in texts)
 
 
 def _has_alpha(image: Any) -> bool:
