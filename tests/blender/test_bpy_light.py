@@ -240,13 +240,20 @@ def test_light_linking_takes_the_stand_in_for_its_splats(ball):
     assert not stand_ins.has_strays(view)
 
 
+def in_a_collection(obj, name):
+    """A new one in the scene, to which ``obj`` and its parts have moved."""
+    scene = bpy.context.scene.collection
+    home = bpy.data.collections.new(name)
+    scene.children.link(home)
+    for part in (obj, *obj.children):
+        homes.put(part, {scene: "INCLUDE"}, {home: "INCLUDE"})
+    return home
+
+
 def test_a_rigid_body_of_splats_is_one_body(ball):
     """And what is made for it is put where it is seen: by name, the collection of physics comes first."""
     obj, view = lit_ball(ball), bpy.context.scene
-    home = bpy.data.collections.new("Splats")
-    view.collection.children.link(home)
-    for part in (obj, *obj.children):
-        homes.put(part, {view.collection: "INCLUDE"}, {home: "INCLUDE"})
+    home = in_a_collection(obj, "Splats")
     bpy.ops.rigidbody.world_add()
     bpy.context.view_layer.objects.active = obj
     bpy.ops.rigidbody.object_add(type="ACTIVE")
@@ -263,10 +270,7 @@ def test_a_rigid_body_of_splats_is_one_body(ball):
 
 def test_a_collection_of_the_artist_may_be_that_of_physics(ball):
     obj, view = lit_ball(ball), bpy.context.scene
-    bodies = bpy.data.collections.new("Bodies")
-    view.collection.children.link(bodies)
-    for part in (obj, *obj.children):
-        homes.put(part, {view.collection: "INCLUDE"}, {bodies: "INCLUDE"})
+    bodies = in_a_collection(obj, "Bodies")
     bpy.ops.rigidbody.world_add()
     view.rigidbody_world.collection = bodies  # which makes bodies of all that is in it
     stand_ins.remove_strays(view)

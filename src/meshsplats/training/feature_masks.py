@@ -15,7 +15,7 @@ from meshsplats.datasets.image_files import Album
 from meshsplats.datasets.photo_file import light_of_mask
 from meshsplats.datasets.views import ImageCache
 from meshsplats.errors import DataWarning
-from meshsplats.training.poses import MAX_IMAGES
+from meshsplats.training.poses import pair_of
 
 MOST_LEFT_OUT = 0.5
 """Masks that leave out less of the photographs than this are of what passed by. Others are of a subject, and
@@ -93,7 +93,7 @@ class FeatureMasks:
                     outside[image] = ~counts[y, x]
             query = "select pair_id, data from two_view_geometries where rows > 0"
             pairs = {
-                divmod(number, MAX_IMAGES): np.frombuffer(data, np.uint32).reshape(-1, 2)
+                pair_of(number): np.frombuffer(data, np.uint32).reshape(-1, 2)
                 for number, data in connection.execute(query)
             }
         ways = np.concatenate([np.zeros(0), *(_ways(points, outside, *pair) for pair in pairs.items())])

@@ -31,8 +31,12 @@ one after the other took 108 s and placed none, with contradictions that were to
 after the other is right, and all together are two wrong."""
 FEWEST_APART = 3
 """Photographs that are named as a group of their own if they have poses together, but not with the rest."""
-MAX_IMAGES = 2**31 - 1
-"""By which COLMAP's database makes one number of the two of a pair."""
+_MAX_IMAGES = 2**31 - 1
+
+
+def pair_of(number: int) -> tuple[int, int]:
+    """The two images of which COLMAP's database makes one ``number``."""
+    return divmod(number, _MAX_IMAGES)
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ def strong_pairs(database: Path) -> dict[tuple[int, int], int]:
     query = "select pair_id, rows from two_view_geometries where rows >= ?"
     with closing(sqlite3.connect(database)) as connection:
         rows = connection.execute(query, (STRONG,)).fetchall()
-    return {((number // MAX_IMAGES), number % MAX_IMAGES): int(count) for number, count in rows}
+    return {pair_of(number): int(count) for number, count in rows}
 
 
 def judge(model: Any, pairs: Mapping[tuple[int, int], int]) -> Poses:
