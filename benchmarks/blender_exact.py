@@ -24,9 +24,9 @@ from _common import SCENES, Report, Stopwatch, arguments, in_turns
 
 from meshsplats import DataWarning, convert, load_mesh, render
 from meshsplats.blender import SceneOptions, draw
-from meshsplats.colors import linear_to_srgb
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.images.reading import load_image
+from meshsplats.scene.colors import linear_to_srgb
 
 
 def rounded(image: np.ndarray) -> np.ndarray:

@@ -27,11 +27,11 @@ from PIL import Image
 from meshsplats import Dataset, GaussianCloud, SplatMesh, View, convert, dome, finetune, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.linear import linear_colors
-from meshsplats.colors import linear_to_srgb
 from meshsplats.datasets.views import ViewImage
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.gaussians import SH_C0
 from meshsplats.images.writing import save_image, strip
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.gaussians import SH_C0
 
 UP = np.array([0.0, 1.0, 0.0], np.float32)
 SPLATS = 20_000

@@ -23,9 +23,9 @@ from PIL import Image
 from meshsplats import convert, load_gaussians, orbit, psnr, render
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.options import LIGHTS
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.images.writing import save_image, strip
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 EVEN = LightOptions(sun_strength=0.0, sky=1.0, ground="none", exposure=0.0)
 COVERED = 0.02

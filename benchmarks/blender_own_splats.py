@@ -24,8 +24,8 @@ from _common import SCENES, Report, Stopwatch, arguments
 from PIL import Image
 
 import meshsplats as ms
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.images.writing import save_image, strip
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 SIDES = 4
 KINDS = ("clean", "noisy", "faulty")

@@ -21,8 +21,8 @@ import meshsplats as ms
 from meshsplats.cluster import Shared
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.finetuning.cells import CellOptions, Cells, CellScene, divide, finetune_cells
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.looks import image_of
+from meshsplats.scene.gaussians import GaussianCloud
 
 NEAR = 1.0
 """Scene units."""

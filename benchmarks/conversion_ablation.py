@@ -21,14 +21,14 @@ from typing import NamedTuple
 import numpy as np
 from _common import DISTANCES, SCENES, Report, Stopwatch, arguments, images, mean_psnr
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import load_gaussians
-from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.rendering import render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 
 _WITHOUT_CAMERAS = ("none", "framing")
 

@@ -13,7 +13,7 @@ from _common import Report, Stopwatch, alone, arguments, peak_bytes
 
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 ROWS: dict[str, dict] = {
     "paper": dict(preset="paper"),

@@ -15,7 +15,7 @@ from pathlib import Path
 from _common import DISTANCES, SCENES, Report, Stopwatch, areas, arguments, images, mean_psnr
 
 import meshsplats as ms
-from meshsplats.mesh import solid_faces
+from meshsplats.scene.mesh import solid_faces
 
 
 def main() -> None:

@@ -21,9 +21,9 @@ from typing import get_args
 import numpy as np
 from _common import FANS, Report, alone, arguments, median_ms, random_fans
 
-from meshsplats.order import Order
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TapedRendering
+from meshsplats.scene.order import Order
 
 GROWTH = {
     "one": (31_250, 0.029, 0.05, 400),

@@ -19,11 +19,11 @@ import numpy as np
 from _common import DATA, PHOTOGRAPHED, SCENES, Report, arguments
 
 import meshsplats as ms
-from meshsplats._geometry import vertex_normals
-from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats._common.geometry import vertex_normals
 from meshsplats.formats.surfaces.tangents import corner_frames, unit
-from meshsplats.mesh import Triangles
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.mesh import Triangles
 
 LIGHTS = np.array([(1, 1, 1), (-1, 0.3, 0.5), (0.2, -0.5, -1.0)])
 STRENGTHS = np.array([0.7, 0.35, 0.25])

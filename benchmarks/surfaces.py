@@ -30,8 +30,8 @@ import numpy as np
 from _common import DATA, PHOTOGRAPHED, SCENES, Report, Scene, Stopwatch, arguments, mean_psnr
 
 import meshsplats as ms
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.datasets.splat_targets import HELD_OUT as HELD_OUT_VIEWS
+from meshsplats.scene.base_mesh import BaseMesh
 from meshsplats.surfaces.options import SurfaceOptions
 
 DISTANCES = ("mid", "close")

@@ -24,12 +24,12 @@ import numpy as np
 from _common import FANS, Report, Stopwatch, arguments, median_ms, random_fans
 
 from meshsplats._core.kernels import compare_images
-from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
-from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TapedRendering
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.order import Order
 
 
 class Step:

@@ -45,11 +45,11 @@ from meshsplats import (
 )
 from meshsplats.datasets.views import ViewImage
 from meshsplats.finetuning.run import Progress
-from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.devices import Device
 from meshsplats.rendering.gpu import GpuRendering, gpu_engine
+from meshsplats.scene.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.settings import DrawSettings

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 import meshsplats as ms
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
 from meshsplats.demo_scene import make_scene
 
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()

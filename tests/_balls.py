@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.datasets.views import View, ViewImage
+from meshsplats.scene.camera import Camera
 
 
 def cameras_around(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 def random_mesh(count: int = 300, seed: int = 0, **fields) -> SplatMesh:

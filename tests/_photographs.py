@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from _datasets import save, write_json
 
-from meshsplats.camera import Camera
+from meshsplats.scene.camera import Camera
 
 
 def write_photographs(folder: Path, cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> Path:

@@ -9,7 +9,7 @@ from _glb import read_glb
 from _zbuffer import _fragments, _pixels
 
 from meshsplats import Camera, SplatMesh
-from meshsplats.colors import linear_to_srgb
+from meshsplats.scene.colors import linear_to_srgb
 
 TYPES = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 COLUMNS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}

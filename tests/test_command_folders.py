@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import meshsplats as ms
-from meshsplats.chains import TABLE, begin_folder, check_folder
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, view_names
+from meshsplats.operations.chains import TABLE, begin_folder, check_folder
 from meshsplats.renders.frames import remove_older
 
 

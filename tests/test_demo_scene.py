@@ -11,8 +11,8 @@ from numpy.polynomial.legendre import legval
 
 from meshsplats import demo_scene, load_gaussians
 from meshsplats.demo_scene._light import KEY_LIGHT, Patch, spherical_harmonics
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from meshsplats._common.options import settings
 from meshsplats._core import library
-from meshsplats._options import settings
 from meshsplats.cli import COMMANDS
 from meshsplats.cli.arguments import options_of
 from meshsplats.cli.messages import flag

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import SplatMesh
 
 FACES = np.array([(0, 1, 2), (0, 2, 3), (5, 6, 7), (8, 9, 10), (8, 10, 11)], np.int32)
 SPLATS = FaceSplats(FACES, np.array([3, 3, 4, 9, 9], np.int32), 13)

@@ -9,13 +9,13 @@ import pytest
 from _splats import few_splats
 
 import meshsplats as ms
-from meshsplats import file_conversion
 from meshsplats.errors import OptionsError
 from meshsplats.evaluation import viewers
 from meshsplats.evaluation.mesh_files import MeshFileOptions
-from meshsplats.file_conversion import ConversionCallbacks, Converter, counts_in_words, seen_from
-from meshsplats.jobs import jobs
-from meshsplats.product import Product
+from meshsplats.operations import conversion as file_conversion
+from meshsplats.operations.batches import jobs
+from meshsplats.operations.conversion import ConversionCallbacks, Converter, counts_in_words, seen_from
+from meshsplats.operations.product import Product
 
 
 def record(job):

@@ -16,20 +16,17 @@ from _priors import bumpy
 from _splats import few_splats
 
 import meshsplats as ms
-from meshsplats._options import Help, settings
+from meshsplats._common.options import Help, settings
 from meshsplats.blender.files import PictureOptions
-from meshsplats.chains import make_chain
 from meshsplats.cluster import Workers
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews, check_photographs
-from meshsplats.edits import EditCallbacks, bake_file, clean_file, simplify_file
 from meshsplats.errors import DataWarning, OptionsError, OptionValueError
 from meshsplats.evaluation.comparison_files import save_comparison
 from meshsplats.evaluation.level_tables import load_table, table_in_words
 from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.evaluation.options import ComparisonOptions
-from meshsplats.file_options import BakingOptions, ChainOptions, LevelTuning, ScoringOptions, SimplifyOptions
 from meshsplats.finetuning.file_tuning import FileTuning
 from meshsplats.finetuning.plans import RunResult
 from meshsplats.finetuning.run import RunOptions
@@ -37,14 +34,23 @@ from meshsplats.finetuning.setup import Setup
 from meshsplats.finetuning.start_options import StartOptions
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.outputs import check_mesh_suffix, check_splat_endings, placed
-from meshsplats.inspection import describe
-from meshsplats.jobs import formats_of
+from meshsplats.operations.batches import formats_of
+from meshsplats.operations.chains import make_chain
+from meshsplats.operations.edits import EditCallbacks, bake_file, clean_file, simplify_file
+from meshsplats.operations.inspection import describe
+from meshsplats.operations.options import (
+    BakingOptions,
+    ChainOptions,
+    LevelTuning,
+    ScoringOptions,
+    SimplifyOptions,
+)
+from meshsplats.operations.product import Product
+from meshsplats.operations.scoring import Scoring
 from meshsplats.prior.options import LayingOptions
 from meshsplats.prior.planning import PriorTraining, pose_files, save_poses
-from meshsplats.product import Product
 from meshsplats.renders.options import ImageOptions
 from meshsplats.renders.saving import ImageRun
-from meshsplats.scoring import Scoring
 from meshsplats.surfaces.files import SurfaceFileOptions
 from meshsplats.surfaces.options import SurfaceOptions
 from meshsplats.tiles.options import TilingOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshsplats._geometry import direction, rotation_rows, vertex_normals
+from meshsplats._common.geometry import direction, rotation_rows, vertex_normals
 
 AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
 """Right, up and forward of someone who looks along +y in a world whose z is up."""

@@ -14,8 +14,8 @@ from meshsplats import convert
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.inspection import describe, in_words
-from meshsplats.installation import examine
+from meshsplats.operations.inspection import describe, in_words
+from meshsplats.operations.installation import examine
 
 
 def test_findings_about_splats_follow_the_arguments_of_the_reader(tmp_path):
@@ -102,7 +102,9 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
 
 
 def test_missing_libraries_are_named_as_pip_takes_them(monkeypatch):
-    monkeypatch.setattr("meshsplats.installation._version", lambda name: None if name == "wgpu" else "1.0")
+    monkeypatch.setattr(
+        "meshsplats.operations.installation._version", lambda name: None if name == "wgpu" else "1.0"
+    )
     found = examine()
     assert found["core"]["works"]
     missing = found["to_install"]
@@ -112,7 +114,9 @@ def test_missing_libraries_are_named_as_pip_takes_them(monkeypatch):
 
 
 def test_what_draws_colours_that_depend_on_the_view_here(monkeypatch):
-    monkeypatch.setattr("meshsplats.installation._version", lambda name: "4.5" if name == "bpy" else None)
+    monkeypatch.setattr(
+        "meshsplats.operations.installation._version", lambda name: "4.5" if name == "bpy" else None
+    )
     found = examine()
     working = [name for name in ("core", "gpu") if found[name]["works"]]
     assert found["harmonics_drawn_by"] == [*working, "Blender (bpy 4.5), unlit"]

@@ -13,7 +13,6 @@ from _stock_viewer import stock_image
 
 from meshsplats import (
     ConversionOptions,
-    chains,
     convert,
     load_gaussians,
     load_mesh,
@@ -23,14 +22,12 @@ from meshsplats import (
     save_gaussians,
     simplify,
 )
-from meshsplats.chains import make_chain
 from meshsplats.cli import main
 from meshsplats.cli.messages import Terminated
 from meshsplats.conversion import merging
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.viewers import AlphaChoice
-from meshsplats.file_options import ChainOptions
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.levels import (
@@ -43,6 +40,9 @@ from meshsplats.levels import (
     plan_levels,
     views_to_score,
 )
+from meshsplats.operations import chains
+from meshsplats.operations.chains import make_chain
+from meshsplats.operations.options import ChainOptions
 
 
 def test_plan():
@@ -246,7 +246,7 @@ def test_a_chain_without_the_command_line(tmp_path):
 
 
 def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
-    import meshsplats.chains as command
+    import meshsplats.operations.chains as command
     from meshsplats.finetuning import Interrupted
 
     out = tmp_path / "chain"
@@ -393,7 +393,7 @@ def test_alpha_modes(splats, tmp_path, capsys):
 def test_levels_with_an_order(splats, tmp_path, capsys, monkeypatch):
     """Tuned through it and converted alone: what an independent viewer shows is what the table says."""
     import meshsplats.levels as module
-    from meshsplats import chains, load_gaussians
+    from meshsplats import load_gaussians
     from meshsplats.finetuning import make_config
 
     def few(*arguments, **options):  # the viewer is slow
@@ -425,7 +425,7 @@ def test_levels_with_an_order(splats, tmp_path, capsys, monkeypatch):
     "error", [KeyboardInterrupt, Terminated(signal.SIGTERM), OSError(28, "full", "level_0.glb")]
 )
 def test_a_chain_that_ends_anywhere_says_how_it_goes_on(splats, tmp_path, capsys, monkeypatch, error):
-    import meshsplats.chains as command
+    import meshsplats.operations.chains as command
 
     def stops(*_, **__):
         raise error

@@ -19,7 +19,7 @@ from meshsplats import (
     render,
     save_mesh,
 )
-from meshsplats._arrays import checked_array
+from meshsplats._common.arrays import checked_array
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 COLORS = np.full((3, 4), 0.5, np.float32)
@@ -31,11 +31,11 @@ def triangle(**changed) -> SplatMesh:
 
 
 def test_everything_is_named_in_a_line():
-    from meshsplats.base_mesh import BaseMesh
     from meshsplats.cameras.trajectories import orbit
     from meshsplats.datasets.splat_targets import splat_views
     from meshsplats.datasets.views import Dataset, ViewImage
     from meshsplats.demo_scene import make_scene
+    from meshsplats.scene.base_mesh import BaseMesh
 
     cloud = make_scene(1234)
     assert repr(cloud) == "GaussianCloud(1,234 splats of degree 3, kernel '3dgs')"

@@ -12,10 +12,10 @@ from _priors import bumpy
 from _rendering import splats
 
 from meshsplats import Camera, SplatMesh, convert, look_at, render
-from meshsplats.binding import ArrayField, Binding
 from meshsplats.errors import DataWarning
 from meshsplats.prior.laying import bind
 from meshsplats.prior.model import MeshPrior
+from meshsplats.scene.binding import ArrayField, Binding
 
 LENGTHS = (2, 3, 1, 4)
 """Triangles of four splats."""

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import pytest
 from _local import script
 
-from meshsplats._options import (
+from meshsplats._common.options import (
     Advanced,
     Fixed,
     Range,

@@ -17,7 +17,7 @@ from meshsplats.formats.outputs import check_outputs
 ROOT = Path(meshsplats.__file__).parent
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 NOT_OURS = {
-    "_foreign.py": {"--load-config", "--output-dir"},  # nerfstudio
+    "_common/foreign.py": {"--load-config", "--output-dir"},  # nerfstudio
     "errors.py": {"--index-url"},  # pip
     "formats/mesh_formats.py": {"--lit"},  # the table of docs/files.md
     "formats/meshes.py": {"--colors"},  # of bake: a whole command to type, whoever says it

@@ -7,7 +7,7 @@ from typing import Literal
 
 import pytest
 
-from meshsplats._option_values import converted, from_text, relative_to, resolve, short
+from meshsplats._common.option_values import converted, from_text, relative_to, resolve, short
 
 KINDS = [
     ("3", int | None, 3),

@@ -17,8 +17,8 @@ import pytest
 from _photographs import write_photographs
 
 import meshsplats
-from meshsplats import _toml as toml
 from meshsplats import cli, demo_scene
+from meshsplats._common import toml
 from meshsplats._core import library
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.errors import MissingDependencyError
@@ -49,7 +49,7 @@ def run(program: str) -> str:
 
 def test_import_loads_no_module_of_ours_before_it_is_used():
     loaded = run("import sys, meshsplats; print(*[m for m in sys.modules if m.startswith('meshsplats')])")
-    assert set(loaded.split()) == {"meshsplats", "meshsplats._lazy"}
+    assert set(loaded.split()) == {"meshsplats", "meshsplats._common.lazy"}
 
 
 def test_everything_public_needs_numpy_alone():

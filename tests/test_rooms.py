@@ -11,26 +11,20 @@ import meshsplats
 
 ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 13
-LOWEST = (
-    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_lazy", "_origin"),
-    *("choices", "colors", "errors", "face_splats", "order", "spherical_harmonics"),
-)
+LOWEST = ("_core", "_files", "errors")
 """Rooms that import no other room."""
 FLOORS = (
-    (
-        *("_json", "_options", "_words", "binding", "camera", "cluster", "draw_order", "gaussians"),
-        "mesh_joining",
-        "mesh_moving",
-    ),
-    ("_option_values", "_toml", "base_mesh", "demo_scene", "images", "mesh"),
+    ("_common", "cluster"),
+    ("scene",),
+    ("demo_scene", "images"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),
     ("viewpoints",),
     ("conversion", "datasets"),
     ("evaluation", "surfaces"),
-    ("finetuning", "jobs", "viewer"),
-    ("file_options", "levels", "prior", "product", "tiles", "training"),
-    ("blender", "chains", "edits", "file_conversion", "inspection", "installation", "renders", "scoring"),
+    ("finetuning", "viewer"),
+    ("levels", "prior", "tiles", "training"),
+    ("blender", "operations", "renders"),
     ("cli",),
     ("__main__",),
 )

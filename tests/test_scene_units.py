@@ -11,7 +11,6 @@ from _balls import ball_view, cameras_around
 from _priors import bumpy
 
 import meshsplats as ms
-from meshsplats.camera import NEAR_SHARE, Camera
 from meshsplats.cli import main
 from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.merging import simplify
@@ -23,6 +22,7 @@ from meshsplats.images.reading import load_image
 from meshsplats.levels import level_targets, make_level, plan_levels
 from meshsplats.prior import bind
 from meshsplats.rendering import reference, render, render_splats
+from meshsplats.scene.camera import NEAR_SHARE, Camera
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.drawing import render_tiles
 from meshsplats.tiles.tileset import Tileset
@@ -231,7 +231,7 @@ def test_a_named_near_plane_that_hides_everything_is_named(tmp_path, capsys):
 
 
 def test_spacing_and_cells_are_those_of_the_rest_beside_strays():
-    from meshsplats._geometry import spacing
+    from meshsplats._common.geometry import spacing
 
     points = splats().means[1:480]
     alone = np.median(spacing(points))

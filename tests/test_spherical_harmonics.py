@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from _splats import harmonics_of_3dgs
 
-from meshsplats.spherical_harmonics import degree_of, harmonic_terms, in_fours, sh_basis
+from meshsplats.scene.spherical_harmonics import degree_of, harmonic_terms, in_fours, sh_basis
 
 
 def sphere(n: int) -> np.ndarray:

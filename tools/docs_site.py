@@ -73,13 +73,13 @@ REFERENCE = {
     "Surfaces": ["make_surface", "SurfaceOptions", "draw_surface", "load_vertex_colored", "save_base"],
     "Mesh priors": ["BaseMesh", "load_base", "bind", "MeshPrior", "load_prior", "train_prior"],
     "Work with files": [
-        *("edits.clean_file", "edits.simplify_file", "edits.bake_file"),
-        *("file_options.SimplifyOptions", "file_options.BakingOptions"),
+        *("operations.edits.clean_file", "operations.edits.simplify_file", "operations.edits.bake_file"),
+        *("operations.options.SimplifyOptions", "operations.options.BakingOptions"),
         *("renders.saving.ImageRun", "renders.options.ImageOptions"),
         *("evaluation.comparison_files.save_comparison", "evaluation.options.ComparisonOptions"),
-        *("scoring.Scoring", "file_options.ScoringOptions"),
-        *("chains.make_chain", "file_options.ChainOptions"),
-        *("prior.planning.save_poses", "prior.planning.pose_files", "inspection.describe"),
+        *("operations.scoring.Scoring", "operations.options.ScoringOptions"),
+        *("operations.chains.make_chain", "operations.options.ChainOptions"),
+        *("prior.planning.save_poses", "prior.planning.pose_files", "operations.inspection.describe"),
     ],
     "Errors": [
         *("FileFormatError", "MissingDependencyError", "DivergenceError", "DeviceError", "ClusterError"),

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from meshsplats._options import Range, Setting, reachable, settings
+from meshsplats._common.options import Range, Setting, reachable, settings
 from meshsplats.cli import COMMANDS
 from meshsplats.cli.arguments import options_of
 from meshsplats.cli.messages import flag

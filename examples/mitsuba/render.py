@@ -20,8 +20,8 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.cameras.framing import front_axes, scene_bounds
-from meshsplats.colors import srgb_to_linear
 from meshsplats.demo_scene import make_scene
+from meshsplats.scene.colors import srgb_to_linear
 
 SUN, SUN_STRENGTH, SUN_SIZE, SKY, GROUND = (-50.0, 45.0), 2.5, 2.0, 0.35, 0.6
 """As in meshsplats.blender.LightOptions: azimuth and elevation, W/m^2, degrees, radiance; reflectance."""

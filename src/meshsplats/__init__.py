@@ -10,11 +10,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from meshsplats._lazy import lazy_names
+from meshsplats._common.lazy import lazy_names
 
 if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at run time
-    from meshsplats.base_mesh import BaseMesh
-    from meshsplats.camera import Camera
     from meshsplats.cameras.files import load_cameras, save_cameras
     from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
     from meshsplats.cluster import Workers, open_workers
@@ -55,9 +53,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.formats.scenes import save_scene
     from meshsplats.formats.streaming import SplatStream, stream_gaussians
     from meshsplats.formats.tensors import gaussians_from_tensors, gaussians_to_tensors
-    from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
-    from meshsplats.mesh import SplatMesh
     from meshsplats.prior import MeshPrior, load_prior, train_prior
     from meshsplats.prior.laying import bind
     from meshsplats.rendering import Rendering, render, render_splats
@@ -66,6 +62,10 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.ordering import drawing_order
     from meshsplats.rendering.plain_colors import plain_colors_of
     from meshsplats.rendering.samples import needed_samples
+    from meshsplats.scene.base_mesh import BaseMesh
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
     from meshsplats.surfaces import SurfaceOptions, draw_surface, make_surface
     from meshsplats.tiles.building import build_tiles
     from meshsplats.tiles.drawing import render_tiles, tiles_mesh
@@ -78,8 +78,8 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
 __version__: str
 
 _HOME = {
-    "meshsplats.base_mesh": ("BaseMesh",),
-    "meshsplats.camera": ("Camera",),
+    "meshsplats.scene.base_mesh": ("BaseMesh",),
+    "meshsplats.scene.camera": ("Camera",),
     "meshsplats.cameras.files": ("load_cameras", "save_cameras"),
     "meshsplats.cameras.trajectories": ("dome", "look_around", "look_at", "orbit"),
     "meshsplats.cluster": ("Workers", "open_workers"),
@@ -108,9 +108,9 @@ _HOME = {
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
     "meshsplats.formats.streaming": ("SplatStream", "stream_gaussians"),
     "meshsplats.formats.tensors": ("gaussians_from_tensors", "gaussians_to_tensors"),
-    "meshsplats.gaussians": ("GaussianCloud",),
+    "meshsplats.scene.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
-    "meshsplats.mesh": ("SplatMesh",),
+    "meshsplats.scene.mesh": ("SplatMesh",),
     "meshsplats.prior": ("MeshPrior", "load_prior", "train_prior"),
     "meshsplats.prior.laying": ("bind",),
     "meshsplats.rendering": ("Rendering", "render", "render_splats"),

@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.footprint import FILTER_PX2
 from meshsplats.conversion.merging import simplify_large
 from meshsplats.datasets.splat_targets import HELD_OUT, shown_degree, splat_dataset
 from meshsplats.datasets.views import Dataset, View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import compare, images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning import (
@@ -31,9 +29,11 @@ from meshsplats.finetuning import (
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starting_sides
 from meshsplats.finetuning.on_splats import with_colors
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.ordering import drawing_order
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 SMALLEST = 16
 """Minimum image width of a level in pixels."""

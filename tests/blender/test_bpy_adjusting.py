@@ -12,7 +12,7 @@ from _blender_scenes import random_mesh
 
 from meshsplats.blender.inside import meshes, objects
 from meshsplats.blender.inside.adjusting import Adjustment, adjust
-from meshsplats.colors import srgb_to_linear
+from meshsplats.scene.colors import srgb_to_linear
 
 LUMA = np.array([0.213, 0.715, 0.072])
 CHANGE = Adjustment(hue=40, saturation=0.6, brightness=0.9, contrast=0.8, opacity=0.5)
@@ -88,7 +88,7 @@ def test_colours_that_depend_on_the_view_change_alike():
 
 def test_meshes_for_linear_light_change_as_they_look():
     data, linear, _ = data_of(False, blending="linear")
-    from meshsplats.colors import linear_to_srgb
+    from meshsplats.scene.colors import linear_to_srgb
 
     adjust(data, CHANGE)
     after = objects.unlit_colors(data)[:, :3]

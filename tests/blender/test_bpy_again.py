@@ -14,9 +14,9 @@ import bmesh
 from _blender_scenes import ball_splats
 
 from meshsplats import bind, orbit, psnr, render, save_gaussians, save_mesh
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender.inside import exporting, meshes, objects, sources
 from meshsplats.conversion.recovery import recover_splats
+from meshsplats.scene.base_mesh import BaseMesh
 
 
 @pytest.fixture

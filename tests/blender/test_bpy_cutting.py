@@ -18,7 +18,7 @@ from meshsplats import convert
 from meshsplats.blender.inside import cutting, objects, stand_ins
 from meshsplats.conversion.cleaning_rules import FLOATERS
 from meshsplats.formats.gaussians import load_gaussians
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints import finding
 from meshsplats.viewpoints.search import FEW, find_places
 

@@ -18,11 +18,11 @@ from meshsplats import convert, load_gaussians, orbit, render
 from meshsplats.blender import SceneOptions, draw
 from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.images.reading import load_image
 from meshsplats.images.writing import to_bytes
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.mesh import SplatMesh
 
 
 def images(mesh, views, folder: Path, options: SceneOptions | None = None, suffix=".exr"):

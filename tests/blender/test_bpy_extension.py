@@ -23,8 +23,8 @@ from _blender_scenes import ball_splats, random_mesh
 from _local import script
 
 from meshsplats import convert, load_mesh, save_gaussians, save_mesh
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.prior import bind
+from meshsplats.scene.base_mesh import BaseMesh
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("_extension_session.py")

@@ -15,8 +15,8 @@ from _blender_scenes import ball_splats, cameras, random_mesh
 from meshsplats import convert, render, save_mesh
 from meshsplats.blender.inside import adjusting, foreign, frame, meshes, objects, rendering, stage, versions
 from meshsplats.blender.inside.adjusting import Adjustment
-from meshsplats.colors import srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.scene.colors import srgb_to_linear
 
 UP = (0.0, -1.0, 0.0)
 

@@ -13,9 +13,9 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats
 
 from meshsplats import convert
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender.inside import objects, priors, versions
 from meshsplats.prior import bind
+from meshsplats.scene.base_mesh import BaseMesh
 
 
 @pytest.fixture

@@ -26,9 +26,9 @@ from meshsplats.blender.inside import (
     stand_ins,
     versions,
 )
-from meshsplats.camera import Camera
-from meshsplats.colors import linear_to_srgb
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.mesh import SplatMesh
 
 SIDE = 48
 

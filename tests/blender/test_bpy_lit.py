@@ -15,8 +15,8 @@ from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import materials, meshes, rendering, scene, stage, versions
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 
 def built(mesh, view, options):

@@ -29,7 +29,7 @@ from meshsplats.blender.inside import (
     versions,
 )
 from meshsplats.blender.inside import splat_points as reader
-from meshsplats.colors import linear_to_srgb
+from meshsplats.scene.colors import linear_to_srgb
 
 
 @pytest.fixture

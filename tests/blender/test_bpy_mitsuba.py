@@ -18,7 +18,7 @@ from _blender_scenes import ball_splats
 from meshsplats import convert, orbit, render, save_cameras, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import materials, rendering, scene, stage, stand_ins
-from meshsplats.colors import srgb_to_linear
+from meshsplats.scene.colors import srgb_to_linear
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "mitsuba" / "render.py"
 SAMPLES = 48

@@ -17,7 +17,6 @@ from _blender_scenes import ball_splats
 from mathutils import Matrix
 
 from meshsplats import bind, convert, load_gaussians, load_mesh, look_at, save_gaussians, save_mesh
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender import subject
 from meshsplats.blender.inside import (
     adjusting,
@@ -38,8 +37,9 @@ from meshsplats.conversion import merging_views
 from meshsplats.conversion.cleaning import find
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.reading import load_image
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.gaussians import GaussianCloud
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 import bmesh
 
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.blender.inside import objects, priors
-from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 def sheet(n: int = 6) -> BaseMesh:

@@ -29,8 +29,8 @@ from meshsplats.blender.inside import materials, meshes, rendering
 from meshsplats.blender.plan import PHASES
 from meshsplats.cli import main
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.reading import load_image
+from meshsplats.scene.gaussians import GaussianCloud
 
 
 def environment(path):

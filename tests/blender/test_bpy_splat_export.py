@@ -12,8 +12,8 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert
 from meshsplats.blender.inside import exporting, frame, objects
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 
 def test_moved_splats_keep_shape_and_what_they_show_from_each_side():

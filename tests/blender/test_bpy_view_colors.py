@@ -31,7 +31,7 @@ from meshsplats.blender.inside import (
 from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.spherical_harmonics import moved_harmonics
+from meshsplats.scene.spherical_harmonics import moved_harmonics
 
 
 def colorful(degree: int):

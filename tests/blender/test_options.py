@@ -7,11 +7,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from meshsplats._geometry import direction
+from meshsplats._common.geometry import direction
 from meshsplats.blender import LightOptions, SceneOptions
 from meshsplats.blender.options import LIGHTS, check_environment
 from meshsplats.cameras.framing import front_axes
-from meshsplats.colors import linear_to_srgb
+from meshsplats.scene.colors import linear_to_srgb
 
 
 @pytest.mark.parametrize(

@@ -9,19 +9,19 @@ import pytest
 from _blender_scenes import ball_splats
 
 from meshsplats import GaussianCloud, convert, orbit, render, save_gaussians, save_mesh
+from meshsplats._common.geometry import vertex_normals
 from meshsplats._core.surfaces import Grid
-from meshsplats._geometry import vertex_normals
 from meshsplats.blender import subject
 from meshsplats.blender.files import PictureOptions, PictureRun
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.blender.stand_in import _Feet, field_around, stand_in, surface_net
 from meshsplats.blender.subject import ground_height, prepare
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import shading_normals
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.viewpoints.finding import FoundCameras
 
 

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import bind, convert
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.framing import front_axes, guess_up, scene_bounds, weighted_quantile
 from meshsplats.cameras.placing import inside_cameras, outside_cameras
 from meshsplats.cameras.trajectories import distance_of, dome, look_around, look_at, orbit
 from meshsplats.errors import FileFormatError
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 OURS = {
     "name": "a",

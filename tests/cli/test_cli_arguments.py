@@ -13,8 +13,8 @@ import pytest
 import tyro
 from _splats import few_splats
 
-from meshsplats import _toml as toml
-from meshsplats._options import alternatives
+from meshsplats._common import toml
+from meshsplats._common.options import alternatives
 from meshsplats.cli import COMMANDS, main
 from meshsplats.cli.arguments import (
     _PARSED,

@@ -17,8 +17,8 @@ import pytest
 from _local import make_link
 from _splats import few_splats
 
-from meshsplats import _toml as toml
-from meshsplats._words import naming
+from meshsplats._common import toml
+from meshsplats._common.words import naming
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
@@ -28,7 +28,7 @@ from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.streaming import stream_gaussians
-from meshsplats.jobs import jobs, sources
+from meshsplats.operations.batches import jobs, sources
 
 
 def run(*arguments) -> int:

@@ -9,7 +9,7 @@ import pytest
 from _splats import few_splats
 from PIL import Image
 
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main

@@ -15,7 +15,7 @@ from _splats import few_splats
 from PIL import Image
 
 import meshsplats
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
@@ -28,10 +28,10 @@ from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import previews, render
 from meshsplats.rendering.looks import draw_splats
 from meshsplats.rendering.samples import needed_samples
+from meshsplats.scene.mesh import SplatMesh
 
 
 @pytest.fixture
@@ -399,7 +399,7 @@ def test_a_file_that_no_viewer_opens_says_so(tmp_path, capsys, monkeypatch):
     source = tmp_path / "balls.ply"
     save_gaussians(few_splats(), source)
     for limit, said in ((10**6, False), (1000, True)):
-        monkeypatch.setattr("meshsplats.file_conversion.LARGE_BYTES", limit)
+        monkeypatch.setattr("meshsplats.operations.conversion.LARGE_BYTES", limit)
         assert run(source, "-o", tmp_path / "m.glb", "--no-preview", "--force") == 0
         err = capsys.readouterr().err
         assert ("too large for viewers" in err) == ("--max-triangles 2000000 merges" in err) == said
@@ -410,7 +410,7 @@ def test_a_file_that_no_viewer_opens_says_so(tmp_path, capsys, monkeypatch):
 def test_the_size_is_said_before_anything_is_written(tmp_path, capsys, monkeypatch):
     source, out = tmp_path / "balls.ply", tmp_path / "m.glb"
     save_gaussians(nested_balls(0.95), source)
-    monkeypatch.setattr("meshsplats.file_conversion.LARGE_BYTES", 1000)
+    monkeypatch.setattr("meshsplats.operations.conversion.LARGE_BYTES", 1000)
     monkeypatch.setattr(
         "meshsplats.evaluation.mesh_files.MeshFileOptions.save", lambda *_: pytest.fail("stop")
     )

@@ -18,7 +18,7 @@ from _local import words_of
 from _photographs import write_photographs
 from PIL import Image
 
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats._files.locks import locked
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit

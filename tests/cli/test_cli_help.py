@@ -9,8 +9,9 @@ import sys
 from meshsplats.cli import COMMANDS
 
 WORKING_ROOMS = (
-    *("_core", "cameras", "chains", "cluster", "demo_scene", "edits", "file_conversion", "images"),
-    *("inspection", "installation", "jobs", "levels", "scoring", "viewpoints", "webgpu"),
+    *("_core", "cameras", "cluster", "demo_scene", "images", "levels", "viewpoints", "webgpu"),
+    *("operations.batches", "operations.chains", "operations.conversion", "operations.edits"),
+    *("operations.inspection", "operations.installation", "operations.scoring"),
     *("conversion.converting", "conversion.driver", "datasets.folder", "datasets.views"),
     *("evaluation.comparison", "evaluation.report", "finetuning.plans", "finetuning.run"),
     *("formats.content", "formats.gltf", "formats.meshes", "formats.ply", "prior.laying", "prior.model"),

@@ -18,7 +18,7 @@ from _datasets import simple_colmap
 from _photographs import write_photographs
 
 import meshsplats
-from meshsplats._words import command_line, parse_color, parse_up, quoted
+from meshsplats._common.words import command_line, parse_color, parse_up, quoted
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main, messages
@@ -27,8 +27,8 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import PACKAGE, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 def cloud(n: int = 30) -> GaussianCloud:
@@ -300,7 +300,7 @@ def test_doctor(capsys, monkeypatch):
     assert f"gpu: {found['gpu']['adapter'] or found['gpu']['problem']}" in out
     assert f"the view: drawn by {', '.join(found['harmonics_drawn_by'])}; other" in out
 
-    from meshsplats import installation
+    from meshsplats.operations import installation
 
     needed = [f"no-such-thing>=1; extra == {extra!r}" for extra in ("gpu", "blender")]
     monkeypatch.setattr(installation.metadata, "requires", lambda _: needed)

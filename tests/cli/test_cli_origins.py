@@ -29,8 +29,8 @@ from meshsplats import (
 from meshsplats.cli import main
 from meshsplats.finetuning.checkpoint import dataset_fingerprint, mesh_fingerprint
 from meshsplats.formats.sniff import identify
-from meshsplats.gaussians import SH_C0
 from meshsplats.images.reading import load_image
+from meshsplats.scene.gaussians import SH_C0
 from meshsplats.tiles.drawing import join_tiles
 from meshsplats.viewer import page
 from meshsplats.viewer.page import Page, make_page

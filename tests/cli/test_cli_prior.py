@@ -13,7 +13,7 @@ from _photographs import write_photographs
 from _priors import bumpy
 
 from meshsplats import SplatMesh, load_mesh, orbit, render, save_mesh
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians

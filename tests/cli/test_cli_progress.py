@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from meshsplats import _words
-from meshsplats._words import Phase, duration
+from meshsplats._common import words
+from meshsplats._common.words import Phase, duration
 from meshsplats.cli import progress
 from meshsplats.cli.progress import progress_display
 
@@ -20,7 +20,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     found = Clock()
-    for module in (_words, progress):
+    for module in (words, progress):
         monkeypatch.setattr(module, "time", found)
     return found
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import look_at, orbit
 from meshsplats.cli import main
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import to_bytes
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 from _local import shared_data
 from _splats import few_splats
 
-from meshsplats import _toml as toml
 from meshsplats import load_gaussians, orbit, save_cameras, save_gaussians, simplify
+from meshsplats._common import toml
 from meshsplats.cli import main
 from meshsplats.conversion.merging_views import merging_views
 

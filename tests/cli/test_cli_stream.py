@@ -12,7 +12,7 @@ import pytest
 from meshsplats import convert, save_gaussians, save_mesh, save_mesh_blocks
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 @pytest.fixture

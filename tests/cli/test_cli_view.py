@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshsplats import _toml as toml
-from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats._common import toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import look_at, orbit
 from meshsplats.cli import main
@@ -27,6 +26,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.formats.base_meshes import save_base
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
+from meshsplats.scene.base_mesh import BaseMesh, Texture
 from meshsplats.viewer import content
 from meshsplats.viewer.unpacking import unpack_mesh
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshsplats._cells import Cells
+from meshsplats._common.cells import Cells
 from meshsplats._core import library
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
@@ -20,9 +20,9 @@ from meshsplats.conversion.cleaning import cropped, find, remove
 from meshsplats.conversion.cleaning_rules import CleaningRules
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.reading import load_image
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 def splats(

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats.camera import Camera
 from meshsplats.conversion import convert
 from meshsplats.conversion.fans import semi_axes
-from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 HALF = 0.5**0.5
 

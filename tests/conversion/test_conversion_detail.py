@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, SplatMesh, convert, draw_splats, render
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.conversion.detail import (
     FEWEST_IMAGES,

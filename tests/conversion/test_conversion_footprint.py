@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats._geometry import spacing
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import spacing
 from meshsplats.cameras.trajectories import look_at, orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion import footprint as module
 from meshsplats.conversion.footprint import CameraCoverage
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 def cloud_at(means, scale=0.1, opacity=0.5, kernel="3dgs", scales=None) -> GaussianCloud:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from _splats import few_splats
 
-from meshsplats.camera import Camera
 from meshsplats.conversion import PRESETS, ConversionOptions, convert
-from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import LEAST_OPACITY, GaussianCloud
 
 CAMERA = Camera(np.eye(4), 100, 100, 32, 32, 64, 64)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshsplats.conversion import Profile, convert, fidelity, fit_profile
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 PAPER = Profile(8, (2.7,), (1.0, 0.2))
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from _local import shared_data
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.looks import draw_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 MARGIN_WITHOUT = 1.5
 """How much better the default must be than paper where no cameras are known, dB."""

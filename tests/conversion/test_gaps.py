@@ -11,7 +11,7 @@ from meshsplats.conversion.gaps import gap_share, with_usual_look, without_gaps
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewer.content import content_of_splats
 
 

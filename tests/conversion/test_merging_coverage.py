@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import meshsplats as ms
-from meshsplats.camera import Camera
 from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
+from meshsplats.scene.camera import Camera
 
 
 def parts_of(group, means, variances, opacities) -> Parts:

@@ -11,10 +11,10 @@ from _blender_scenes import ball_splats, sheets
 from meshsplats import convert
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.subject import lit_subject
-from meshsplats.colors import srgb_to_linear
 from meshsplats.conversion.normals import shading_normals, surfels_of, typical_spacing
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
 
 
 def angles(mesh, normals, true):

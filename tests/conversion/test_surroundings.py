@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.conversion import convert
@@ -21,10 +20,11 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.reading import load_image
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints import finding
 from meshsplats.viewpoints.search import FEW, find_places
 

@@ -26,9 +26,9 @@ from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.reading import read_header, read_shot
 from meshsplats.rendering.previews import save_preview
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.sheet import contact_sheet
 
 

@@ -12,7 +12,7 @@ from _photographs import write_photographs
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.datasets.scene_views import SceneViews, cameras_named
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 SQUARE = SplatMesh(
     np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32),

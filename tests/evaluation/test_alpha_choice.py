@@ -9,7 +9,7 @@ import pytest
 from _local import shared_data
 
 from meshsplats import GaussianCloud, SplatMesh, convert, load_gaussians, load_mesh, orbit, render, save_mesh
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation import viewers
 from meshsplats.evaluation.viewers import AlphaChoice, area_means, choose_alpha

@@ -11,7 +11,7 @@ import pytest
 from _datasets import simple_colmap
 from _photographs import write_photographs
 
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert

@@ -10,13 +10,13 @@ import pytest
 
 from meshsplats import DataWarning, convert, splat_dataset
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.comparison import Comparison, ViewSimilarity, compare, compare_views
 from meshsplats.evaluation.metrics import ssim
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.looks import draw_splats
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 def scene() -> tuple[GaussianCloud, SplatMesh, list]:

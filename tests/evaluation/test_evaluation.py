@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from _datasets import simple_colmap
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
@@ -30,10 +28,12 @@ from meshsplats.evaluation.report import (
     masked_ssim,
 )
 from meshsplats.evaluation.strips import image_folder, markdown_table, worst_window
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_image
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 CAMERA = Camera(np.eye(4), 10, 10, 12, 8, 24, 16, name="a/one.png")
 

@@ -10,7 +10,7 @@ from _splats import few_splats
 from meshsplats import convert, load_mesh
 from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.formats.gltf.document import GltfDocument
-from meshsplats.mesh import solid_faces
+from meshsplats.scene.mesh import solid_faces
 
 
 def test_solid_triangles_are_cut_before_they_are_saved():

@@ -23,11 +23,11 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width, warn_of_trained_on
-from meshsplats.file_options import ScoringOptions
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
+from meshsplats.operations.options import ScoringOptions
+from meshsplats.operations.scoring import Scoring
 from meshsplats.rendering import render_splats
-from meshsplats.scoring import Scoring
 
 MANY = "is scored on views that it was trained on"
 

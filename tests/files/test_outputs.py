@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from _splats import few_splats
 
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats._files import atomic
 from meshsplats._files.atomic import (
     atomic_path,
@@ -43,7 +43,7 @@ from meshsplats.formats.mesh_formats import written_mesh_suffixes
 from meshsplats.formats.meshes import expected_bytes, load_mesh, save_mesh, save_mesh_blocks
 from meshsplats.formats.outputs import check_outputs
 from meshsplats.images.writing import encode_array, save_animation, save_image
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
 COMMAND = [sys.executable, "-m", "meshsplats"]

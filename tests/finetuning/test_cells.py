@@ -39,7 +39,7 @@ from meshsplats.finetuning import cells as in_cells
 from meshsplats.finetuning.cells import CellOptions, CellScene, divide, finetune_cells, waves
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.reports import held_out_scores
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 COUNT, MOST = 3000, 1100
 CONFIG = make_config(steps=40)

@@ -14,7 +14,6 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
@@ -37,8 +36,9 @@ from meshsplats.finetuning.step import (
     target_of,
     view_of_step,
 )
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_linear_light(scene):
 
 
 def test_the_slope_of_the_encoding_is_finite():
-    from meshsplats.colors import encoding_slope, linear_to_srgb
+    from meshsplats.scene.colors import encoding_slope, linear_to_srgb
 
     values = np.linspace(0.01, 1, 100)
     step = 1e-3
@@ -136,9 +136,9 @@ def test_the_slope_of_the_encoding_is_finite():
 def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeypatch):
     """Loss, and its gradients by positions, colours and exposure, against autograd through rasterize."""
     torch = pytest.importorskip("torch", reason="torch's gradients are the model here")
-    from meshsplats.colors import srgb_to_linear
     from meshsplats.finetuning.losses import photometric_loss
     from meshsplats.rendering.autograd import rasterize
+    from meshsplats.scene.colors import srgb_to_linear
 
     _, dataset, mesh = scene
     mesh = mesh.of_degree(0) if blending == "linear" else mesh

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import ConversionOptions, convert
@@ -31,9 +30,10 @@ from meshsplats.finetuning.initial import (
 )
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
-from meshsplats.gaussians import DILATION
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import DILATION
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training import train_config
 
 ROOT = Path(__file__).parents[2]

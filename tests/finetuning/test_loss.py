@@ -14,7 +14,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError, OtherRunError
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.loss import DefaultLoss, Target, loss_name
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 QUIET = RunOptions(report_every=0)
 

@@ -29,8 +29,8 @@ from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.formats.cutting import cut_mesh
-from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering import render
+from meshsplats.scene.mesh import SplatMesh, solid_faces
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats.finetuning.outlines import BEHIND, MAX_CORNERS, MAX_GROWTH, _fans, fewer_triangles
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.mesh import SplatMesh
 
 
 def fan(radii, middle=(0.0, 0.0, 5.0), rim=(0.2, 0.4, 0.6), tip=None, splat=0) -> SplatMesh:

@@ -12,7 +12,7 @@ from meshsplats.datasets.views import WHITE
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import OptionsError
 from meshsplats.finetuning.targets import Targets
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 CLOUD = make_scene().take(np.arange(0, 4000, 40))
 

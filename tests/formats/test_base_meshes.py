@@ -13,9 +13,9 @@ from _local import make_link, shared_data
 from PIL import Image
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, orbit, render, save_mesh
-from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.prior import bind
+from meshsplats.scene.base_mesh import BaseMesh, Texture
 
 PIXELS = np.array(
     [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8

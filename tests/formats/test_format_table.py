@@ -29,7 +29,7 @@ from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import FORMATS, SplatFormat, listed, splat_suffixes, zipped_suffixes
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.splats._cloud_builder import SplatReader
-from meshsplats.jobs import sources
+from meshsplats.operations.batches import sources
 
 ROOT = Path(__file__).resolve().parents[2]
 POINTS = np.random.default_rng(5).normal(size=(300, 3))

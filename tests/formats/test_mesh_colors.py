@@ -3,8 +3,8 @@
 import numpy as np
 
 from meshsplats import SplatMesh, load_mesh, save_mesh
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.formats.gltf.writer import linear_colors
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 
 def test_values_of_the_standard():

@@ -12,10 +12,10 @@ from _glb import edit_glb
 from _meshes import fan_mesh, random_mesh
 
 from meshsplats import DataWarning, MissingDependencyError, SplatMesh, load_mesh, save_mesh
-from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._orientation import up_rotation
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.writer import change_alpha
+from meshsplats.scene.colors import srgb_to_linear
 
 MESH = random_mesh(np.random.default_rng(0), 20, 30)
 

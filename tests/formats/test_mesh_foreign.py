@@ -15,9 +15,9 @@ from _meshes import random_mesh
 from _splat_files import random_splats
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
-from meshsplats.colors import linear_to_srgb
 from meshsplats.formats import _validation
 from meshsplats.formats.sniff import identify
+from meshsplats.scene.colors import linear_to_srgb
 
 
 def load(tmp_path, document):

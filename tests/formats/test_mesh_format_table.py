@@ -32,8 +32,8 @@ from meshsplats.formats.mesh_formats import (
 )
 from meshsplats.formats.outputs import Ending, MeshEnding
 from meshsplats.formats.sniff import identify
-from meshsplats.jobs import sources
-from meshsplats.mesh import SplatMesh
+from meshsplats.operations.batches import sources
+from meshsplats.scene.mesh import SplatMesh
 
 ROOT = Path(__file__).resolve().parents[2]
 MARK = b"tin\0"

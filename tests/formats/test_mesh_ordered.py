@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import DataWarning, FileFormatError, SplatMesh, load_mesh, save_mesh
-from meshsplats.draw_order import DrawOrder
 from meshsplats.formats.gltf import copies
 from meshsplats.formats.gltf.reader import listed_order
 from meshsplats.formats.meshes import expected_bytes
+from meshsplats.scene.draw_order import DrawOrder
 
 
 def random_order(rng, f: int, nodes: int) -> DrawOrder:

@@ -20,12 +20,12 @@ from meshsplats import (
     save_gaussians,
     save_mesh,
 )
-from meshsplats.binding import ArrayField, Binding
 from meshsplats.formats import npz
 from meshsplats.formats.gltf import binary_chunk, own, reader
 from meshsplats.formats.mesh_formats import mesh_format_to_write
 from meshsplats.formats.ply import header
 from meshsplats.formats.sniff import identify
+from meshsplats.scene.binding import ArrayField, Binding
 
 SUFFIXES = (".npz", ".ply", ".glb")
 

@@ -35,7 +35,6 @@ from meshsplats import (
     save_mesh,
     stream_gaussians,
 )
-from meshsplats._origin import choose_origin, in_words, need_detail
 from meshsplats.cameras.framing import default_up
 from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.evaluation.metrics import psnr
@@ -45,6 +44,7 @@ from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.meshes import save_mesh_blocks
 from meshsplats.formats.outputs import placed
 from meshsplats.formats.tensors import gaussians_from_tensors
+from meshsplats.scene.origin import choose_origin, in_words, need_detail
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.options import TileOptions
 

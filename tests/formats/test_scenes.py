@@ -12,9 +12,9 @@ from _splats import few_splats
 from PIL import Image
 
 import meshsplats as ms
-from meshsplats.base_mesh import Texture
 from meshsplats.cli import main
 from meshsplats.errors import DataWarning, NoTextureWarning
+from meshsplats.scene.base_mesh import Texture
 
 UP = np.array([0.6, -0.64, 0.48], np.float32)
 CLOUD = replace(few_splats(), up=UP)

@@ -12,7 +12,7 @@ from _splat_files import random_splats, splat_table, write_ply
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians, save_gaussians, stream_gaussians
 from meshsplats.cli import main
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 COUNT = 3000
 

@@ -11,7 +11,7 @@ from _splat_files import random_splats, splat_table, write_ply
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians, stream_gaussians
 from meshsplats.cli import main
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 
 
 def spacetime(n=40, seed=0, **more):

@@ -22,11 +22,11 @@ from meshsplats import (
 )
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cli import main
-from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.formats.gaussians import save_gaussian_blocks
-from meshsplats.gaussians import SH_C0
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.gaussians import SH_C0
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 BRUSH = "Exported from Brush"
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import DataWarning, FileFormatError, GaussianCloud, load_gaussians, save_gaussians
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 ENCODINGS = ["ascii", "binary_little_endian", "binary_big_endian"]
 FACES = Table("face", [("uchar", "int", "vertex_indices")], [[[0, 1, 2]], [[0, 1, 2, 3]], [[]], [[4, 5, 6]]])

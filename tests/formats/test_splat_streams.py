@@ -42,7 +42,7 @@ from meshsplats.formats.splats import _spz_streams
 from meshsplats.formats.splats import dot_splat as dot_splat_module
 from meshsplats.formats.splats import sog as sog_module
 from meshsplats.formats.splats import spz as spz_module
-from meshsplats.jobs import sources
+from meshsplats.operations.batches import sources
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 VALUES = random_splats(n=600, degree=1)

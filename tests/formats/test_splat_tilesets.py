@@ -15,7 +15,7 @@ from meshsplats.cli import main
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.gaussians import format_of
 from meshsplats.formats.sniff import identify
-from meshsplats.inspection import describe
+from meshsplats.operations.inspection import describe
 from meshsplats.tiles import is_tileset
 
 BOX = {"boundingVolume": {"box": [0, 0, 0, 9, 0, 0, 0, 9, 0, 0, 0, 9]}, "geometricError": 1}

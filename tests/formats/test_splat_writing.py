@@ -13,7 +13,7 @@ from _glb import read_glb, write_glb
 from _local import shared_data
 
 import meshsplats as ms
-from meshsplats._geometry import rotation_rows
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.cli import main
 from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.formats.splat_formats import format_to_write, written_ending

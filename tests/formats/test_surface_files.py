@@ -16,12 +16,12 @@ from _priors import CUBE, CUBE_FACES
 from PIL import Image
 
 from meshsplats import BaseMesh, load_base, load_mesh, look_at, save_base
-from meshsplats.base_mesh import Texture
 from meshsplats.errors import NoColorsWarning
 from meshsplats.formats.base_meshes import BASE_SUFFIXES, companions
 from meshsplats.formats.gltf.cameras import cameras_in_mesh
 from meshsplats.formats.surfaces.convex import THICK, convex_parts
 from meshsplats.formats.usd.cameras import cameras_in_usd
+from meshsplats.scene.base_mesh import Texture
 
 needs_scipy = pytest.mark.skipif(importlib.util.find_spec("scipy") is None, reason="install meshsplats[base]")
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="install meshsplats[usd]")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshsplats import BaseMesh, load_base, save_base
-from meshsplats.base_mesh import Texture
+from meshsplats.scene.base_mesh import Texture
 
 FACTOR = (1.0, 0.25, 0.0, 1.0)
 

@@ -21,7 +21,7 @@ from meshsplats import (
     save_gaussians,
 )
 from meshsplats.demo_scene import make_scene
-from meshsplats.gaussians import SH_C0
+from meshsplats.scene.gaussians import SH_C0
 
 LAYOUTS = ("gsplat", "inria", "nerfstudio")
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")

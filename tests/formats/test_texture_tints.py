@@ -14,10 +14,10 @@ from _gltf_meshes import TRIANGLE, gltf
 
 import meshsplats as ms
 from meshsplats import DataWarning
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.errors import NoTextureWarning
 from meshsplats.formats.gltf.scene_writer import png_of
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 pytest.importorskip("PIL", reason="Pillow is not installed")
 

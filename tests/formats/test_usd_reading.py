@@ -12,10 +12,10 @@ import pytest
 from _meshes import assert_same, random_mesh
 
 from meshsplats import DataWarning, FileFormatError, MissingDependencyError, load_mesh, save_mesh
-from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.usd import reader as usd_reader
 from meshsplats.formats.usd.extraction import extract_meshes
 from meshsplats.formats.usd.opening import checked
+from meshsplats.scene.colors import linear_to_srgb
 
 needs_usd = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed")
 COLOR = ' color3f[] primvars:displayColor = [(0.5, 0, 1)] (interpolation = "constant")'

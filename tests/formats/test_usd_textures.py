@@ -14,13 +14,13 @@ from _local import make_link
 from PIL import Image
 
 import meshsplats as ms
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.base_meshes import load_textured
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.usd import reader as usd_reader
 from meshsplats.formats.usd.cameras import cameras_in_usd
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.colors import linear_to_srgb
 from meshsplats.viewpoints.showing import default_views
 
 pytest.importorskip("pxr", reason="install meshsplats[usd]")

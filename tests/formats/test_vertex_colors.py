@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshsplats import load_mesh, orbit, render
-from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import main
 from meshsplats.errors import NoTextureWarning
@@ -19,6 +18,7 @@ from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.base_meshes import load_base, load_vertex_colored, save_base
 from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors as colored
 from meshsplats.images.reading import load_image
+from meshsplats.scene.base_mesh import BaseMesh, Texture
 from meshsplats.surfaces.images import draw_surface
 
 RAMP = np.empty((64, 128, 4), np.uint8)

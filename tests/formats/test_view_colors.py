@@ -21,9 +21,9 @@ from meshsplats import (
     render,
     save_mesh,
 )
-from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.meshes import expected_bytes
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 USD = (".usda", ".usdc")
 

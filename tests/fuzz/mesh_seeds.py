@@ -18,7 +18,7 @@ from _meshes import random_mesh
 from fuzz.seeds import Change, Seed
 
 from meshsplats import BaseMesh, load_base, load_mesh, save_base, save_mesh
-from meshsplats.base_mesh import Texture
+from meshsplats.scene.base_mesh import Texture
 
 
 def _saved(name: str, suffix: str, origin=(0, 0, 0), compression=None, **more) -> Seed:

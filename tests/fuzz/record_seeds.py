@@ -15,8 +15,8 @@ import numpy as np
 from _meshes import random_mesh
 from fuzz.seeds import Seed, in_gzip
 
-from meshsplats import _toml as toml
 from meshsplats import load_cameras, orbit, save_cameras, save_mesh
+from meshsplats._common import toml
 from meshsplats.blender.levels import read_chain
 from meshsplats.cli import arguments
 from meshsplats.cli.arguments import Command

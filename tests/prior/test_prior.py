@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, load_base, load_mesh, orbit, psnr, render
-from meshsplats._geometry import vertex_normals
-from meshsplats.binding import Binding
+from meshsplats._common.geometry import vertex_normals
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
@@ -22,6 +21,7 @@ from meshsplats.prior.laying import SHELLS_DEPTH
 from meshsplats.prior.matching import exchanged_axes, in_words
 from meshsplats.prior.options import LAYERS
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
+from meshsplats.scene.binding import Binding
 
 
 def base_picture(base, camera, **options):

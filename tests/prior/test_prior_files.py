@@ -16,7 +16,7 @@ from _meshes import assert_same
 from _priors import bumpy, cube
 
 from meshsplats import BaseMesh, DataWarning, FileFormatError, SplatMesh, load_mesh, save_mesh
-from meshsplats._words import parse_up
+from meshsplats._common.words import parse_up
 from meshsplats.demo_scene import make_scene
 from meshsplats.prior import MeshPrior, bind, load_prior
 from meshsplats.prior.agreement import warn_of_contradictions

@@ -10,10 +10,10 @@ from _rendering import TOLERANCE, camera, layers, soup
 from _splats import few_splats
 
 from meshsplats import SplatMesh, convert, drawing_order, look_at, orbit
-from meshsplats.draw_order import DrawOrder
 from meshsplats.rendering import reference_listed
 from meshsplats.rendering.backward import OpacityRamp, TapedRendering, TapeOptions
 from meshsplats.rendering.viewers import ordered_image
+from meshsplats.scene.draw_order import DrawOrder
 
 
 def shuffled(mesh: SplatMesh, nodes: int = 1, seed: int = 0) -> DrawOrder:

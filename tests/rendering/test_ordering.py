@@ -11,10 +11,10 @@ from _splats import few_splats
 from _stock_viewer import stock_image
 
 from meshsplats import SplatMesh, convert, drawing_order, load_mesh, look_at, orbit, psnr, render, save_mesh
-from meshsplats.draw_order import DrawOrder
 from meshsplats.rendering import ordering
 from meshsplats.rendering.ordering import default_views, pieces_of, solve
 from meshsplats.rendering.viewers import ordered_image, viewer_images
+from meshsplats.scene.draw_order import DrawOrder
 
 SQUARE = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], float)
 RED, BLUE = (1, 0, 0, 0.9), (0, 0, 1, 0.9)

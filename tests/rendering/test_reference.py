@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.reference import render
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 BLACK = (0, 0, 0)
 seeds = st.integers(0, 10_000)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshsplats.camera import Camera
-from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.rendering.reference_splats import render_splats, sh_basis, splat_colors
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 
 BLACK = (0, 0, 0)
 seeds = st.integers(0, 10_000)

@@ -9,11 +9,11 @@ import pytest
 from _rendering import camera, splats, turned
 
 from meshsplats import GaussianCloud, SplatMesh, convert, render
-from meshsplats.camera import Camera
-from meshsplats.mesh import MAX_COLOR
 from meshsplats.rendering import reference
 from meshsplats.rendering.shading import Shading, seen_from, shaded
-from meshsplats.spherical_harmonics import harmonics_map, sh_basis, turned_harmonics
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MAX_COLOR
+from meshsplats.scene.spherical_harmonics import harmonics_map, sh_basis, turned_harmonics
 
 DEGREES = (1, 2, 3)
 

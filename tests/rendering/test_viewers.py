@@ -10,9 +10,9 @@ from _rendering import camera, fan, layers, soup, turned
 from _zbuffer import zbuffer
 
 from meshsplats import render
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.rendering import reference
 from meshsplats.rendering.viewers import viewer_images
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 MODES = (None, 0.0, 0.3, 0.9)
 

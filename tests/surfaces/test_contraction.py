@@ -12,8 +12,8 @@ from test_surfaces import ball
 
 from meshsplats._core.surfaces import Grid, fuse_depth
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.core_arguments import camera_struct
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces import fusion, make_surface
 from meshsplats.surfaces.fusion import grid_of
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats.surfaces.tangents import corner_frames
+from meshsplats.scene.base_mesh import BaseMesh
 from meshsplats.surfaces import make_surface
 from meshsplats.surfaces.normal_maps import normal_map, relief_of
 

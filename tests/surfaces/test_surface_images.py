@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshsplats import BaseMesh, Camera, SplatMesh, orbit, psnr, render
-from meshsplats._arrays import block_means
-from meshsplats.base_mesh import Texture
+from meshsplats._common.arrays import block_means
 from meshsplats.datasets.views import View, ViewImage
+from meshsplats.scene.base_mesh import Texture
 from meshsplats.surfaces import draw_surface
 from meshsplats.surfaces.atlas import GUTTER, cells, filled, unwrap
 from meshsplats.surfaces.fitting import SMALL, SmoothSteps, fit, mean_colors, target_of

@@ -12,7 +12,7 @@ from meshsplats import convert, load_gaussians, orbit, psnr, render, save_gaussi
 from meshsplats.cli import main
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.inspection import describe
+from meshsplats.operations.inspection import describe
 from meshsplats.tiles import building
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.drawing import render_tiles, tiles_mesh

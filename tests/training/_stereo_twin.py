@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.datasets.views import View, ViewImage
+from meshsplats.scene.camera import Camera
 
 PLAIN, LONE, SIMILAR = 2.0, 0.12, 30.0
 

@@ -12,7 +12,7 @@ from _datasets import write_json
 from _photographs import write_photographs
 from PIL import Image
 
-from meshsplats import _toml as toml
+from meshsplats._common import toml
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError

@@ -19,11 +19,11 @@ from _datasets import save, simple_colmap
 from _local import make_link
 from PIL import Image, TiffImagePlugin
 
-from meshsplats.camera import Camera
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.points import load_points
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionsError
 from meshsplats.images.reading import Shot, load_image, read_shot
+from meshsplats.scene.camera import Camera
 from meshsplats.training import poses, reconstruction
 from meshsplats.training.feature_masks import FeatureMasks
 from meshsplats.training.photographs import PhotographOptions

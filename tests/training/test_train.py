@@ -41,10 +41,10 @@ from meshsplats.finetuning.step import (
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.images.reading import load_image
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.previews import SIDE
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training import run as run_module
 from meshsplats.training.as_splats import HALVED, splats_of_fans

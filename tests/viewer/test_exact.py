@@ -15,10 +15,10 @@ from _pages import HEIGHT, WIDTH, cameras_fixture, cloud_fixture, levels, mesh_f
 from _shared_device import SharedDevice, shared_device
 
 import meshsplats as ms
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.demo_scene import make_scene
 from meshsplats.rendering.looks import image_of
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.viewer.page import _read, make_page
 from meshsplats.viewer.quantise import quantise_mesh
 from meshsplats.webgpu.settings import DrawSettings, frame_uniform

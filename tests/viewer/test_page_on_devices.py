@@ -16,7 +16,7 @@ from test_controls import HEIGHT, PATIENCE, WIDTH, moved, open_page, pose, text_
 from test_surface_in_page import SIDE, box, camera, expected, plain, press, same
 
 import meshsplats as ms
-from meshsplats.base_mesh import BaseMesh, Texture
+from meshsplats.scene.base_mesh import BaseMesh, Texture
 from meshsplats.viewer import page as pages
 from meshsplats.webgpu import frames
 

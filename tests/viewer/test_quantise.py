@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import meshsplats as ms
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.demo_scene import make_scene
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer import quantise
 from meshsplats.viewer.packing import FINER, Precision, pack_mesh, pack_splats
 from meshsplats.viewer.quantise import PRECISIONS, estimated_bytes, quantise_mesh

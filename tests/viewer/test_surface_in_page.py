@@ -12,9 +12,9 @@ from test_controls import open_page
 from test_page import block
 
 import meshsplats as ms
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.colors import linear_to_srgb
 from meshsplats.images.reading import load_image
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.colors import linear_to_srgb
 from meshsplats.viewer.page import PageOptions, estimated_size
 from meshsplats.viewer.streams import Unpacker
 from meshsplats.viewer.surface import STEPS, pack_surface

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from _local import shared_data
 
-from meshsplats._geometry import quaternions_of
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras, first_impression, varied
 from meshsplats.viewpoints.kind import fineness_outside
 from meshsplats.viewpoints.relief import Relief

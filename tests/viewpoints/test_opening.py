@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from _local import shared_data
 
-from meshsplats._geometry import quaternions_of
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.cameras.trajectories import direction, front_axes, orbit
 from meshsplats.conversion import convert
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.formats.gaussians import load_gaussians
-from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.rendering.previews import USUAL
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints import opening
 from meshsplats.viewpoints.opening import opening_azimuth, opening_camera
 

@@ -13,8 +13,8 @@ from test_finding_cameras import moved
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cli import main
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.api import render_splats
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.finding import find_cameras, first_impression
 from meshsplats.viewpoints.relief import find_relief, unhidden
 from meshsplats.viewpoints.showing import default_views

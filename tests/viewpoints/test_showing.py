@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from _glb import edit_glb
 
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.errors import DataWarning
 from meshsplats.formats.base_meshes import load_vertex_colored, save_base
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints import showing
 from meshsplats.viewpoints.finding import FoundCameras
 from meshsplats.viewpoints.showing import default_views, opening_beside

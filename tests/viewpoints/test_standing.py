@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from _local import shared_data
 
-from meshsplats._geometry import quaternions_of
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import main
 from meshsplats.conversion import convert
@@ -16,7 +16,7 @@ from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 from meshsplats.viewpoints import standing
 from meshsplats.viewpoints.finding import (
     BY_COARSENESS,

@@ -21,7 +21,7 @@ from meshsplats.demo_scene.room import make_room
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.streaming import stream_gaussians
-from meshsplats.inspection import describe
+from meshsplats.operations.inspection import describe
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.options import TileOptions
 from meshsplats.tiles.tileset import Tileset

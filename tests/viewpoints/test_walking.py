@@ -10,7 +10,7 @@ import pytest
 
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli.images import ViewOptions
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints import finding, showing
 from meshsplats.viewpoints.walking import keys_of, short_round, walk
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from _needs import lacking
 
-from meshsplats.order import Order
+from meshsplats.scene.order import Order
 from meshsplats.webgpu import kernels
 
 FOLDER = Path(__file__).parents[2] / "build" / "dawn"

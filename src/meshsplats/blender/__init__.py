@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshsplats._lazy import lazy_names
+from meshsplats._common.lazy import lazy_names
 from meshsplats.blender.levels import LevelMeshes
 from meshsplats.blender.options import MAX_LAYERS, Engine, Ground, LightOptions, SceneOptions
-from meshsplats.camera import Camera
 from meshsplats.errors import DataWarning
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from meshsplats.blender.launch import BlenderError, Job, Progress

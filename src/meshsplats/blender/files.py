@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from meshsplats._options import changed, check_options
-from meshsplats._words import parse_color, parse_up
+from meshsplats._common.options import changed, check_options
+from meshsplats._common.words import parse_color, parse_up
 from meshsplats.blender import draw
 from meshsplats.blender.launch import command
 from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
@@ -24,7 +24,6 @@ from meshsplats.blender.options import (
 )
 from meshsplats.blender.plan import in_words
 from meshsplats.blender.subject import views_within
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.cleaning import cropped
@@ -34,8 +33,9 @@ from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.errors import OptionsError
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, view_names
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.tiles.drawing import MAX_ERROR, tiles_mesh
 from meshsplats.tiles.source import open_tileset, outline
 from meshsplats.tiles.tileset import Tileset

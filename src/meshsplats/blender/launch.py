@@ -25,8 +25,8 @@ from meshsplats._files.locks import try_lock
 from meshsplats.blender import guard
 from meshsplats.blender.inside import MISSING, worker
 from meshsplats.blender.options import SceneOptions
-from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
+from meshsplats.scene.camera import Camera
 
 OLDEST = (4, 2)
 JOB = "job.json"

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
 from meshsplats.cameras.framing import front_axes, scene_bounds
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 _PROBE = 2.0**-12
 PROBE_SIDE = 192

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from meshsplats._json import read_json
+from meshsplats._common.json_files import read_json
 from meshsplats.errors import FileFormatError
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 TABLE = "levels.json"
 

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.blender.options import CAREFUL
-from meshsplats.camera import Camera
-from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.normals import views_around
 from meshsplats.finetuning.adam import RowAdam
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import encoding_slope, linear_to_srgb, srgb_to_linear
+from meshsplats.scene.mesh import SplatMesh
 
 _SIDE = 200
 """Side in pixels of the images around the scene."""

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from meshsplats._options import Advanced, Range, check_options
-from meshsplats.camera import Camera
+from meshsplats._common.options import Advanced, Range, check_options
+from meshsplats.scene.camera import Camera
 
 Engine = Literal["cycles", "eevee"]
 Ground = Literal["plane", "catcher", "none"]

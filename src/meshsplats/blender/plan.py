@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from meshsplats._words import duration
+from meshsplats._common.words import duration
 from meshsplats.blender.options import SceneOptions
 
 if TYPE_CHECKING:

@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._cells import Cells
+from meshsplats._common.cells import Cells
+from meshsplats._common.geometry import vertex_normals
 from meshsplats._core.cells import VertexGrid, nearest_vertices
 from meshsplats._core.surfaces import Grid
-from meshsplats._geometry import vertex_normals
 from meshsplats.blender.options import CAREFUL
-from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.normals import DepthImage, depth_image_of, typical_spacing, unit, views_around
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces.fusion import MIN_PART, grid_around, signed_distances
 
 SIDE = 3

@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._geometry import direction
+from meshsplats._common.arrays import subsample
+from meshsplats._common.geometry import direction
 from meshsplats.blender.background import Background
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.options import CAREFUL, MAX_LAYERS, Effort, SceneOptions
 from meshsplats.blender.stand_in import StandIn, field_around, stand_in
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.conversion.normals import shading_normals, surfels_of, typical_spacing
 from meshsplats.conversion.recovery import splats_of
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 VIEWS = 24

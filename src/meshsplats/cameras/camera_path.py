@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera, from_opengl
 from meshsplats.errors import FileFormatError
+from meshsplats.scene.camera import Camera, from_opengl
 
 
 def is_camera_path(content: object) -> bool:

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.foreign import what_it_is
+from meshsplats._common.json_files import read_json
+from meshsplats._common.kinds import need_all, need_path
 from meshsplats._files.atomic import write_text
-from meshsplats._foreign import what_it_is
-from meshsplats._json import read_json
-from meshsplats._kinds import need_all, need_path
-from meshsplats.camera import Camera
 from meshsplats.cameras.camera_path import cameras_of_path, is_camera_path
 from meshsplats.cameras.viewer_settings import start_camera
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.scene.camera import Camera
 
 MAX_CAMERAS = 20_000
 

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._cells import Cells
-from meshsplats._geometry import away_from_ground
-from meshsplats._kinds import need_array
-from meshsplats._origin import FAR, choose_origin, sampled
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
+from meshsplats._common.cells import Cells
+from meshsplats._common.geometry import away_from_ground
+from meshsplats._common.kinds import need_array
 from meshsplats.errors import DataWarning, StraysWarning
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import FAR, choose_origin, sampled
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Splats trained from COLMAP cameras have the y axis pointing down."""

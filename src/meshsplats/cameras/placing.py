@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     SAMPLE,
     SURROUNDINGS,
@@ -19,7 +18,8 @@ from meshsplats.cameras.framing import (
     weighted_quantile,
 )
 from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 
 STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
 """Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._geometry import direction
-from meshsplats._kinds import as_whole, need_array, need_numbers
-from meshsplats.camera import Camera, checked_side
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.geometry import direction
+from meshsplats._common.kinds import as_whole, need_array, need_numbers
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
     Framable,
@@ -22,6 +21,7 @@ from meshsplats.cameras.framing import (
     scene_bounds,
     unit_up,
 )
+from meshsplats.scene.camera import Camera, checked_side
 
 NEAR_SHARE = 0.01
 """Near plane of these cameras as a share of their distance from the subject's middle, which ``distance_of``

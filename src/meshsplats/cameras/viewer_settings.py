@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.errors import FileFormatError
+from meshsplats.scene.camera import Camera
 
 NAME = "settings.json"
 FOV = 75.0

@@ -247,7 +247,7 @@ def _overview() -> str:
 
 
 def _unknown(name: str) -> int:
-    from meshsplats._options import did_you_mean
+    from meshsplats._common.options import did_you_mean
 
     hint = did_you_mean(name, COMMANDS) or f"commands: {', '.join(COMMANDS)}"
     say(f"error: there is no command {name!r}; {hint}")

@@ -16,9 +16,9 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import tyro
 
-from meshsplats import _toml as toml
-from meshsplats._option_values import converted, from_text, short
-from meshsplats._options import check_naming, did_you_mean, reachable, settings
+from meshsplats._common import toml
+from meshsplats._common.option_values import converted, from_text, short
+from meshsplats._common.options import check_naming, did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say, with_flags
 from meshsplats.errors import OptionsError, OptionValueError
 
@@ -228,7 +228,7 @@ def as_cli_options(
     checked: bool = True,
 ) -> Callable[[type[T]], type[T]]:
     """Makes of a class whose base is a library's dataclass of options a group of the command line. Help,
-    placeholders and whether an option has a flag follow from the fields (``_options.settings``).
+    placeholders and whether an option has a flag follow from the fields (``options.settings``).
 
     Args:
         about: description of the group; by default the docstring of the class.

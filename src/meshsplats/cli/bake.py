@@ -10,13 +10,13 @@ from typing import Annotated
 
 import tyro
 
-from meshsplats._words import plural
+from meshsplats._common.words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import size_of, written
 from meshsplats.cli.images import ViewOptions
 from meshsplats.cli.messages import say
-from meshsplats.file_options import BakingOptions
+from meshsplats.operations.options import BakingOptions
 
 
 @as_cli_options(presets=False)
@@ -48,7 +48,7 @@ class Bake(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.edits import bake_file
+        from meshsplats.operations.edits import bake_file
 
         start, place = time.perf_counter(), partial(written, origin=self.origin)
         made = bake_file(self.input, self.output, self.baking, place=place, force=self.force, say=say)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from meshsplats._words import plural
+from meshsplats._common.words import plural
 from meshsplats.blender.files import PictureOptions, PictureRun, Pictures
 from meshsplats.blender.options import LightOptions
 from meshsplats.blender.plan import Lines, where

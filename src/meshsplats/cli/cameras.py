@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from meshsplats._words import command_line, optional_up
+from meshsplats._common.words import command_line, optional_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions
@@ -51,8 +51,8 @@ class Cameras(Command):
         from meshsplats.cameras.files import cameras_beside, model_folder, save_cameras
         from meshsplats.cameras.framing import guess_up
         from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
-        from meshsplats.gaussians import GaussianCloud
         from meshsplats.images.writing import save_image
+        from meshsplats.scene.gaussians import GaussianCloud
         from meshsplats.viewpoints.finding import find_cameras
         from meshsplats.viewpoints.sheet import contact_sheet
         from meshsplats.viewpoints.showing import opened_with

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import tyro
 
-from meshsplats._words import plural
+from meshsplats._common.words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import SplatOptions, named, written
@@ -48,7 +48,7 @@ class Clean(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.edits import clean_file
+        from meshsplats.operations.edits import clean_file
 
         start = time.perf_counter()
         made = clean_file(

@@ -23,10 +23,10 @@ from meshsplats.formats.outputs import Scene, placed
 if TYPE_CHECKING:
     import numpy as np
 
-    from meshsplats.camera import Camera
     from meshsplats.cluster import Workers
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
 
 T = TypeVar("T")
 
@@ -72,7 +72,7 @@ class ClusterOptions:
 
 def written(scene: Scene, origin: option.Origin) -> Scene:
     """``placed``; also says where the file will stand in the world."""
-    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.scene.gaussians import GaussianCloud
 
     say_origin(scene.origin, origin, splats=isinstance(scene, GaussianCloud))
     return placed(scene, origin)
@@ -81,7 +81,7 @@ def written(scene: Scene, origin: option.Origin) -> Scene:
 def say_origin(found: np.ndarray, origin: option.Origin, *, splats: bool = False) -> None:
     """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
     ``splats`` does not tell other programs."""
-    from meshsplats._origin import in_words
+    from meshsplats.scene.origin import in_words
 
     if origin == "keep" and found.any():
         splats_only = ", in a note of the file: other programs see the splats of .ply and .sog around 0 0 0"

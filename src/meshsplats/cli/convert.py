@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from meshsplats._options import of_presets
-from meshsplats._words import command_line, plural
+from meshsplats._common.options import of_presets
+from meshsplats._common.words import command_line, plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options, usage_errors
 from meshsplats.cli.common import (
@@ -47,13 +47,13 @@ from meshsplats.errors import DataWarning
 from meshsplats.evaluation.mesh_files import MeshFileOptions
 from meshsplats.formats.outputs import CONFIGURATION, Ending, beside, means_splats
 from meshsplats.formats.splat_formats import written_ending
-from meshsplats.product import Product
+from meshsplats.operations.product import Product
 
 if TYPE_CHECKING:
-    from meshsplats.camera import Camera
     from meshsplats.formats.streaming import SplatStream
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.jobs import Job
+    from meshsplats.operations.batches import Job
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.gaussians import GaussianCloud
 
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream", "threads")
 """Options that do not change the mesh."""
@@ -114,7 +114,7 @@ class Convert(Command):
     their input or were made with other options."""
 
     def execute(self) -> int:
-        from meshsplats.jobs import formats_of, is_batch, jobs, sources, without_results
+        from meshsplats.operations.batches import formats_of, is_batch, jobs, sources, without_results
 
         if not self.input:
             raise UsageError("give a splat file, a mesh or a folder to convert")
@@ -199,7 +199,7 @@ class Convert(Command):
 
     def _made(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Writes the outputs of ``job``; counts, scores and seconds."""
-        from meshsplats.file_conversion import ConversionCallbacks, Converter
+        from meshsplats.operations.conversion import ConversionCallbacks, Converter
 
         if not (self.product.as_splats or self.product.stream):
             self.product.check_kind(job, self.reading)
@@ -249,9 +249,9 @@ class Convert(Command):
         self.finish(result, *self._lines(result, job, cameras), indent=None)
 
     def _lines(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> list[str]:
-        from meshsplats._origin import zero_origin
         from meshsplats.evaluation.viewers import AlphaChoice
-        from meshsplats.file_conversion import counts_in_words, seen_from, times_in_words
+        from meshsplats.operations.conversion import counts_in_words, seen_from, times_in_words
+        from meshsplats.scene.origin import zero_origin
 
         made = named(self.output)
         if result["skipped"]:
@@ -275,7 +275,7 @@ class Convert(Command):
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:
         """Prints the result of one of several inputs."""
-        from meshsplats.file_conversion import counts_in_words
+        from meshsplats.operations.conversion import counts_in_words
 
         if result["skipped"]:
             sizes = "kept"

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from meshsplats._words import plural
+from meshsplats._common.words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import say_origin, size_of, track
 from meshsplats.cli.messages import UsageError
 
 if TYPE_CHECKING:
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.mesh import SplatMesh
 
 
 @dataclass(frozen=True)

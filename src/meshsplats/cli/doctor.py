@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from meshsplats._words import quoted
+from meshsplats._common.words import quoted
 from meshsplats.cli.arguments import Command
 
 
@@ -17,7 +17,7 @@ class Doctor(Command):
     """Print the findings as JSON."""
 
     def execute(self) -> int:
-        from meshsplats.installation import examine, in_words
+        from meshsplats.operations.installation import examine, in_words
 
         findings = examine()
         missing = findings["to_install"].items()

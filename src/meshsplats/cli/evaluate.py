@@ -15,8 +15,8 @@ from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, SplatOptions, print_table, track
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import write_configuration
-from meshsplats.file_options import ScoringOptions
 from meshsplats.formats.outputs import CONFIGURATION
+from meshsplats.operations.options import ScoringOptions
 
 Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 
@@ -57,7 +57,7 @@ class Evaluate(Command):
         from meshsplats.evaluation.report import SSIM_CONVENTION
         from meshsplats.evaluation.results import notes
         from meshsplats.evaluation.strips import score_table
-        from meshsplats.scoring import Scoring
+        from meshsplats.operations.scoring import Scoring
 
         self.how.check(self.mesh)
         here = self.cluster.cluster is None  # workers share a terminal

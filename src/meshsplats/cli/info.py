@@ -24,7 +24,7 @@ class Info(Command):
     """Print the findings as JSON."""
 
     def execute(self) -> None:
-        from meshsplats.inspection import describe, in_words
+        from meshsplats.operations.inspection import describe, in_words
 
         findings = {"path": shown_path(self.input), **describe(self.input, self.reading.arguments)}
         if findings["kind"] not in ("splats", "tileset"):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from meshsplats._words import optional_up
+from meshsplats._common.words import optional_up
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, resumable, say_origin
@@ -20,9 +20,9 @@ from meshsplats.cli.messages import UsageError, flag, say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import differences, write_configuration
 from meshsplats.errors import FileFormatError
-from meshsplats.file_options import ChainOptions, LevelTuning
 from meshsplats.formats.outputs import CONFIGURATION, check_folder_name, placed
-from meshsplats.order import Order
+from meshsplats.operations.options import ChainOptions, LevelTuning
+from meshsplats.scene.order import Order
 
 if TYPE_CHECKING:
     from meshsplats.finetuning import Progress
@@ -77,10 +77,10 @@ class Levels(Command):
     """Overwrite an older chain in the folder."""
 
     def execute(self) -> int:
-        from meshsplats.chains import make_chain, partial_folder, planned
         from meshsplats.evaluation.level_tables import table_in_words
         from meshsplats.finetuning import Interrupted
         from meshsplats.formats.sniff import identify
+        from meshsplats.operations.chains import make_chain, partial_folder, planned
 
         self._check()
         config = self.tuning.config()
@@ -115,7 +115,7 @@ class Levels(Command):
     def _check(self) -> None:
         """UsageError or OptionsError for options that contradict each other; OSError, before the work, if the
         folder cannot appear."""
-        from meshsplats.chains import check_folder
+        from meshsplats.operations.chains import check_folder
 
         self.chain.check()
         option.check_resumption(self.resume, self.force)
@@ -126,7 +126,7 @@ class Levels(Command):
 
     def _begin(self) -> None:
         """Makes the folder of unfinished levels, empty; with --resume it must be that of the same command."""
-        from meshsplats.chains import begin_folder, partial_folder
+        from meshsplats.operations.chains import begin_folder, partial_folder
 
         if not self.resume:
             write_configuration(begin_folder(self.output) / CONFIGURATION, "levels", self)

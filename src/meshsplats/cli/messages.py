@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from meshsplats._common.words import naming
 from meshsplats._files import DISK_FULL
-from meshsplats._words import naming
 from meshsplats.errors import ClusterError, DeviceError, NamingOptions, OverwritingError, with_options
 
 OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5

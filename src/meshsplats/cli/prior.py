@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from meshsplats._words import quoted
+from meshsplats._common.words import quoted
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import SplatOptions

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from meshsplats._words import Phase
+from meshsplats._common.words import Phase
 from meshsplats.cli.messages import say
 from meshsplats.finetuning.setup import in_words
 

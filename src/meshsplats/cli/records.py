@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import meshsplats
-from meshsplats import _toml as toml
-from meshsplats._option_values import relative_to
-from meshsplats._words import legible
+from meshsplats._common import toml
+from meshsplats._common.option_values import relative_to
+from meshsplats._common.words import legible
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
 from meshsplats.cli.messages import shown_path
 from meshsplats.formats.outputs import recorded_options

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from meshsplats._words import plural
+from meshsplats._common.words import plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import ClusterOptions, PartOptions, SplatOptions, named, track

@@ -13,7 +13,7 @@ from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, draw_preview, named, written
 from meshsplats.cli.records import write_configuration
-from meshsplats.file_options import SimplifyOptions
+from meshsplats.operations.options import SimplifyOptions
 
 
 @as_cli_options(presets=False)
@@ -43,7 +43,7 @@ class Simplify(Command):
     force: option.Force = False
 
     def execute(self) -> None:
-        from meshsplats.edits import EditCallbacks, simplify_file
+        from meshsplats.operations.edits import EditCallbacks, simplify_file
 
         made = simplify_file(
             self.input,

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from meshsplats._words import command_line
+from meshsplats._common.words import command_line
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options
 from meshsplats.cli.common import SplatOptions, size_of, written
@@ -18,7 +18,7 @@ from meshsplats.cli.messages import say
 from meshsplats.cli.progress import progress_display
 from meshsplats.cli.records import write_configuration
 from meshsplats.formats.base_meshes import PRINTED
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces.files import SurfaceFileOptions, SurfaceRun
 from meshsplats.surfaces.options import SurfaceOptions, default_in_words
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
+from meshsplats._common.options import of_presets
+from meshsplats._common.words import command_line
 from meshsplats._files.atomic import together
-from meshsplats._options import of_presets
-from meshsplats._words import command_line
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import draw_preview, written

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
+from meshsplats._common.kinds import need, need_all
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import SplatMesh, checked_filter
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import SplatMesh, checked_filter
 
 MIN_VARIANCE = 1e-4
 """Least variance of a splat as a share of the filter's, as in ``render``."""

@@ -10,17 +10,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats._cells import Cells
-from meshsplats._geometry import spacing
-from meshsplats.camera import Camera
+from meshsplats._common.cells import Cells
+from meshsplats._common.geometry import spacing
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
 CELL = 2.5

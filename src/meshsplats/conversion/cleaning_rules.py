@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from meshsplats._options import Range, check_options
+from meshsplats._common.options import Range, check_options
 
 
 @dataclass(frozen=True)

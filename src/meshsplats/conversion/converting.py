@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
+from meshsplats._common.choices import Look
+from meshsplats._common.kinds import need, need_all
 from meshsplats._core.library import check_threads
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, unit_up
-from meshsplats.choices import Look
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.detail import FIRST_STAR, LEVELS, OnImage, choose_levels, visibility
 from meshsplats.conversion.driver import Driver, drawn_part, filter_of, worth_drawing
@@ -22,8 +21,9 @@ from meshsplats.conversion.merging import simplify_large
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
 from meshsplats.conversion.selection import most_important, refuse_empty_box, within
 from meshsplats.conversion.stars import STARS
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

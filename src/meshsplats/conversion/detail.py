@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.camera import Camera
-from meshsplats.choices import Look
+from meshsplats._common.arrays import subsample
+from meshsplats._common.choices import Look
 from meshsplats.conversion.stars import STARS
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import scatter_to_vertices
 from meshsplats.rendering.looks import draw_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 LEVELS = ((3, 1), (4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
 """Levels of detail: sides and rings of the ellipses, in the order of their triangle counts."""

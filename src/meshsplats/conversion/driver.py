@@ -12,8 +12,8 @@ from meshsplats.conversion.fan_sizes import Fans
 from meshsplats.conversion.footprint import SceneViews
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import within
-from meshsplats.gaussians import DILATION, GaussianCloud, Kernel
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import DILATION, GaussianCloud, Kernel
+from meshsplats.scene.mesh import SplatMesh
 
 
 def worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:

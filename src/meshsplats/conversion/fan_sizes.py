@@ -12,7 +12,7 @@ from meshsplats.conversion.footprint import FILTER_PX2, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.profiles import fit_profile
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 LARGEST_SIGMA = np.float32(1e18)
 """Larger splats have this standard deviation: float32 holds no product of two that are larger."""

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from meshsplats._geometry import rotation_rows
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.conversion.chunks import chunks, thin_product
 
 CHUNK = 1 << 13

@@ -11,16 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import spread_indices
-from meshsplats._geometry import spacing
-from meshsplats.camera import Camera, hiding_near_plane
+from meshsplats._common.arrays import spread_indices
+from meshsplats._common.geometry import spacing
 from meshsplats.cameras.framing import SAMPLE, guess_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
-from meshsplats.mesh import MAX_COLOR
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.camera import Camera, hiding_near_plane
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud, Kernel
+from meshsplats.scene.mesh import MAX_COLOR
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 FILTER_PX2: dict[str, dict[str, float]] = {
     "area": {"3dgs": 0.05, "antialiased": 0.05, "2dgs": 0.05},

@@ -12,10 +12,10 @@ import numpy as np
 from meshsplats.conversion.footprint import FILTER_PX2, usual_pixels, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import DILATION, GaussianCloud
 from meshsplats.rendering.api import render_splats
 from meshsplats.rendering.layers import affordable
 from meshsplats.rendering.previews import preview_camera
+from meshsplats.scene.gaussians import DILATION, GaussianCloud
 
 SIDE = 500
 """Side in pixels of the images that tell."""

@@ -18,17 +18,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
+from meshsplats._common.geometry import quaternions_of
+from meshsplats._common.kinds import need, need_all
 from meshsplats._core.library import check_threads, processors
-from meshsplats._geometry import quaternions_of
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
 from meshsplats.conversion.footprint import usual_pixels, widen
 from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import LEAST_OPACITY, LOW_PASS_PX2, GaussianCloud, Kernel
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import LEAST_OPACITY, LOW_PASS_PX2, GaussianCloud, Kernel
 
 BLOCK = 1 << 16
 """Splats that ``simplify_in_blocks`` merges at a time."""

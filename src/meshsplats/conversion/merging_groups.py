@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._common.geometry import morton_codes
 from meshsplats._core.library import pointer, run
 from meshsplats._core.neighbours import nearest
 from meshsplats._core.structures import MergingStruct
-from meshsplats._geometry import morton_codes
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 NEIGHBOURS = 8
 """Nearest splats with which each may be merged at first; a merged one has the neighbours of both. With 16,

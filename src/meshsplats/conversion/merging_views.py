@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.cameras.trajectories import dome
 from meshsplats.conversion.budget import within_limits
@@ -17,8 +16,9 @@ from meshsplats.conversion.converting import convert
 from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.merging import simplify_large
 from meshsplats.conversion.options import ConversionOptions, Preset
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 VIEWS, SIDE = 32, 800

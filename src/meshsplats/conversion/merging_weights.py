@@ -10,16 +10,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats._core.neighbours import nearest
-from meshsplats.camera import Camera
 from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import CameraCoverage, SceneSample, SceneViews
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import visible_pixels
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 
 HIDDEN = 0.2
 """What a splat counts that others hide from a camera, relative to one that nothing hides."""

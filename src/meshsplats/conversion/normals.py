@@ -14,14 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
+from meshsplats._common.geometry import spacing
 from meshsplats._core.cells import sums_around
-from meshsplats._geometry import spacing
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds
 from meshsplats.cameras.trajectories import dome
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 CELL = 2.5
 """Side of the cells in which neighbours are sought, in spacings: measured on splats of a known surface,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 
-from meshsplats._options import Advanced, Range, With, check_names, check_options
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.options import Advanced, Range, With, check_names, check_options
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

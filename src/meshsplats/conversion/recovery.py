@@ -6,14 +6,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from meshsplats._geometry import quaternions_of
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.conversion.fan_sizes import ellipse, missing
 from meshsplats.conversion.fans import PLANES, Shape
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.conversion.stars import CENTERS, OPACITIES, star
-from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 THICKNESS = 0.02
 """Standard deviation across a flat fan, as a share of the smaller one in it: viewers need one above 0."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 THOMSEN = 1.6075
 """Exponent of Thomsen's formula for the surface of an ellipsoid, within 1.1 % of the true value."""

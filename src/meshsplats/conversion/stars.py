@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._geometry import level_axes
+from meshsplats._common.geometry import level_axes
 from meshsplats.conversion.fans import Pattern, Shape
 
 RADIUS = 2.6

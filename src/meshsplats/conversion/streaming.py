@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshsplats._kinds import each, need, need_all
-from meshsplats.camera import Camera
+from meshsplats._common.kinds import each, need, need_all
 from meshsplats.cameras.framing import SAMPLE, guess_up, unit_up, warn_of_strays
 from meshsplats.conversion.driver import Driver, Piece, drawn_part, filter_of, worth_drawing
 from meshsplats.conversion.footprint import SceneSample, SceneViews, origin_of, origin_step
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
-from meshsplats.gaussians import GaussianCloud, Kernel
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

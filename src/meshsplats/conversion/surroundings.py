@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from meshsplats._arrays import subsample
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.conversion.cleaning import Findings, find
 from meshsplats.conversion.cleaning_rules import FLOATERS
 from meshsplats.conversion.recovery import splats_of
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import scatter_to_vertices
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 PLACES = 8

@@ -16,8 +16,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
-from meshsplats.choices import MAX_SIDE
+from meshsplats._common.choices import MAX_SIDE
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.datasets.image_files import MAX_NAME, Frame
 from meshsplats.datasets.lens import MODELS, Lens
 from meshsplats.errors import FileFormatError

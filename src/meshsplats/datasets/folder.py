@@ -11,11 +11,10 @@ from typing import get_args
 
 import numpy as np
 
-from meshsplats._foreign import what_it_is
-from meshsplats._kinds import need_path
-from meshsplats._origin import choose_origin
-from meshsplats._words import plural
-from meshsplats.choices import Masks, Missing
+from meshsplats._common.choices import Masks, Missing
+from meshsplats._common.foreign import what_it_is
+from meshsplats._common.kinds import need_path
+from meshsplats._common.words import plural
 from meshsplats.datasets.colmap import read_model
 from meshsplats.datasets.image_files import Album, Frame, Taken, first_names, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
@@ -24,6 +23,7 @@ from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.transforms import read_transforms
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View
 from meshsplats.errors import DataWarning, FileFormatError, OptionValueError
+from meshsplats.scene.origin import choose_origin
 
 Views = tuple[list[View], list[View]]
 MAX_LIST_BYTES = 16 << 20

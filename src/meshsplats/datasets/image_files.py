@@ -13,13 +13,13 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.choices import Masks, Missing
+from meshsplats._common.choices import Masks, Missing
 from meshsplats.datasets.lens import Lens, Pinhole, check_shape, fits, pinholes
 from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.views import ImageCache
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import Header, read_header
+from meshsplats.scene.camera import Camera
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""

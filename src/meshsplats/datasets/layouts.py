@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from meshsplats._foreign import what_it_is
+from meshsplats._common.foreign import what_it_is
 from meshsplats.datasets.cameras_of_others import cameras_of_others
 from meshsplats.datasets.colmap import MODEL_FILES, find_model, image_names
 from meshsplats.datasets.image_files import Shelf, is_hidden, is_readable

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.camera import MAX_SKEW
-from meshsplats.choices import MAX_SIDE
+from meshsplats._common.choices import MAX_SIDE
 from meshsplats.datasets.image_files import Frame, Shelf
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.npz import read_npy_header
+from meshsplats.scene.camera import MAX_SKEW
 
 MAX_BYTES = 32 << 20
 """Longer files are refused."""

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._kinds import need_path
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.kinds import need_path
 from meshsplats.datasets.image_files import inside, leads_out
 from meshsplats.datasets.layouts import find_layout
 from meshsplats.datasets.transforms import points_file

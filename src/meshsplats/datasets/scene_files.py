@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
+from meshsplats._common.options import Advanced, Help, changed
+from meshsplats._common.words import direction_in_words
 from meshsplats._files.atomic import in_words
-from meshsplats._options import Advanced, Help, changed
-from meshsplats._words import direction_in_words
 from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.formats.splat_formats import listed, y_up_suffixes
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from meshsplats.base_mesh import BaseMesh
     from meshsplats.formats.streaming import SplatStream
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.base_mesh import BaseMesh
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
     from meshsplats.viewpoints.finding import UnusualUp
 
 Mesh = TypeVar("Mesh", bound="SplatMesh | BaseMesh")
@@ -141,9 +141,9 @@ class SceneReading:
         self, path: Path, *, up: str | None = None, threads: int | None = None
     ) -> GaussianCloud | SplatMesh | BaseMesh:
         """``load_scene``, but a surface with one texture on all faces as it is."""
-        from meshsplats.base_mesh import BaseMesh
         from meshsplats.formats.base_meshes import load_textured, vertex_colored
         from meshsplats.formats.surfaces.corners import has_whole_texture
+        from meshsplats.scene.base_mesh import BaseMesh
 
         def load(path: Path) -> SplatMesh | BaseMesh:
             found = load_textured(path)
@@ -160,9 +160,9 @@ class SceneReading:
         find_up: bool,
         threads: int | None,
     ) -> GaussianCloud | Mesh:
-        from meshsplats.base_mesh import BaseMesh
         from meshsplats.cameras.framing import warn_of_strays_in
         from meshsplats.formats.sniff import identify
+        from meshsplats.scene.base_mesh import BaseMesh
 
         kind = identify(path)
         if kind == "cameras":

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from meshsplats._options import Help, Range, changed, check_options
-from meshsplats._words import parse_up
-from meshsplats.choices import MAX_SIDE, Masks, Missing
+from meshsplats._common.choices import MAX_SIDE, Masks, Missing
+from meshsplats._common.options import Help, Range, changed, check_options
+from meshsplats._common.words import parse_up
 from meshsplats.errors import OptionsError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from meshsplats.camera import Camera
     from meshsplats.datasets.views import Dataset
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
 
     Origin = Sequence[float] | np.ndarray
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.views import SHOWN, Dataset, View, ViewImage
 from meshsplats.errors import DataWarning

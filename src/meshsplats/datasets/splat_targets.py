@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from meshsplats._common.choices import MAX_SIDE, Look
+from meshsplats._common.kinds import need, need_all, need_choice
 from meshsplats._core.library import check_threads
-from meshsplats._kinds import need, need_all, need_choice
-from meshsplats.camera import Camera
 from meshsplats.cameras.placing import (
     ALL_ELEVATIONS,
     DISTANCES,
@@ -21,12 +21,12 @@ from meshsplats.cameras.placing import (
     inside_cameras,
     outside_cameras,
 )
-from meshsplats.choices import MAX_SIDE, Look
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.core_arguments import MAX_SAMPLES
 from meshsplats.rendering.looks import check_look, draw_splats
 from meshsplats.rendering.sight import check_sight
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.finding import FoundCameras, find_cameras
 
 Placement = Literal["auto", "object", "surrounded", "inside", "found"]

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._json import read_json
-from meshsplats.camera import from_opengl
-from meshsplats.choices import MAX_SIDE
+from meshsplats._common.choices import MAX_SIDE
+from meshsplats._common.json_files import read_json
 from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable, leads_out
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.images.reading import read_header
+from meshsplats.scene.camera import from_opengl
 
 MAX_FRAMES = 200_000
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")

@@ -11,13 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
-from meshsplats._arrays import check_units, checked_array
-from meshsplats._kinds import need, need_all
-from meshsplats._origin import in_words, zero_origin
-from meshsplats.camera import Camera
-from meshsplats.choices import Look
+from meshsplats._common.arrays import check_units, checked_array
+from meshsplats._common.choices import Look
+from meshsplats._common.kinds import need, need_all
 from meshsplats.errors import DataWarning
-from meshsplats.mesh import MAX_COLOR
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MAX_COLOR
+from meshsplats.scene.origin import in_words, zero_origin
 
 CACHE_BYTES = 2 << 30
 """Default limit on the images of a data set that are kept in memory after their first use, bytes."""

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats.demo_scene._light import KEY_LIGHT, Patch, column, diffuse, mix, spherical_harmonics, unit
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 UP = np.array([0.0, -1.0, 0.0])

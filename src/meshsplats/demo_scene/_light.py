@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats.gaussians import SH_C0
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.gaussians import SH_C0
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 KEY_LIGHT = np.array([-0.60, -0.70, -0.40]) / np.linalg.norm([-0.60, -0.70, -0.40])
 """(3,) unit direction towards the key light: above, left of and in front of the table."""

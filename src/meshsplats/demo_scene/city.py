@@ -17,7 +17,7 @@ import numpy as np
 
 from meshsplats.demo_scene import GOLDEN_ANGLE, UP, splats_of
 from meshsplats.demo_scene._light import Patch, column, diffuse, spherical_harmonics, unit
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 
 LOT = 20.0
 """Side of a lot, scene units."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from meshsplats.demo_scene import GOLDEN_ANGLE, make_scene, splats_of
 from meshsplats.demo_scene._light import KEY_LIGHT, Patch, column, diffuse, spherical_harmonics
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 
 Paint = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Reflectance (n, 3) of places (n,), (n,) along the two edges of a rectangle, in units."""

@@ -12,14 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._kinds import described, need, require
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats._common.arrays import subsample
+from meshsplats._common.kinds import described, need, require
 from meshsplats.datasets.views import WHITE, Dataset, View
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 BLACK = (0.0, 0.0, 0.0)
 CANDIDATES: Mapping[str, tuple[float, float, float]] = {"black": BLACK, "white": WHITE}

@@ -24,8 +24,8 @@ from meshsplats.evaluation.report import SSIM_CONVENTION, Report, evaluate
 from meshsplats.evaluation.strips import markdown_table
 from meshsplats.formats.mesh_formats import mesh_suffixes
 from meshsplats.formats.splat_formats import splat_suffixes
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 @dataclass(frozen=True)

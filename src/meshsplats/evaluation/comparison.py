@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._kinds import need, need_all
-from meshsplats._origin import need_one_origin
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
+from meshsplats._common.choices import Device, Look
+from meshsplats._common.kinds import need, need_all
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.choices import Device, Look
 from meshsplats.datasets.views import View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.metrics import psnr, ssim
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import check_look, draw_splats, image_of, mesh_samples
 from meshsplats.rendering.sight import check_sight
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import need_one_origin
 
 
 @dataclass(frozen=True)

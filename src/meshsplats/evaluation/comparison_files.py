@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from meshsplats._common.kinds import as_path
 from meshsplats._files.atomic import write_json
-from meshsplats._kinds import as_path
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.conversion import convert
 from meshsplats.conversion.cleaning import cropped
@@ -23,11 +22,12 @@ from meshsplats.evaluation.options import ComparisonOptions
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, check_outputs, view_names
 from meshsplats.formats.sniff import identify
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import amplified_error, save_image, strip
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import mesh_samples
 from meshsplats.rendering.sight import check_sight
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 RESULTS = "results.json"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from meshsplats._common.choices import Look
+from meshsplats._common.json_files import read_json
+from meshsplats._common.words import plural
 from meshsplats._files.atomic import in_words
-from meshsplats._json import read_json
-from meshsplats._words import plural
-from meshsplats.choices import Look
 from meshsplats.errors import FileFormatError
 from meshsplats.rendering.looks import comparison_in_words
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._kinds import need_choice
+from meshsplats._common.kinds import need_choice
 from meshsplats.errors import GET_TORCH, FileFormatError, MissingDependencyError
 from meshsplats.evaluation.metrics import checked_images
 from meshsplats.formats.safetensors import load_safetensors

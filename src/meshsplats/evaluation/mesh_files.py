@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from meshsplats._options import Advanced, check_options
+from meshsplats._common.options import Advanced, check_options
 from meshsplats.errors import OptionsError
 from meshsplats.formats.mesh_formats import takes
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from meshsplats.camera import Camera
-    from meshsplats.draw_order import DrawOrder
     from meshsplats.evaluation.viewers import AlphaChoice
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.draw_order import DrawOrder
+    from meshsplats.scene.mesh import SplatMesh
 
 GLB_ALPHA = ("mask", "hybrid", "ordered")
 """Values of ``alpha`` that only .glb files have."""
@@ -56,8 +56,8 @@ class MeshFileOptions:
             OptionsError: options contradict each other or have no effect.
             ValueError: one is out of range.
         """
-        from meshsplats.mesh import checked_cutoff
         from meshsplats.rendering.ordering import check_nodes
+        from meshsplats.scene.mesh import checked_cutoff
 
         check_options(self)
         names = [f"mesh.{kind}" for kind in kinds]

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from meshsplats._arrays import check_units
-from meshsplats._kinds import need_array, need_choice
+from meshsplats._common.arrays import check_units
+from meshsplats._common.kinds import need_array, need_choice
 
 SsimConvention = Literal["3dgs", "valid", "reflect"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from meshsplats._options import check_options
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.options import check_options
 from meshsplats.conversion.options import Preset
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
-from meshsplats._kinds import need
-from meshsplats._origin import need_one_origin
-from meshsplats.camera import Camera
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.kinds import need
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import GROUND_TRUTHS, draw_splats, image_of, mesh_samples
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import need_one_origin
 
 if TYPE_CHECKING:
     from meshsplats.evaluation.lpips import Lpips

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from meshsplats._arrays import spread_indices
+from meshsplats._common.arrays import spread_indices
+from meshsplats._common.words import plural
 from meshsplats._files.atomic import write_json, write_text
-from meshsplats._words import plural
 from meshsplats.evaluation.benchmarks import BenchmarkResult
 from meshsplats.evaluation.report import Report, ScoredView
 from meshsplats.evaluation.strips import markdown_table, view_crop, view_strip

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._words import natural_key
-from meshsplats.camera import Camera
+from meshsplats._common.words import natural_key
 from meshsplats.datasets.image_files import is_hidden
 from meshsplats.evaluation.report import ImageAt, Report, ScoredView
 from meshsplats.images.writing import amplified_error, strip
+from meshsplats.scene.camera import Camera
 
 CROP_SHARE = 4
 """The shorter side of an image divided by the side of its crop."""

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.errors import DataWarning
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf.writer import Alpha
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering.api import render
 from meshsplats.rendering.layers import affordable, layers
 from meshsplats.rendering.viewers import viewer_images
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh, solid_faces
 
 CUTOFFS = (0.1, CUTOFF, 0.3)
 """Cutoffs of 'mask' that are tried. Each is the best on some scene; 0.5 was on none of ten."""

@@ -5,7 +5,7 @@ Needs NumPy alone. ``meshsplats.finetuning.losses`` has the same losses as torch
 
 from typing import TYPE_CHECKING
 
-from meshsplats._lazy import lazy_names
+from meshsplats._common.lazy import lazy_names
 
 __all__ = [
     "FEWEST_VIEWS",

@@ -13,21 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.datasets.splat_targets import RenderedSplats, splat_views, window_centers, window_of_image
 from meshsplats.datasets.views import Dataset, View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import starts_with_filter
 from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.cutting import cut_mesh
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 ZOOMS = (0.5, 1, 2, 4)
 """Image sizes, as multiples of those of the training views: for 400 pixels, 200 to 1600. Of the larger images

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.binding import Binding
 from meshsplats.finetuning.initial import vertex_means
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.mesh import SplatMesh
 
 _CHUNK = 1 << 15
 """Vertices processed at a time: the working set fits a processor's cache."""

@@ -9,8 +9,8 @@ from meshsplats.finetuning.config import make_config
 from meshsplats.finetuning.initial import for_photographs, starting_mesh
 from meshsplats.finetuning.run import finetune
 from meshsplats.finetuning.run_options import RunOptions
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 def tuned_candidates(

@@ -23,9 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._common.json_files import json_object
 from meshsplats._files.atomic import write_text
-from meshsplats._json import json_object
-from meshsplats.camera import Camera
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.merging import simplify
@@ -41,10 +40,11 @@ from meshsplats.finetuning.run import Progress, finetune
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import visible_pixels
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 FAR_SHARE = 0.25
 """Splats that stand for the scene beyond the margin, as a share of those of a cell."""

@@ -23,8 +23,8 @@ from meshsplats.errors import FileFormatError, OtherRunError
 from meshsplats.finetuning.config import LENGTHS, FinetuneConfig, with_changes
 from meshsplats.finetuning.loss import DEFAULT
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 VERSION = 1
 _KEY = "meshsplats"

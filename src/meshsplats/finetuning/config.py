@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-from meshsplats._options import Advanced, Range, With, check_names, check_options
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.options import Advanced, Range, With, check_names, check_options
 
 Unit = Literal["splat", "scene"]
 BackgroundMode = Literal["mixed", "random", "white", "black"]

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from meshsplats._words import plural
-from meshsplats.choices import Device
+from meshsplats._common.choices import Device
+from meshsplats._common.words import plural
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.gaps import without_gaps
@@ -31,8 +31,8 @@ from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.finetuning.start_options import StartOptions
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 Scene = GaussianCloud | SplatMesh
 

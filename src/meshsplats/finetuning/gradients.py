@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.rendering.backward import TapeOptions
+from meshsplats.scene.camera import Camera
 
 
 class Rates(NamedTuple):

@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.state import MAX_OPACITY
-from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import scatter_to_vertices
+from meshsplats.scene.mesh import SplatMesh, solid_faces
 
 SOLID = 1 - 0.5 / 255
 """Least opacity of a fragment of opaque triangles, which blended ones do not reach."""

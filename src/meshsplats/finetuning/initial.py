@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
+from meshsplats._common.kinds import need, need_all
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.detail import OnImage
 from meshsplats.conversion.footprint import FILTER_PX2, CameraCoverage
@@ -18,10 +17,11 @@ from meshsplats.conversion.options import FLAT_SIDES, make_options
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.config import FinetuneConfig, is_long
-from meshsplats.gaussians import DILATION, GaussianCloud
-from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order, checked_order
 from meshsplats.rendering import render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import DILATION, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.order import Order, checked_order
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._common.json_files import json_object
+from meshsplats._common.kinds import need
 from meshsplats._files.atomic import write_text
 from meshsplats._files.locks import locked
-from meshsplats._json import json_object
-from meshsplats._kinds import need
 from meshsplats.errors import EarlierRunError, FileFormatError
 from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from meshsplats.finetuning.config import LENGTHS

@@ -12,8 +12,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from meshsplats._common.kinds import described
 from meshsplats._core.kernels import compare_images
-from meshsplats._kinds import described
 from meshsplats.finetuning.config import FinetuneConfig
 
 DEFAULT = "default"

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._common.kinds import described
 from meshsplats._core.kernels import compare_images
 from meshsplats._core.library import check_threads
-from meshsplats._kinds import described
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.finetuning.loss import Loss, Target, loss_name
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from meshsplats.cluster import memory_of_task
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4
 """Per vertex: position and colour, each with its gradient, two moments and their copies while a checkpoint is

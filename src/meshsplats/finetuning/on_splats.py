@@ -10,15 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.choices import Device
+from meshsplats._common.arrays import subsample
+from meshsplats._common.choices import Device
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.merging_views import merged_within_limits
 from meshsplats.datasets.splat_targets import shown_degree
 from meshsplats.datasets.views import Dataset
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import OptionsError
 from meshsplats.finetuning.baseline import (
     SHARES,
@@ -50,9 +49,10 @@ from meshsplats.finetuning.run import finetune
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.ordering import VIEWS, default_views, drawing_order
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""

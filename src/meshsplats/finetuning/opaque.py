@@ -13,12 +13,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.config import FinetuneConfig
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import ExpectedError
 from meshsplats.rendering.edges import front_faces
+from meshsplats.scene.mesh import SplatMesh
 
 HIT_VIEWS = 64
 """Maximum number of training views, evenly spread, in which triangles are looked for."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from meshsplats._kinds import need
+from meshsplats._common.kinds import need
 from meshsplats.datasets.views import Dataset
-from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.journal import claimed
 from meshsplats.finetuning.run import Progress, ready_loop
 from meshsplats.finetuning.run_options import RunOptions
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

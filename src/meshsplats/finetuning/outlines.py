@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import SplatMesh
 
 BEHIND = 0.1
 """Estimated squared difference, summed over RGB, between a splat and what shows where it no longer is."""

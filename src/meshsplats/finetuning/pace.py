@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.choices import Device
+from meshsplats._common.json_files import read_json
 from meshsplats._files.atomic import write_text
-from meshsplats._json import read_json
-from meshsplats.choices import Device
 from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.datasets.splat_targets import ZOOMS
 from meshsplats.datasets.views import Dataset
@@ -26,8 +26,8 @@ from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.phases.choice import first_phase
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.ordering import drawing_order
+from meshsplats.scene.gaussians import GaussianCloud
 
 FEWEST_STEPS = 150
 """Steps that a run for opaque triangles should have."""

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.plain_colors import plain_means
+from meshsplats.scene.mesh import SplatMesh
 
 MOST_VIEWS = 16
 """Largest number of views that the colours are means over, before they are optimised."""

@@ -7,8 +7,8 @@ from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from meshsplats._common.words import plural
 from meshsplats._files.atomic import in_words
-from meshsplats._words import plural
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import Background, choose_background
 from meshsplats.finetuning.baseline import SizeScores
@@ -21,8 +21,8 @@ from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display
 from meshsplats.finetuning.step import samples_of
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 
 @dataclass(frozen=True)

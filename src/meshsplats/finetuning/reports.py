@@ -7,17 +7,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.choices import Device
+from meshsplats._common.arrays import subsample
+from meshsplats._common.choices import Device
 from meshsplats.datasets.views import Dataset, View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.step import samples_of
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 SCORED_VIEWS = 8
 """Maximum number of held-out views that are scored during a run."""

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._kinds import need
-from meshsplats._origin import need_one_origin
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.kinds import need
 from meshsplats.datasets.splat_targets import are_rendered
 from meshsplats.datasets.views import Dataset
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import OtherRunError
 from meshsplats.finetuning.checkpoint import (
     Checkpoint,
@@ -37,8 +35,10 @@ from meshsplats.finetuning.reports import Reports, scored_count
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import for_views, make_step
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import need_one_origin
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from meshsplats._kinds import need_path
-from meshsplats._options import Range, check_options
-from meshsplats.choices import Device
+from meshsplats._common.choices import Device
+from meshsplats._common.kinds import need_path
+from meshsplats._common.options import Range, check_options
 from meshsplats.datasets.views import CACHE_BYTES
 
 

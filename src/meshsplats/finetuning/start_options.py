@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from meshsplats._options import Advanced
+from meshsplats._common.options import Advanced
 from meshsplats.conversion.options import ConversionOptions, Preset
 
 

@@ -8,11 +8,9 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, nonzero_rows
+from meshsplats._common.arrays import checked_array, nonzero_rows
+from meshsplats._common.choices import Device
 from meshsplats._core.kernels import round_fans
-from meshsplats.camera import Camera
-from meshsplats.choices import Device
-from meshsplats.colors import srgb_to_linear
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored_mesh
@@ -20,11 +18,13 @@ from meshsplats.finetuning.config import HARMONICS_RATE, FinetuneConfig, epsilon
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
 from meshsplats.finetuning.initial import boundary_vertices, order_of, vertex_sizes
 from meshsplats.finetuning.loss import LossRates
-from meshsplats.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.edges import faces_across
 from meshsplats.rendering.engine import Need, Taped, WholeSteps
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
 from meshsplats.webgpu.training import Moments, Parameters, Sums
 from meshsplats.webgpu.training import Rates as StepRates
 

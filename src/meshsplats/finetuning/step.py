@@ -8,11 +8,9 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.silhouettes import has_silhouettes
 from meshsplats.datasets.splat_targets import RenderedSplats, are_rendered
 from meshsplats.datasets.views import View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, HARMONICS_RATE, FinetuneConfig
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
@@ -23,6 +21,8 @@ from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapeOption
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.engine import Need, Taped, WholeSteps
 from meshsplats.rendering.shading import shaded
+from meshsplats.scene.colors import encoding_slope, linear_to_srgb, srgb_to_linear
+from meshsplats.scene.draw_order import DrawOrder
 
 Config = TypeVar("Config", bound=FinetuneConfig)
 

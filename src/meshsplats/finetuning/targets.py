@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from meshsplats._options import Advanced, changed
-from meshsplats._words import parse_up
-from meshsplats.choices import Look, Masks
+from meshsplats._common.choices import Look, Masks
+from meshsplats._common.options import Advanced, changed
+from meshsplats._common.words import parse_up
 from meshsplats.datasets.scene_views import MissingOfData
 from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import FEWEST_VIEWS
 
 if TYPE_CHECKING:
-    from meshsplats.camera import Camera
     from meshsplats.datasets.views import Dataset
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
 
 PLACING = ("placement", "distance", "up")
 """Options of cameras that are placed."""
@@ -120,12 +120,12 @@ class Targets:
 
         Raises ValueError if no view is left to train on, and what ``load_dataset`` or ``splat_dataset`` do.
         """
-        from meshsplats._kinds import need
+        from meshsplats._common.kinds import need
         from meshsplats.cameras.files import cameras_beside, load_cameras
         from meshsplats.datasets.folder import load_dataset
         from meshsplats.datasets.splat_targets import splat_dataset
-        from meshsplats.gaussians import GaussianCloud
-        from meshsplats.mesh import SplatMesh
+        from meshsplats.scene.gaussians import GaussianCloud
+        from meshsplats.scene.mesh import SplatMesh
 
         if self.data is not None:
             dataset = load_dataset(

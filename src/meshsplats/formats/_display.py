@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import SH_C0, GaussianCloud, constant_harmonics
-from meshsplats.spherical_harmonics import sh_basis, spiral
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud, constant_harmonics
+from meshsplats.scene.spherical_harmonics import sh_basis, spiral
 
 _DIRECTIONS = 128
 _AT_ONCE = 1 << 14

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats.camera import OPENGL, Camera
-from meshsplats.choices import MAX_SIDE
+from meshsplats._common.choices import MAX_SIDE
+from meshsplats.scene.camera import OPENGL, Camera
 
 _SIDE = 800
 """Height of the images, pixels; files name only their shape."""

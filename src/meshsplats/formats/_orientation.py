@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.mesh import SplatMesh
+from meshsplats._common.geometry import rotation_rows
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
 """Half turn about x: from y up to y down and back; reverses z, too."""

@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, lost_between, lost_detail, sampled, usual_size
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import choose_origin, lost_between, lost_detail, sampled, usual_size
 
 T = TypeVar("T")
 _BASE_BYTES = 256 << 20

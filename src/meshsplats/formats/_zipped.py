@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from meshsplats._foreign import BROKEN_ZIP
+from meshsplats._common.foreign import BROKEN_ZIP
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 

@@ -11,11 +11,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from meshsplats._common.kinds import need, need_all, need_choice, need_path
+from meshsplats._common.words import legible
 from meshsplats._files.atomic import atomic_path, together
-from meshsplats._kinds import need, need_all, need_choice, need_path
-from meshsplats._words import legible
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.textures import gltf_textures
@@ -30,7 +28,9 @@ from meshsplats.formats.surfaces.text import write_surface_obj, write_surface_pl
 from meshsplats.formats.surfaces.usd import write_surface_usd
 from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
 from meshsplats.formats.usd.textures import usd_textures
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 TextureImage = Literal["png", "jpg", "webp"]
 """Kinds of image files of textures."""
@@ -301,7 +301,7 @@ def _base(
 
 def _display(mesh: SplatMesh) -> np.ndarray:
     """(n, 4) display RGBA of a SplatMesh."""
-    from meshsplats.colors import linear_to_srgb
+    from meshsplats.scene.colors import linear_to_srgb
 
     if mesh.blending == "display":
         return mesh.colors

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._kinds import need
-from meshsplats.mesh import SplatMesh, checked_cutoff
+from meshsplats._common.kinds import need
+from meshsplats.scene.mesh import SplatMesh, checked_cutoff
 
 CUTOFF = 0.2
 """Least opacity that is drawn as solid: of 0.05 to 0.5 the best compromise over an opaque figure, a furry one

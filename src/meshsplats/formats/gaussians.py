@@ -10,9 +10,9 @@ from typing import get_args
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.kinds import each, need, need_path
 from meshsplats._files.atomic import atomic_path
-from meshsplats._kinds import each, need, need_path
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.opening import open_splats, to_y_down
 from meshsplats.formats.ply.activated import Activated
@@ -22,7 +22,7 @@ from meshsplats.formats.sniff import UnreadSplats, content_of, splat_format
 from meshsplats.formats.splat_formats import format_to_write, listed, taken_by, written_suffixes
 from meshsplats.formats.splat_paths import splat_file
 from meshsplats.formats.writing import SpzVersion, Writing
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
 
 
 def load_gaussians(

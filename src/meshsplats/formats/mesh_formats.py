@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from meshsplats.formats.content import Content
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.mesh import SplatMesh
 
 
 @dataclass(frozen=True)

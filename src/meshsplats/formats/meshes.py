@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import check_faces, checked_array
+from meshsplats._common.arrays import check_faces, checked_array
+from meshsplats._common.foreign import foreign, foreign_archive
+from meshsplats._common.kinds import each, need, need_path
 from meshsplats._files.atomic import atomic_path
-from meshsplats._foreign import foreign, foreign_archive
-from meshsplats._kinds import each, need, need_path
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
@@ -31,7 +30,8 @@ from meshsplats.formats.mesh_formats import (
 from meshsplats.formats.ply.mesh import write_mesh_blocks
 from meshsplats.formats.sniff import content_of
 from meshsplats.formats.splat_formats import listed
-from meshsplats.mesh import SplatMesh, checked_cutoff
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh, checked_cutoff
 
 
 def load_mesh(

@@ -22,8 +22,7 @@ from typing import IO
 
 import numpy as np
 
-from meshsplats._foreign import BROKEN_ZIP
-from meshsplats.binding import Binding
+from meshsplats._common.foreign import BROKEN_ZIP
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import (
     Budget,
@@ -34,8 +33,9 @@ from meshsplats.formats._validation import (
 )
 from meshsplats.formats._zipped import BoundedReader
 from meshsplats.formats.mesh_formats import FileSize, MeshCodec
-from meshsplats.mesh import MAX_COLOR, SplatMesh
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.spherical_harmonics import TERMS
 
 _ATTRIBUTE = "attribute_"
 _MAX_HEADER = 10_000

@@ -32,9 +32,9 @@ CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
 
 if TYPE_CHECKING:
-    from meshsplats.base_mesh import BaseMesh
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.base_mesh import BaseMesh
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
 
     MeshEnding = str
     Ending = str
@@ -83,8 +83,8 @@ def scaled(scene: Scene, factor: float | None) -> Scene:
     ValueError for a mesh that is bound to a base mesh, whose lengths are those of the base."""
     import numpy as np
 
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
 
     if factor is None:
         return scene
@@ -101,8 +101,8 @@ def placed(scene: Scene, origin: WantedOrigin) -> Scene:
     details are lost there, OptionValueError for any other word."""
     import numpy as np
 
-    from meshsplats._origin import lost_between, lost_detail, sampled
-    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.origin import lost_between, lost_detail, sampled
 
     check_origin(origin)
     if isinstance(origin, str):
@@ -120,8 +120,8 @@ def _size_of(scene: GaussianCloud | SplatMesh | BaseMesh) -> float:
     """Usual size of a splat or a triangle, scene units; of a sample of them."""
     import numpy as np
 
-    from meshsplats._origin import sampled, usual_size
-    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.origin import sampled, usual_size
 
     if isinstance(scene, GaussianCloud):
         return usual_size(scene.scales) if len(scene) else 0.0
@@ -171,7 +171,7 @@ def check_mesh_endings(*kinds: str) -> None:
 def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:
     """The options in the configuration file at ``path``; None if there is none, or of another command than
     ``name``."""
-    from meshsplats import _toml as toml  # Python 3.10 has no parser of its own
+    from meshsplats._common import toml  # Python 3.10 has no parser of its own
 
     try:
         record = toml.load(path)

@@ -8,12 +8,12 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from meshsplats._kinds import need_choice
+from meshsplats._common.kinds import need_choice
 from meshsplats.formats._display import display_cloud
 from meshsplats.formats.content import Content
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.ply.activated import Activated, checked_activated
-from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud, Kernel
+from meshsplats.scene.gaussians import LEAST_OPACITY, GaussianCloud, Kernel
 
 Axes = Literal["auto", "y-down", "y-up"]
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.kinds import need, need_path
 from meshsplats._files.atomic import atomic_path
-from meshsplats._kinds import need, need_path
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.meshes import expected_bytes
 from meshsplats.formats.surfaces.corners import warn_of_tints
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 SUFFIXES = (".glb", ".usdc", ".usda", ".usd", ".usdz")
 _SAME = 1e-3

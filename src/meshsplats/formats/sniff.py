@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from meshsplats._foreign import foreign, foreign_archive
+from meshsplats._common.foreign import foreign, foreign_archive
 from meshsplats.errors import FileFormatError
 from meshsplats.formats import splat_formats
 from meshsplats.formats.content import Container, Content

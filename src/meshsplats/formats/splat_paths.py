@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from meshsplats._foreign import IMAGE_SUFFIXES
+from meshsplats._common.foreign import IMAGE_SUFFIXES
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.splat_formats import double_suffixes, folder_files
 

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._kinds import described, need_path, require_path
-from meshsplats._origin import choose_origin, need_detail
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.kinds import described, need_path, require_path
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.opening import open_splats, to_y_down
@@ -24,7 +23,8 @@ from meshsplats.formats.reading import Axes, Reading
 from meshsplats.formats.sniff import archives_of_splats, content_of, identify, splat_format
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named, splat_file
-from meshsplats.gaussians import GaussianCloud, Kernel, shared_up
+from meshsplats.scene.gaussians import GaussianCloud, Kernel, shared_up
+from meshsplats.scene.origin import choose_origin, need_detail
 
 
 class SplatStream:

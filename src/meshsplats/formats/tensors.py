@@ -21,15 +21,15 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, subsample
-from meshsplats._kinds import described, need, need_choice
+from meshsplats._common.arrays import checked_array, subsample
+from meshsplats._common.kinds import described, need, need_choice
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.formats import _activation
 from meshsplats.formats._validation import local_positions
 from meshsplats.formats.ply import activated as stored_activated
 from meshsplats.formats.ply.activated import Activated
 from meshsplats.formats.splats._cloud_builder import CloudBuilder
-from meshsplats.gaussians import GaussianCloud, Kernel, constant_harmonics
+from meshsplats.scene.gaussians import GaussianCloud, Kernel, constant_harmonics
 
 if TYPE_CHECKING:
     import torch as torch_library

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 SpzVersion = Literal[3, 4]
 

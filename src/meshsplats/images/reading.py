@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.choices import MAX_SIDE
+from meshsplats._common.choices import MAX_SIDE
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 
 MAX_PIXELS = 1 << 26

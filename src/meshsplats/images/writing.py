@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from meshsplats._arrays import check_units
+from meshsplats._common.arrays import check_units
+from meshsplats._common.kinds import need_array, need_path
 from meshsplats._files.atomic import write_bytes
-from meshsplats._kinds import need_array, need_path
 
 if TYPE_CHECKING:
     from PIL import Image

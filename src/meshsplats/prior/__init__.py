@@ -5,7 +5,7 @@ Needs NumPy alone.
 
 from typing import TYPE_CHECKING
 
-from meshsplats._lazy import lazy_names
+from meshsplats._common.lazy import lazy_names
 
 __all__ = [
     "LIFT",
@@ -19,14 +19,14 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from meshsplats.base_mesh import BaseMesh, Texture
     from meshsplats.prior.laying import bind
     from meshsplats.prior.model import LIFT, MeshPrior, load_prior
     from meshsplats.prior.options import prior_config
     from meshsplats.prior.training import train_prior
+    from meshsplats.scene.base_mesh import BaseMesh, Texture
 else:
     _HOME = {
-        "meshsplats.base_mesh": ("BaseMesh", "Texture"),
+        "meshsplats.scene.base_mesh": ("BaseMesh", "Texture"),
         "meshsplats.prior.laying": ("bind",),
         "meshsplats.prior.model": ("LIFT", "MeshPrior", "load_prior"),
         "meshsplats.prior.options": ("prior_config",),

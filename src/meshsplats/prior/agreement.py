@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._words import direction_in_words
-from meshsplats.base_mesh import BaseMesh
+from meshsplats._common.words import direction_in_words
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.gaussians import GaussianCloud
 
 _LARGER, _SMALLER = 5.0, 1 / 30
 """How many times as large as the splats a base may be; one may be of a small part of them."""

@@ -8,16 +8,16 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._kinds import as_whole, need, need_all, need_choice
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.binding import Binding
+from meshsplats._common.kinds import as_whole, need, need_all, need_choice
 from meshsplats.datasets.views import View
 from meshsplats.errors import DataWarning
-from meshsplats.mesh import SplatMesh
 from meshsplats.prior.model import MeshPrior
 from meshsplats.prior.options import LAYERS, Source
 from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 from meshsplats.prior.shells import DepthViews, render_depth_views
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces.color_projection import colors_from_views
 
 MAX_LAYERS = 16

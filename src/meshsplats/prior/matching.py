@@ -7,8 +7,8 @@ from itertools import permutations, product
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.binding import Binding
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.binding import Binding
 
 _CLOSE = 0.1
 """Largest distance of the vertices from those of a base with other axes, relative to its size, and to the

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._kinds import need, need_path
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.mesh import SplatMesh
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.kinds import need, need_path
 from meshsplats.prior.matching import matched_vertices
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 LIFT = 2e-5
 """Distance between two layers of exported meshes, relative to the diagonal of the base's bounding box: enough

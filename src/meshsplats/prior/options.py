@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from meshsplats._options import check_options
+from meshsplats._common.options import check_options
 from meshsplats.errors import OptionsError
 from meshsplats.finetuning.config import FinetuneConfig, make_config
 
 if TYPE_CHECKING:
-    from meshsplats.base_mesh import BaseMesh
+    from meshsplats.scene.base_mesh import BaseMesh
 
 Source = Literal["auto", "texture", "vertices", "views", "grey"]
 LAYERS = 6

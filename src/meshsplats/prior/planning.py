@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._kinds import as_path
-from meshsplats._words import natural_key
-from meshsplats.base_mesh import BaseMesh
+from meshsplats._common.kinds import as_path
+from meshsplats._common.words import natural_key
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.views import Dataset
@@ -31,13 +30,14 @@ from meshsplats.formats.mesh_formats import keeps, written_mesh_suffixes
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import check_mesh_suffix, check_outputs
 from meshsplats.formats.usd.reader import usd_frames
-from meshsplats.mesh import SplatMesh
 from meshsplats.prior.agreement import warn_of_contradictions
 from meshsplats.prior.laying import bind
 from meshsplats.prior.matching import exchanged_axes, in_words
 from meshsplats.prior.model import MeshPrior, load_prior
 from meshsplats.prior.options import LayingOptions
 from meshsplats.prior.training import train_prior
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 @dataclass(frozen=True)

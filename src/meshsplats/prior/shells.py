@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import spread_indices
-from meshsplats._geometry import vertex_normals
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import spread_indices
+from meshsplats._common.geometry import vertex_normals
 from meshsplats.cameras.trajectories import dome
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 MAX_VIEWS = 24
 """Maximum number of depth images."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from meshsplats._kinds import need
+from meshsplats._common.kinds import need
 from meshsplats.prior.options import prior_config
 
 if TYPE_CHECKING:

@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from meshsplats._arrays import check_faces
+from meshsplats._common.arrays import check_faces
+from meshsplats._common.choices import Device
+from meshsplats._common.kinds import each, need, need_numbers
 from meshsplats._core import library, structures
-from meshsplats._kinds import each, need, need_numbers
-from meshsplats.camera import Camera
-from meshsplats.choices import Device
-from meshsplats.gaussians import DILATION, LOW_PASS_PX2, GaussianCloud
-from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
-from meshsplats.order import Order, checked_order
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import ImageOptions, check_device
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import DILATION, LOW_PASS_PX2, GaussianCloud
+from meshsplats.scene.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
+from meshsplats.scene.order import Order, checked_order
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from meshsplats._kinds import need_all
-from meshsplats.camera import Camera
-from meshsplats.choices import Device
+from meshsplats._common.choices import Device
+from meshsplats._common.kinds import need_all
 from meshsplats.errors import GET_TORCH, MissingDependencyError
-from meshsplats.mesh import MIN_TRANSMITTANCE
-from meshsplats.order import Order
 from meshsplats.rendering.backward import TAPE_BYTES, TapeOptions
 from meshsplats.rendering.devices import engine
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MIN_TRANSMITTANCE
+from meshsplats.scene.order import Order
 
 if TYPE_CHECKING:
     import torch

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._core import kernels, library, structures
-from meshsplats.camera import Camera
-from meshsplats.draw_order import DrawOrder
-from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_cutoff
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options, mesh_struct
 from meshsplats.rendering.shading import Shading
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import MIN_TRANSMITTANCE, Triangles, checked_cutoff
 
 TAPE_BYTES = 128 << 20
 """Largest size of the tape of one image, which takes about two bytes a fragment. The backward pass renders

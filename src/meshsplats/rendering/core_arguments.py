@@ -7,13 +7,13 @@ from ctypes import c_double
 
 import numpy as np
 
+from meshsplats._common.choices import MAX_SIDE
+from meshsplats._common.kinds import need_array
 from meshsplats._core import library, structures
 from meshsplats._core.library import check_threads
-from meshsplats._kinds import need_array
-from meshsplats.camera import Camera
-from meshsplats.choices import MAX_SIDE
-from meshsplats.mesh import MAX_COLOR, Triangles, checked_filter
-from meshsplats.order import checked_order
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MAX_COLOR, Triangles, checked_filter
+from meshsplats.scene.order import checked_order
 
 MAX_SAMPLES = 16
 """Largest side of the grid of samples in each pixel."""

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshsplats._core import library, structures
-from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options, mesh_struct
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
 from meshsplats.rendering.shading import shaded
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh, Triangles
 
 
 @dataclass(frozen=True)

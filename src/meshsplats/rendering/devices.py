@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from meshsplats.choices import Device
+from meshsplats._common.choices import Device
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import Engine, check_device
 from meshsplats.rendering.gpu import gpu_engine

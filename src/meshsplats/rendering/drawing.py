@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from meshsplats._words import optional_color
-from meshsplats.order import Order
+from meshsplats._common.words import optional_color
+from meshsplats.scene.order import Order
 
 if TYPE_CHECKING:
-    from meshsplats.camera import Camera
-    from meshsplats.gaussians import GaussianCloud
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.gaussians import GaussianCloud
+    from meshsplats.scene.mesh import SplatMesh
 
 LONG_SECONDS = 10
 """Images that take longer than this, as far as can be estimated, are announced."""

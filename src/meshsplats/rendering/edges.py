@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._common.geometry import edge_groups
 from meshsplats._core import kernels
-from meshsplats._geometry import edge_groups
-from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import render
 from meshsplats.rendering.shading import seen_from
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 EDGE_SAMPLES = 2
 """Samples along each side of a pixel between which edges are looked for."""

@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.choices import Device
-from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, Triangles
-from meshsplats.order import Order
+from meshsplats._common.choices import Device
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MIN_TRANSMITTANCE, SplatMesh, Triangles
+from meshsplats.scene.order import Order
 from meshsplats.webgpu.training import Parameters, Rates, Sums
 
 Need = Literal[

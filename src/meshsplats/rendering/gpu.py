@@ -10,13 +10,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 import numpy as np
 
 from meshsplats._core.kernels import regular_polygon
-from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh, Triangles, checked_filter
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, TapeOptions
 from meshsplats.rendering.core_arguments import Pointers, checked_options
 from meshsplats.rendering.engine import Drawn, ImageOptions, Need
 from meshsplats.rendering.shading import Shading
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh, Triangles, checked_filter
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES
 from meshsplats.webgpu.gradients import (

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats._core.library import processors
-from meshsplats.camera import Camera
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 SAMPLE = 20_000
 """Triangles or splats that are looked at, evenly spread."""

@@ -7,16 +7,16 @@ from typing import get_args
 
 import numpy as np
 
-from meshsplats._kinds import need
-from meshsplats.camera import Camera
-from meshsplats.choices import Device, Look
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.draw_order import DrawOrder
-from meshsplats.gaussians import DILATION, GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats._common.choices import Device, Look
+from meshsplats._common.kinds import need
 from meshsplats.rendering.api import Rendering, render, render_splats
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
 from meshsplats.rendering.samples import needed_samples
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import DILATION, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 GROUND_TRUTHS: dict[Look, str] = {
     "area": "splats as means over each pixel's area",

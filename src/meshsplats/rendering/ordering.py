@@ -8,18 +8,18 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
+from meshsplats._common.kinds import need, need_all
 from meshsplats._core import kernels
 from meshsplats._core.library import check_threads
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import dome, orbit
-from meshsplats.draw_order import DrawOrder
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.core_arguments import camera_struct
 from meshsplats.rendering.looks import image_of
 from meshsplats.rendering.viewers import ordered_image
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import SplatMesh
 
 VIEWS = 96
 """Largest number of views that an order is solved for."""

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import check_faces
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import OUT_OF_SIGHT, Camera
-from meshsplats.mesh import SplatMesh
+from meshsplats._common.arrays import check_faces
+from meshsplats._common.kinds import need, need_all
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import visible_pixels
 from meshsplats.rendering.shading import shaded
+from meshsplats.scene.camera import OUT_OF_SIGHT, Camera
+from meshsplats.scene.mesh import SplatMesh
 
 _HIDDEN_PIXELS = 1e-6
 """Weight in a view of a vertex that the view does not show, so that one that none shows has a mean, too."""

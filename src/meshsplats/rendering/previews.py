@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.draw_order import DrawOrder
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_image
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import render_splats
 from meshsplats.rendering.layers import affordable
 from meshsplats.rendering.looks import image_of
 from meshsplats.rendering.samples import FEWEST, needed_samples
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 TRIANGLES = 1_000_000
 """Triangles of a mesh above which its preview is half as wide, with the fewest samples. Of 2 to 17 million

@@ -13,10 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.colors import linear_to_srgb
-from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
-from meshsplats.order import Order
 from meshsplats.rendering.api import Rendering, resolved_order
 from meshsplats.rendering.reference_samples import (
     checked_background,
@@ -24,7 +20,11 @@ from meshsplats.rendering.reference_samples import (
     sample_positions,
     to_camera,
 )
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.mesh import SplatMesh, checked_cutoff, checked_filter
+from meshsplats.scene.order import Order
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 FILTER_MIN_VARIANCE = 1e-4
 """The filter takes no fan to have a smaller variance than this share of its own."""

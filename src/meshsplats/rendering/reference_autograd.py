@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import SplatMesh, Triangles
-from meshsplats.order import Order
 from meshsplats.rendering import reference
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import SplatMesh, Triangles
+from meshsplats.scene.order import Order
 
 try:
     import torch
@@ -29,7 +29,7 @@ except ImportError as error:
 from meshsplats.rendering.autograd import Raster
 from meshsplats.rendering.backward import OpacityRamp
 from meshsplats.rendering.reference_samples import sample_positions
-from meshsplats.spherical_harmonics import degree_of, sh_basis
+from meshsplats.scene.spherical_harmonics import degree_of, sh_basis
 
 
 def rasterize(

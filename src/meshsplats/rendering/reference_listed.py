@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.draw_order import DrawOrder
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.reference import _cover, _edge_functions
 from meshsplats.rendering.reference_samples import sample_positions, to_camera
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 
 class Painted(NamedTuple):

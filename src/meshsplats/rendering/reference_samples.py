@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
+from meshsplats.scene.camera import Camera
 
 
 def checked_background(background: Sequence[float] | np.ndarray, camera: Camera) -> np.ndarray:

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.gaussians import DILATION, LEAST_OPACITY, GaussianCloud
 from meshsplats.rendering.api import Rendering
 from meshsplats.rendering.reference_samples import (
     checked_background,
@@ -16,6 +14,8 @@ from meshsplats.rendering.reference_samples import (
     sample_positions,
     to_camera,
 )
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import DILATION, LEAST_OPACITY, GaussianCloud
 
 SPLAT_MAX_ALPHA = 0.99
 """No splat is more opaque than this at a sample, as in 3DGS."""

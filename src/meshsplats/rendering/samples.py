@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
+from meshsplats._common.kinds import need, need_all
 from meshsplats.cameras.framing import weighted_quantile
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 FEWEST, MOST = 2, 8
 """Least and greatest side of the grid of samples in each pixel."""

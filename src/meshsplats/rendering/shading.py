@@ -12,8 +12,8 @@ import numpy as np
 
 from meshsplats._core import library
 from meshsplats._core.structures import ShadingStruct
-from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh, Triangles
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh, Triangles
 
 
 def camera_center(camera: Camera, pose: np.ndarray | None = None) -> np.ndarray:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from meshsplats._arrays import subsample
-from meshsplats.camera import OUT_OF_SIGHT, Camera, hiding_near_plane
+from meshsplats._common.arrays import subsample
 from meshsplats.errors import warn_of_data
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.api import render_splats
+from meshsplats.scene.camera import OUT_OF_SIGHT, Camera, hiding_near_plane
+from meshsplats.scene.gaussians import GaussianCloud
 
 _POINTS = 20_000
 """Centres that are looked at first: most cameras see some of them."""

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._kinds import described
-from meshsplats.camera import Camera
+from meshsplats._common.kinds import described
 from meshsplats.errors import GET_TORCH, MissingDependencyError
-from meshsplats.face_splats import FaceSplats, check_ascending
-from meshsplats.mesh import Triangles
-from meshsplats.order import Order
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.engine import Engine, Taped
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.face_splats import FaceSplats, check_ascending
+from meshsplats.scene.mesh import Triangles
+from meshsplats.scene.order import Order
+from meshsplats.scene.spherical_harmonics import TERMS
 
 try:
     import torch

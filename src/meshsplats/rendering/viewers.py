@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._core import kernels
-from meshsplats.camera import Camera
-from meshsplats.colors import linear_to_srgb
-from meshsplats.draw_order import DrawOrder
-from meshsplats.mesh import SplatMesh, checked_cutoff
 from meshsplats.rendering.core_arguments import Pointers, camera_struct, checked_options
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh, checked_cutoff
 
 
 def viewer_images(

@@ -9,17 +9,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Shared, Workers
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, recorded_options, view_names
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import encode_array, encode_depth_png, encode_image, straight_rgba
-from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.samples import needed_samples
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.order import Order
 from meshsplats.tiles.drawing import MAX_ERROR, render_tiles, samples_for
 from meshsplats.tiles.tileset import Tileset
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from meshsplats._options import changed, check_options
+from meshsplats._common.options import changed, check_options
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import SceneViews
 from meshsplats.errors import OptionsError
@@ -58,7 +58,7 @@ class ImageOptions:
         if self.as_splats and self.depth != "none":
             raise OptionsError("``depth`` is that of a mesh: leave out ``as_splats``")
         if self.cutoff is not None:
-            from meshsplats.mesh import checked_cutoff
+            from meshsplats.scene.mesh import checked_cutoff
 
             checked_cutoff(self.cutoff)
             if self.as_splats:

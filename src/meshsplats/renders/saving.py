@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from meshsplats._common.kinds import as_path
 from meshsplats._files.atomic import write_bytes
-from meshsplats._kinds import as_path
-from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.conversion.cleaning import cropped
@@ -19,11 +18,12 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.errors import DataWarning, OptionsError, OptionValueError
 from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, view_names
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.drawing import announce_cost
 from meshsplats.renders.frames import FrameOptions, Scene, depth_unit, draw_frames, remove_older
 from meshsplats.renders.options import ImageOptions
+from meshsplats.scene.camera import Camera, hiding_near_plane
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.tiles.drawing import MAX_ERROR
 from meshsplats.tiles.source import open_tileset, outline
 from meshsplats.tiles.tileset import Tileset

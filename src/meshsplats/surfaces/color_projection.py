@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats.binding import Binding
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.views import View
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.mesh import SplatMesh
 
 BEST_VIEWS = 4
 """Number of views that determine the colour of a point: those that see it most frontally."""

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats._files.atomic import together
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.scene_files import SceneReading
@@ -22,10 +20,12 @@ from meshsplats.errors import OptionsError
 from meshsplats.formats import base_meshes
 from meshsplats.formats.outputs import CONFIGURATION, PREVIEW, beside, check_outputs, scaled
 from meshsplats.formats.surfaces.solids import upright
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_image
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.previews import SIDE
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces import draw_surface
 from meshsplats.surfaces.fusion import parts_of
 from meshsplats.surfaces.making import surfaces_from

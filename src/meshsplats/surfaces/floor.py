@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import level_axes
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import level_axes
+from meshsplats.scene.camera import Camera
 
 CELL = 2.0
 """Side of a cell in voxels."""

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from meshsplats._core.surfaces import Grid, fuse_depth
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds, weighted_quantile
 from meshsplats.errors import MissingDependencyError
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.core_arguments import camera_struct
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces.options import MAX_RESOLUTION, USUAL_RESOLUTION
 
 TRUNCATION = 3.0

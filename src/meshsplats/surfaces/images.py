@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import block_means
+from meshsplats._common.arrays import block_means
+from meshsplats._common.kinds import need
 from meshsplats._core.surfaces import (
     Samples,
     coordinate_gradients,
@@ -16,12 +17,8 @@ from meshsplats._core.surfaces import (
     texel_sums,
     texture_samples,
 )
-from meshsplats._kinds import need
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.camera import Camera
 from meshsplats.formats.surfaces.corners import check_texture, opaque_pixels
 from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
-from meshsplats.mesh import Triangles
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering, TapeOptions
 from meshsplats.rendering.edges import (
@@ -32,6 +29,9 @@ from meshsplats.rendering.edges import (
     indices_of,
     motion_gradients,
 )
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import Triangles
 
 SAMPLES = 2
 """Samples along each side of a pixel."""

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from meshsplats._common.kinds import need, need_all
+from meshsplats._common.options import check_names
 from meshsplats._core.surfaces import Grid
-from meshsplats._kinds import need, need_all
-from meshsplats._options import check_names
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.binding import Binding
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import convert
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.formats.surfaces.solids import warn_of_gaps
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces.atlas import cells, cells_side, unwrap
 from meshsplats.surfaces.color_projection import colors_from_views
 from meshsplats.surfaces.fitting import fit, mean_colors

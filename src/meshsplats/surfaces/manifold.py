@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats._geometry import edge_groups, vertex_normals
+from meshsplats._common.geometry import edge_groups, vertex_normals
 from meshsplats.surfaces.fusion import collapsed, parts_of
 
 _ROUNDS = 20

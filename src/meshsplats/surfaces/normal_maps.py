@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import vertex_normals
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import vertex_normals
 from meshsplats.conversion.normals import unit
 from meshsplats.formats.surfaces.tangents import Frames, corner_frames
-from meshsplats.mesh import Triangles
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
 from meshsplats.rendering.edges import index_digits, indices_of
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import Triangles
 from meshsplats.surfaces.atlas import filled
 
 _NEIGHBOURS = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, TypedDict
 
-from meshsplats._options import Advanced, Range, With, check_options
+from meshsplats._common.options import Advanced, Range, With, check_options
 
 Shape = Literal["auto", "closed", "open", "floor"]
 

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import block_means
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import block_means
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.placing import has_surroundings
 from meshsplats.cameras.trajectories import dome
 from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.surfaces.fusion import libraries
 from meshsplats.surfaces.images import SAMPLES
 from meshsplats.surfaces.options import SurfaceOptions

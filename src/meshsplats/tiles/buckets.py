@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.geometry import morton_codes
 from meshsplats._files import DISK_FULL
-from meshsplats._geometry import morton_codes
 from meshsplats.errors import FileFormatError
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
 from meshsplats.tiles.journal import Journal
 
 DEPTH = 20

@@ -19,12 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.kinds import need, need_path
+from meshsplats._common.words import plural
 from meshsplats._core.library import check_threads
 from meshsplats._files.atomic import atomic_path, replace_folder
 from meshsplats._files.locks import locked
-from meshsplats._kinds import need, need_path
-from meshsplats._words import plural
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, default_up, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cluster import Shared, Workers
@@ -36,8 +35,9 @@ from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, c
 from meshsplats.formats.gltf.writer import change_alpha
 from meshsplats.formats.outputs import check_resumption
 from meshsplats.formats.streaming import SplatStream
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.tiles.buckets import BUCKET, Buckets, Cube, records_of
 from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._kinds import need, need_all
-from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh
+from meshsplats._common.arrays import subsample
+from meshsplats._common.kinds import need, need_all
 from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.samples import CAMERAS, needed_samples
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.tiles.tileset import Tile, Tileset
 
 MAX_ERROR = 1.0

@@ -23,8 +23,8 @@ from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.splat_tiles import write_splat_tile
 from meshsplats.formats.gltf.writer import Alpha
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.gaussians import GaussianCloud, Kernel
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.tiles.buckets import (
     DEPTH,
     Cube,

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal
 
-from meshsplats._options import Range, check_options
-from meshsplats._words import parse_up
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.options import Range, check_options
+from meshsplats._common.words import parse_up
 from meshsplats.conversion.options import ConversionOptions, Preset
 
 TilesAlpha = Literal["auto", "blend", "mask", "opaque"]

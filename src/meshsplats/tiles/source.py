@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from meshsplats.errors import OptionsError
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.tiles import is_tileset
 from meshsplats.tiles.tileset import Tileset
 

@@ -15,12 +15,12 @@ from urllib.parse import unquote
 import numpy as np
 
 from meshsplats import __version__
-from meshsplats._json import read_json
-from meshsplats._origin import in_words
-from meshsplats._words import plural
+from meshsplats._common.json_files import read_json
+from meshsplats._common.words import plural
 from meshsplats.errors import DataWarning, FileFormatError, OptionValueError
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.streaming import SplatStream
+from meshsplats.scene.origin import in_words
 from meshsplats.tiles.options import TileOptions
 
 _NAMING = (".json", ".gltf", ".lcc")

@@ -17,11 +17,9 @@ from typing import Any
 import numpy as np
 
 from meshsplats import __version__
+from meshsplats._common.geometry import away_from_ground
+from meshsplats._common.kinds import need_path
 from meshsplats._files.atomic import write_text
-from meshsplats._geometry import away_from_ground
-from meshsplats._kinds import need_path
-from meshsplats._origin import FAR
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import has_northing_along_z
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import tile_frame
@@ -38,7 +36,9 @@ from meshsplats.formats.gltf.tileset_file import (
     read_tileset,
 )
 from meshsplats.formats.meshes import load_mesh
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import FAR
 from meshsplats.tiles import NAME
 
 LEVELS_PER_FILE = 3

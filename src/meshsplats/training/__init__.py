@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from meshsplats._lazy import lazy_names
+from meshsplats._common.lazy import lazy_names
 
 __all__ = ["TrainConfig", "starting_fans", "train", "train_config"]
 

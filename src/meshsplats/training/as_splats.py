@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from meshsplats._geometry import quaternions_of
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.conversion.profiles import fit_profile
 from meshsplats.conversion.recovery import THICKNESS
 from meshsplats.datasets.views import Dataset, View
@@ -19,9 +19,9 @@ from meshsplats.finetuning.run import Progress, TrainingLoop, run_start
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import for_views
-from meshsplats.gaussians import DILATION, SH_C0, GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Need
+from meshsplats.scene.gaussians import DILATION, SH_C0, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.exposures import exposures_differ
 from meshsplats.training.growth import corners_of, fan_count, select_fans

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
-from meshsplats._options import Advanced, Fixed, Range, check_names
+from meshsplats._common.options import Advanced, Fixed, Range, check_names
 from meshsplats.finetuning.config import HARMONICS_RATE, LENGTHS, BackgroundMode, FinetuneConfig
 
 MASKED_SHARE = 0.4

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._arrays import spread_indices
-from meshsplats._geometry import level_axes
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import spread_indices
+from meshsplats._common.geometry import level_axes
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.datasets.views import View
 from meshsplats.images.writing import strip
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training.growth import SHELL, corners_of
 from meshsplats.training.initial import ranges_of_cameras
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.reduced import reduced_views
 from meshsplats.datasets.views import ImageCache, View
 from meshsplats.evaluation.report import exposure_between
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
+from meshsplats.scene.mesh import SplatMesh
 
 VIEWS, SIDE = 24, 200
 """Maximum number of views, evenly spread, that are looked at, and of pixels along their longer side."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.image_files import Album
 from meshsplats.datasets.photo_file import light_of_mask
 from meshsplats.datasets.views import ImageCache

@@ -15,7 +15,7 @@ from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, view_of_step
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training.config import TrainConfig
 from meshsplats.training.growth import NearFields, corners_of, fan_count, grow, score, select_fans
 from meshsplats.training.schedule import budget, events_passed, image_factor

@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, samples_of
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import scatter_to_vertices
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 
 JUDGED_VIEWS = 20
 """Maximum number of training views, evenly spread, in which fans are judged."""

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 
 HLG, PQ = 18, 16
 """FFmpeg's numbers of the transfer functions of HDR (ITU-R BT.2100)..."""

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.datasets.silhouettes import OPAQUE, has_alpha
 from meshsplats.datasets.views import View
+from meshsplats.scene.camera import Camera
 
 FIRST_LEVEL = 32
 """Cells along each side of the first grid. Each further one has twice as many."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.choices import Masks, Missing
+from meshsplats._common.choices import Masks, Missing
 from meshsplats.datasets.folder import MOST_DOWNSCALE, load_dataset
 from meshsplats.errors import DataWarning
 

@@ -7,19 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats._core.stereo import SurfaceArrays
-from meshsplats.camera import Camera
 from meshsplats.conversion import convert
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import reduced_views
 from meshsplats.datasets.silhouettes import has_silhouettes
 from meshsplats.datasets.views import ImageCache, View
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.engine import scatter_to_vertices
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training.hull import carve, in_silhouettes
 from meshsplats.training.patches import Patches, flat_splats, fused
 from meshsplats.training.stereo import REFERENCES, SIDE, find_depths

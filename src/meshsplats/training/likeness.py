@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 
 ALL_UP_TO = 60
 """Photographs up to which all pairs are matched."""

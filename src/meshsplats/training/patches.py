@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._common.geometry import quaternions_of
 from meshsplats._core.stereo import SurfaceArrays, fuse_points
-from meshsplats._geometry import quaternions_of
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 from meshsplats.training.stereo import Depths
 
 LARGEST = 8.0

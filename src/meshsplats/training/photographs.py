@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from meshsplats.choices import Masks, Missing
+from meshsplats._common.choices import Masks, Missing
 from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import BACKGROUNDS
 from meshsplats.finetuning.targets import check_cache

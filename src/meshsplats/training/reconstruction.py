@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._common.json_files import read_json
 from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together, write_bytes, write_text
-from meshsplats._json import read_json
 from meshsplats.datasets.image_files import Shelf, inside
 from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._kinds import need
+from meshsplats._common.kinds import need
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import reduced_views
@@ -25,9 +25,9 @@ from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.step import for_views
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.images.writing import save_image
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.devices import engine
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.spherical_harmonics import TERMS
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.coverage import coverage_picture
 from meshsplats.training.exposures import exposures_differ

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats._core.stereo import (
     Layout,
     Pairs,
@@ -23,10 +23,10 @@ from meshsplats._core.stereo import (
     fill_depths,
     match_photos,
 )
-from meshsplats.camera import Camera
 from meshsplats.datasets.reduced import reduced_image
 from meshsplats.datasets.views import View
 from meshsplats.rendering.core_arguments import camera_struct
+from meshsplats.scene.camera import Camera
 
 SIDE = 400
 """Longer side of the images that are matched, in pixels."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import spread_indices, subsample
+from meshsplats._common.arrays import spread_indices, subsample
 from meshsplats.datasets.reduced import reduced_image
 from meshsplats.datasets.views import View, ViewImage
 

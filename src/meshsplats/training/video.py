@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._common.foreign import VIDEO_SUFFIXES
+from meshsplats._common.json_files import read_json
 from meshsplats._files.atomic import write_json
-from meshsplats._foreign import VIDEO_SUFFIXES
-from meshsplats._json import read_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image

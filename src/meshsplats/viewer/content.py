@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import block_means
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import block_means
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion.budget import usual_triangles_each
@@ -21,11 +19,13 @@ from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.merging_views import merging_views, views_of_place
 from meshsplats.conversion.recovery import recover_splats
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.layers import SMALLEST, affordable
 from meshsplats.rendering.previews import USUAL
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer.page import Page, PageOptions, estimated_size, make_page
 
 SIDE = 400

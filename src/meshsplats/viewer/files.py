@@ -7,9 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from meshsplats._words import optional_color, optional_up
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
+from meshsplats._common.words import optional_color, optional_up
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.conversion.merging_views import VIEWS
@@ -20,8 +18,10 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.errors import OptionsError
 from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.formats.base_meshes import load_base
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer import content
 from meshsplats.viewer.content import (
     MOST_TRIANGLES,

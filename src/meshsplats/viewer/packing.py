@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.cameras.framing import scene_bounds
-from meshsplats.face_splats import FaceSplats
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer.streams import Packer, rounded
 
 FINER = 8

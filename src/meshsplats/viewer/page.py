@@ -19,11 +19,9 @@ from importlib import resources
 
 import numpy as np
 
-from meshsplats._arrays import subsample
-from meshsplats._kinds import need, need_all
-from meshsplats._words import legible
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
+from meshsplats._common.arrays import subsample
+from meshsplats._common.kinds import need, need_all
+from meshsplats._common.words import legible
 from meshsplats.cameras.framing import (
     COVERED,
     MARGIN,
@@ -35,9 +33,11 @@ from meshsplats.cameras.framing import (
 )
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.formats.surfaces.vertex_colors import texture_to_vertex_colors
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order, checked_order
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.order import Order, checked_order
 from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_mesh
 from meshsplats.viewer.surface import PackedSurface, pack_surface

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats.cameras.framing import scene_bounds
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer.packing import SAMPLE, Precision, pack_in_order, pack_mesh, pack_splats, vertex_order
 from meshsplats.viewer.unpacking import unpack_mesh
 

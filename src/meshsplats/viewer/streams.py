@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._json import json_object
+from meshsplats._common.json_files import json_object
 
 MAGIC = b"MSplat01"
 LARGEST = (1 << 31) - 1

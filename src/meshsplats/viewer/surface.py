@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.surfaces.corners import check_texture, corners_of, plain_mesh, texture_file
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer.packing import vertex_order
 from meshsplats.viewer.quantise import QuantisedMesh, quantise_mesh
 from meshsplats.viewer.streams import Packer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer.packing import others_than, predict
 from meshsplats.viewer.streams import Unpacker
 

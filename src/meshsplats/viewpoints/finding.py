@@ -10,9 +10,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from meshsplats._kinds import need
-from meshsplats._words import direction_in_words
-from meshsplats.camera import Camera
+from meshsplats._common.choices import MAX_SIDE
+from meshsplats._common.kinds import need
+from meshsplats._common.words import direction_in_words
 from meshsplats.cameras.framing import DEFAULT_UP, guess_up, scene_bounds, unit_up, up_of_survey
 from meshsplats.cameras.placing import (
     OBJECT_ELEVATIONS,
@@ -21,10 +21,10 @@ from meshsplats.cameras.placing import (
     has_surroundings,
     outside_cameras,
 )
-from meshsplats.choices import MAX_SIDE
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import FRAGMENTS, preview_camera
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.kind import (
     FEWEST,
     Kind,

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import front_axes, scene_bounds, unit_up, weighted_quantile
 from meshsplats.cameras.placing import cameras_around
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.sample import COARSE, AllSplats, Sample
 from meshsplats.viewpoints.search import Places
 

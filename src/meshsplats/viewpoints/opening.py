@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._geometry import quaternions_of
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import render, render_splats
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import USUAL, preview_camera
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 DIRECTIONS = 12
 """Directions around the object that are looked from."""

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import level_axes
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import level_axes
 from meshsplats.cameras.placing import STEPS
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.thinning import sizes_of
 from meshsplats.viewpoints.views import NEAR_SHARE
 

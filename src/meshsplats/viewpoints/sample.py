@@ -12,13 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
+from meshsplats._common.geometry import level_axes, rotation_rows
 from meshsplats._core.library import processors
-from meshsplats._geometry import level_axes, rotation_rows
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.gaussians import DILATION, SH_C0, GaussianCloud
 from meshsplats.rendering.api import Rendering, render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import DILATION, SH_C0, GaussianCloud
 from meshsplats.viewpoints.thinning import ByPlace, largest, sizes_of, without_harmonics
 
 SAMPLE = 50_000

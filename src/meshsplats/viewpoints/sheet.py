@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.api import render_splats
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 
 COLUMNS = 6
 MOST = 24

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._json import read_json
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
+from meshsplats._common.json_files import read_json
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.cameras.viewer_settings import NAME, start_camera
@@ -20,8 +18,10 @@ from meshsplats.formats.gltf.cameras import cameras_in_gltf, cameras_in_mesh
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named
 from meshsplats.formats.usd.cameras import cameras_in_usd
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.finding import find_cameras, worth_a_look
 from meshsplats.viewpoints.kind import kind_from_outside
 from meshsplats.viewpoints.relief import find_relief

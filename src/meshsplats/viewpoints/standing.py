@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats._geometry import level_axes
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import level_axes
 from meshsplats.cameras.framing import DEFAULT_UP, Bounds, scene_bounds, up_of_survey
 from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.viewpoints.kind import FINE, glance, subsample_of
 from meshsplats.viewpoints.sample import AllSplats, fibonacci
 from meshsplats.viewpoints.thinning import without_harmonics

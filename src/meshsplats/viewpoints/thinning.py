@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 POOL = 1_250_000
 """Splats among which the ones that a place shows are chosen, about."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._geometry import level_axes
+from meshsplats._common.geometry import level_axes
 from meshsplats.viewpoints.sample import COARSE, Sample, fibonacci
 from meshsplats.viewpoints.search import Places
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at
+from meshsplats.scene.camera import Camera
 from meshsplats.viewpoints.sample import CONE, LEVELS, Sample, merit
 from meshsplats.viewpoints.search import BEST, FINER, Places
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._geometry import level_axes
-from meshsplats.camera import Camera
+from meshsplats._common.geometry import level_axes
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import look_at
+from meshsplats.scene.camera import Camera
 
 MOST_KEYS = 12
 """Views that a round passes, at most: through more of them it hurries."""

@@ -10,9 +10,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.layout import (

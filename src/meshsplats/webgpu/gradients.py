@@ -12,10 +12,10 @@ from typing import Any, get_args
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh, Triangles
-from meshsplats.order import Order
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import SplatMesh, Triangles
+from meshsplats.scene.order import Order
 from meshsplats.webgpu import frames, kernels
 from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.frames import WINDOW_SAMPLES, MeshFrames, Output, Program, Work

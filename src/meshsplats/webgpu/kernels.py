@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any, Literal
 
-from meshsplats.order import Order
+from meshsplats.scene.order import Order
 
 QUEUE = 32
 """Default length of the fragment queue of each sample, in the first walk through a tile list."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
 

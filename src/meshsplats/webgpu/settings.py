@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats.camera import Camera
-from meshsplats.mesh import MIN_TRANSMITTANCE
-from meshsplats.order import Order
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MIN_TRANSMITTANCE
+from meshsplats.scene.order import Order
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET
 from meshsplats.webgpu.layout import tiles_of

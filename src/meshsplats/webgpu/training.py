@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device
 from meshsplats.webgpu.frames import Output

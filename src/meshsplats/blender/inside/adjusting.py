@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.blender.inside import meshes, objects, scene_linear
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.mesh import MAX_COLOR
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.mesh import MAX_COLOR
 
 _LUMA = np.array([0.213, 0.715, 0.072])
 _TURN_COS = np.eye(3) - _LUMA

@@ -12,7 +12,7 @@ from meshsplats.blender.inside.host import bpy
 from meshsplats.conversion import surroundings
 from meshsplats.conversion.cleaning import find
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 class Cut(NamedTuple):

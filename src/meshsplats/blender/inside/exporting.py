@@ -13,11 +13,11 @@ import numpy as np
 from meshsplats.blender.inside import far_to_near, frame, materials, meshes, objects, stage, stand_ins
 from meshsplats.blender.inside.host import bpy
 from meshsplats.cameras.framing import DEFAULT_UP
-from meshsplats.colors import srgb_to_linear
 from meshsplats.conversion.recovery import recover_splats
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
-from meshsplats.spherical_harmonics import moved_harmonics
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.spherical_harmonics import moved_harmonics
 
 UP = np.array([0.0, 0.0, 1.0])
 LINEAR = "Color linear"

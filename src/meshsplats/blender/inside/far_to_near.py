@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._common.arrays import subsample
 from meshsplats.blender.inside import meshes, sorted_copies, turning, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.sorted_copies import CENTER, SORTED, VIEW

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from meshsplats.blender.inside import frame, versions
-from meshsplats.colors import linear_to_srgb
 from meshsplats.formats._orientation import Z_UP_FROM_Y_UP
 from meshsplats.formats.gltf.view_colors import put_back, stored_colors
-from meshsplats.mesh import Blending, SplatMesh
-from meshsplats.spherical_harmonics import moved_harmonics
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.mesh import Blending, SplatMesh
+from meshsplats.scene.spherical_harmonics import moved_harmonics
 
 _OPACITIES = ("displayOpacity",)
 """Attributes that hold opacity apart from colour, as in USD."""

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera, to_opengl
 from meshsplats.cameras.framing import front_axes
+from meshsplats.scene.camera import Camera, to_opengl
 
 
 def to_blender(up: np.ndarray) -> np.ndarray:

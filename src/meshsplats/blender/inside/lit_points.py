@@ -26,11 +26,11 @@ from meshsplats.blender.inside.materials import LIT
 from meshsplats.blender.inside.stand_ins import ROUGH
 from meshsplats.blender.options import CAREFUL, FAST
 from meshsplats.blender.subject import Announce, lit_subject, views_within
-from meshsplats.camera import Camera
-from meshsplats.colors import srgb_to_linear
 from meshsplats.conversion import convert
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 _MATERIAL = "meshsplats_material"
 """Property of lit splats: the material that they had before, where they had one."""

@@ -7,7 +7,7 @@ from typing import Any
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.meshes import COLOR, HARMONICS, NORMAL
-from meshsplats.spherical_harmonics import harmonic_terms
+from meshsplats.scene.spherical_harmonics import harmonic_terms
 
 SELF_SHADOW = "Self-shadow distance"
 """Name and label of the node with the distance within which layers do not shade each other."""

@@ -10,7 +10,7 @@ from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.splat_points import is_splats, values
 from meshsplats.cameras.framing import SAMPLE
-from meshsplats.spherical_harmonics import TERMS, in_fours
+from meshsplats.scene.spherical_harmonics import TERMS, in_fours
 
 COLOR = "Color"
 """Attribute with RGBA: display values where the image is unlit, linear light where it is lit."""

@@ -35,13 +35,13 @@ from meshsplats.blender.inside.stand_ins import ROUGH as ROUGH
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import CAREFUL, FAST, LightOptions
 from meshsplats.blender.subject import Announce, lit_subject, lowest, vertex_harmonics
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
-from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.baking import bake_filter
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import MAX_COLOR, Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import MAX_COLOR, Blending, SplatMesh
 
 LINEAR = "meshsplats_linear"
 """Property of the mesh data: whether the mesh was made for blending in linear light."""

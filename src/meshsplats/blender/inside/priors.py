@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.binding import Binding
 from meshsplats.blender.inside import far_to_near, meshes, versions
 from meshsplats.blender.inside.host import bpy
+from meshsplats.scene.binding import Binding
 
 BASE = "meshsplats_base"
 """Property of the splats' object: the object of its base."""

@@ -24,8 +24,8 @@ from meshsplats.blender.inside import (
 )
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LightOptions, SceneOptions
-from meshsplats.camera import Camera
-from meshsplats.colors import srgb_to_linear
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import srgb_to_linear
 
 
 @dataclass(frozen=True, eq=False)

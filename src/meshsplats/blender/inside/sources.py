@@ -10,8 +10,8 @@ import numpy as np
 from meshsplats.blender.inside import frame, levels, meshes, priors, stand_ins
 from meshsplats.blender.inside.host import bpy
 from meshsplats.conversion.recovery import recover_splats
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 MADE = "meshsplats_made"
 """Property of an object: what ``_state`` was when its mesh was made from its file."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.formats.splats._cloud_builder import CloudBuilder
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.spherical_harmonics import TERMS
 
 WIDTHS = {"position": 3, "scale": 3, "rotation": 4, "radiance:base": 4}
 """Attributes of a splat: centre, standard deviations, quaternion w, x, y, z; the harmonic of degree 0 in red,

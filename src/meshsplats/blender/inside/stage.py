@@ -11,7 +11,7 @@ import numpy as np
 
 from meshsplats.blender.inside import frame, materials, notes, versions
 from meshsplats.blender.inside.host import bpy
-from meshsplats.camera import Camera
+from meshsplats.scene.camera import Camera
 
 GREY = (0.6, 0.6, 0.6)
 """Linear colour of the ground."""

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats.blender.inside import meshes, versions
-from meshsplats.face_splats import FaceSplats
-from meshsplats.spherical_harmonics import turned_harmonics
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.spherical_harmonics import turned_harmonics
 
 REST = ".splat_rest"
 """Attribute of vertices: that direction, ``_packed`` (4 bytes); 0 where it is not known. A name with a dot is

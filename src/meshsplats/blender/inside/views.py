@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats.blender.inside import frame, meshes
-from meshsplats.camera import Camera
 from meshsplats.cameras.framing import scene_bounds
+from meshsplats.scene.camera import Camera
 
 VIEWS = "MeshSplats view"
 """Name of an object's property: views of a place from within, the first one to open with, as ``remember``

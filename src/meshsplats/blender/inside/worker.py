@@ -76,7 +76,7 @@ def main(job_path: str) -> None:
     from meshsplats.blender.inside import far_to_near, rendering, stage, versions, written
     from meshsplats.blender.inside.scene import Subject, build
     from meshsplats.blender.options import LightOptions, SceneOptions
-    from meshsplats.camera import Camera
+    from meshsplats.scene.camera import Camera
 
     if bpy.app.version < versions.OLDEST:
         raise ValueError(f"Blender 4.2 or newer is needed, this is {bpy.app.version_string}")

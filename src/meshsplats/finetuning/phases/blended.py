@@ -12,8 +12,8 @@ from meshsplats.finetuning.config import FinetuneConfig, learning_rates
 from meshsplats.finetuning.phases.phase import Moment, pruned
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, samples_of, uses_point_targets
-from meshsplats.mesh import SplatMesh
-from meshsplats.order import Order
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.order import Order
 
 
 @dataclass(frozen=True)

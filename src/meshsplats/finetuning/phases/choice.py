@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.checkpoint import reading_arrays
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import order_of
@@ -16,8 +15,9 @@ from meshsplats.finetuning.phases.hybrid import Hybrid
 from meshsplats.finetuning.phases.listed import Listed, check_for_file_order
 from meshsplats.finetuning.phases.phase import Phase
 from meshsplats.finetuning.state import State
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.engine import Engine, Need
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 PHASE_ARRAYS = ("color_limits", "listing.copies", "listing.starts")
 """Names of the arrays of all phases in a checkpoint (``Phase.arrays``)."""

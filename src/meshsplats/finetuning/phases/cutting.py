@@ -21,8 +21,8 @@ from meshsplats.finetuning.phases.phase import Moment, pruned
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, samples_of, uses_point_targets
 from meshsplats.formats.cutting import cut_mesh
-from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import OpacityRamp
+from meshsplats.scene.mesh import SplatMesh
 
 STEEPEST = 30.0
 """Slope of the ramp at the end of the annealing, where it is not limited by its width already."""

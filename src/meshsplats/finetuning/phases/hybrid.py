@@ -12,7 +12,7 @@ from meshsplats.finetuning.hybrid import SOLID, ColorLimits
 from meshsplats.finetuning.phases.phase import Moment, pruned
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, samples_of
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 class Hybrid:

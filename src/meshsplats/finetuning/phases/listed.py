@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats.datasets.views import View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Plan, kept_faces
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from meshsplats.datasets.views import View
-from meshsplats.draw_order import DrawOrder
 from meshsplats.finetuning.clock import Clock
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import Schedule, kept_faces
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 
 class Moment(NamedTuple):

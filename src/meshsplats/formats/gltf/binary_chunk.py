@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats._orientation import turned_origin, up_quaternion
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 _MAX_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}

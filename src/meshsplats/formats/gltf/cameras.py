@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera, to_opengl
 from meshsplats.formats._file_cameras import near_plane, placed_camera
 from meshsplats.formats._orientation import HALF_TURN_Z, up_quaternion
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.own import grid_of, is_own_placement, our_note
 from meshsplats.formats.gltf.scene import placed_meshes, placed_nodes, rotation_matrix
 from meshsplats.formats.gltf.splats import has_own_frame, names_splats, splat_document
+from meshsplats.scene.camera import Camera, to_opengl
 
 
 def cameras_in_gltf(path: Path) -> list[Camera]:

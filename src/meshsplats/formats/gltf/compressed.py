@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._kinds import need_choice
+from meshsplats._common.kinds import need_choice
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk
 from meshsplats.formats.gltf.document import MESHOPT
 from meshsplats.formats.gltf.meshopt import encoded_attributes, encoded_triangles

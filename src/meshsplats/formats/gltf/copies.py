@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats.draw_order import DrawOrder
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
 
 
 class Part(NamedTuple):

@@ -9,7 +9,6 @@ from typing import Any, get_args
 
 import numpy as np
 
-from meshsplats.binding import Binding
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._orientation import up_quaternion
 from meshsplats.formats._validation import checked
@@ -19,7 +18,8 @@ from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.view_colors import IN_VIEW_COLORS
 from meshsplats.formats.gltf.writer import camel_case
-from meshsplats.mesh import Blending, SplatMesh
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.mesh import Blending, SplatMesh
 
 
 def our_note(mesh: dict[str, Any]) -> dict[str, Any]:

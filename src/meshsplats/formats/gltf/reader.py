@@ -9,10 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import joined_rows
-from meshsplats._origin import choose_origin, zero_origin
-from meshsplats.colors import linear_to_srgb
-from meshsplats.draw_order import DrawOrder
+from meshsplats._common.arrays import joined_rows
 from meshsplats.errors import NoColorsWarning, NoTextureWarning
 from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
 from meshsplats.formats.gltf import copies
@@ -33,8 +30,11 @@ from meshsplats.formats.gltf.own import (
 from meshsplats.formats.gltf.scene import Placed, Skinning, placed_meshes
 from meshsplats.formats.gltf.scene_parts import is_splats, shown_meshes
 from meshsplats.formats.gltf.view_colors import Stored, put_back, stored_colors
-from meshsplats.mesh import SplatMesh
-from meshsplats.spherical_harmonics import moved_harmonics
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import choose_origin, zero_origin
+from meshsplats.scene.spherical_harmonics import moved_harmonics
 
 POINTS_TO_LINES = (0, 1, 2, 3)
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
-from meshsplats._origin import SAMPLE
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
+from meshsplats.scene.origin import SAMPLE
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _AT_ONCE = 1 << 15

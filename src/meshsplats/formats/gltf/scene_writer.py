@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh, Texture
-from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
@@ -22,6 +20,8 @@ from meshsplats.formats.gltf.splats_writer import splats_part
 from meshsplats.formats.gltf.writer import mesh_part
 from meshsplats.formats.surfaces.corners import normal_file, smooth_normals
 from meshsplats.formats.surfaces.tangents import corner_frames
+from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.colors import srgb_to_linear
 
 COLLIDER = "collider-colonly"
 """Godot's suffix for a mesh that becomes a collider and is not drawn."""

@@ -20,7 +20,7 @@ from meshsplats.formats._orientation import HALF_TURN_X, up_rotation
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
 from meshsplats.formats.gltf.splats import EXTENSION
 from meshsplats.formats.splats.spz_writer import spz_bytes
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
 CONTENT = {

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import away_from_ground
-from meshsplats._origin import choose_origin, sampled
+from meshsplats._common.geometry import away_from_ground
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._orientation import Y_DOWN_FROM_Z_UP, Z_UP_FROM_Y_UP, tile_frame
 from meshsplats.formats._validation import Budget
@@ -34,7 +33,8 @@ from meshsplats.formats.gltf.tileset_file import (
 from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import joined_within
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.origin import choose_origin, sampled
 
 _TO_Z_UP = np.eye(4)
 _TO_Z_UP[:3, :3] = Z_UP_FROM_Y_UP

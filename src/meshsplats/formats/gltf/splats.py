@@ -16,8 +16,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
-from meshsplats._origin import choose_origin, sampled, zero_origin
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z, up_quaternion
@@ -28,7 +27,8 @@ from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within
 from meshsplats.formats.splats.spz import spz_in_memory
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.origin import choose_origin, sampled, zero_origin
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPRESSED = (

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
-from meshsplats.colors import srgb_to_linear
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.formats._orientation import HALF_TURN_Z
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, write_binary
 from meshsplats.formats.gltf.splats import EXTENSION, turn_of
 from meshsplats.formats.splats._quantising import as_bytes
 from meshsplats.formats.writing import FormatWriter, Writing
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.gaussians import GaussianCloud
 
 
 def write_splat_glb(cloud: GaussianCloud, path: Path, writing: Writing) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import Texture, Wrap
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gltf.document import GltfDocument, dict_or_empty
 from meshsplats.formats.gltf.looks import Look, look_of
@@ -21,6 +20,7 @@ from meshsplats.formats.gltf.reader import (
     placed_faces,
 )
 from meshsplats.formats.gltf.scene_parts import shown_meshes
+from meshsplats.scene.base_mesh import Texture, Wrap
 
 _WRAPS: dict[object, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _SOURCES = ("EXT_texture_webp",)

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from meshsplats._json import json_object
+from meshsplats._common.json_files import json_object
 from meshsplats.errors import FileFormatError
 
 MAX_BYTES = 64 << 20

@@ -20,9 +20,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats.face_splats import FaceSplats
-from meshsplats.mesh import MAX_COLOR, SplatMesh
-from meshsplats.spherical_harmonics import TERMS, in_fours
+from meshsplats.scene.face_splats import FaceSplats
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.spherical_harmonics import TERMS, in_fours
 
 Harmonics = Literal["attributes", "texcoords"]
 

@@ -19,11 +19,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._geometry import vertex_normals
-from meshsplats._kinds import need_choice
-from meshsplats.binding import Binding
-from meshsplats.colors import srgb_to_linear
-from meshsplats.draw_order import DrawOrder
+from meshsplats._common.geometry import vertex_normals
+from meshsplats._common.kinds import need_choice
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf import compressed, copies
@@ -36,7 +33,10 @@ from meshsplats.formats.gltf.view_colors import (
     scales_of,
     vertex_tables,
 )
-from meshsplats.mesh import SplatMesh, solid_faces
+from meshsplats.scene.binding import Binding
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.mesh import SplatMesh, solid_faces
 
 ColorType = Literal["uint16", "float32"]
 Alpha = Literal["blend", "mask", "opaque", "hybrid"]

@@ -16,15 +16,15 @@ from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import in_words, zero_origin
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._orientation import up_rotation
 from meshsplats.formats._polygons import corner_places, cut_polygons
 from meshsplats.formats._validation import checked, local_positions, straight_colors
 from meshsplats.formats.mesh_formats import FileSize, MeshCodec
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import in_words, zero_origin
 
 _TURNED_COMMENT = "# meshsplats turned"
 _UP_COMMENT = "# meshsplats up"

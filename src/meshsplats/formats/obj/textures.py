@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.base_mesh import Texture, Wrap
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
 from meshsplats.formats._polygons import corner_places, cut_polygons
 from meshsplats.formats.obj.mesh import corner, statements
+from meshsplats.scene.base_mesh import Texture, Wrap
 
 MAX_LIBRARY_BYTES = 16 << 20
 """A larger file of materials is refused."""

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshsplats.errors import DataWarning
-from meshsplats.gaussians import SH_C0
+from meshsplats.scene.gaussians import SH_C0
 
 Activated = Literal["scales", "opacities", "colors"]
 SAMPLE = 2000

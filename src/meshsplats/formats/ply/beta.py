@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.spherical_harmonics import sh_basis
+from meshsplats.scene.spherical_harmonics import sh_basis
 
 PREFIX = "sb_params_"
 DEGREE = 3

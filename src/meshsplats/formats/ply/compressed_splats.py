@@ -13,7 +13,6 @@ from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.ply.header import Element, PlyHeader, origin_of_comments
@@ -21,7 +20,8 @@ from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_in, u
 from meshsplats.formats.ply.table import RowReader
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
-from meshsplats.gaussians import constant_harmonics
+from meshsplats.scene.gaussians import constant_harmonics
+from meshsplats.scene.origin import SAMPLE
 
 _SHARED = 256
 """Splats that share a chunk's ranges."""

@@ -14,7 +14,7 @@ from meshsplats.formats.ply.header import origin_comments
 from meshsplats.formats.ply.notes import note_comments
 from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, sorted_in_space
 from meshsplats.formats.writing import FormatWriter, Writing
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud
 
 _SHARED = 256
 _LEAST_LOG, _MOST_LOG = -20.0, 20.0

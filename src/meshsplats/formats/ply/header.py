@@ -12,8 +12,8 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
-from meshsplats._origin import in_words
 from meshsplats.errors import FileFormatError
+from meshsplats.scene.origin import in_words
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 

@@ -23,7 +23,6 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import (
     Budget,
@@ -43,9 +42,10 @@ from meshsplats.formats.ply.header import (
     read_header,
 )
 from meshsplats.formats.ply.table import POSITION, FloatTable
-from meshsplats.mesh import MAX_COLOR, SplatMesh
-from meshsplats.mesh_joining import check_alike
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.scene.joining import check_alike
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.origin import choose_origin, zero_origin
+from meshsplats.scene.spherical_harmonics import TERMS
 
 _ATTRIBUTE = "attribute_"
 _LOCAL = ("local_x", "local_y", "local_z")

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._geometry import quaternions_of
+from meshsplats._common.geometry import quaternions_of
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.splats._cloud_builder import SplatRows
 

@@ -23,7 +23,7 @@ from meshsplats.errors import DataWarning
 from meshsplats.formats.content import Content
 from meshsplats.formats.ply.header import PlyHeader
 from meshsplats.formats.ply.table import FloatTable
-from meshsplats.gaussians import Kernel
+from meshsplats.scene.gaussians import Kernel
 
 _UP = re.compile(r"(meshsplats up|vertical axis|up[ _-]?axis|up|world[ _-]up)\s*[:= ]\s*(.+)", re.IGNORECASE)
 _AXIS = re.compile(r"([+-]?)([xyz])(?![a-z])", re.IGNORECASE)

@@ -23,7 +23,6 @@ from typing import BinaryIO
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path
-from meshsplats._origin import zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats import _activation
 from meshsplats.formats.content import Content
@@ -37,7 +36,8 @@ from meshsplats.formats.ply.table import CHUNK_BYTES, POSITION, FloatTable
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.formats.writing import FormatWriter, Writing
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.origin import zero_origin
 
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -13,9 +13,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import SAMPLE, zero_origin
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import Element, PlyHeader
+from meshsplats.scene.origin import SAMPLE, zero_origin
 
 CHUNK_BYTES = 1 << 20
 MAX_LINE_BYTES = 1 << 18

@@ -9,14 +9,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import choose_origin
-from meshsplats.base_mesh import Texture
 from meshsplats.errors import DataWarning
 from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.faces import read_corner_values, read_faces
 from meshsplats.formats.ply.header import PlyHeader, read_header
 from meshsplats.formats.ply.table import POSITION, FloatTable
+from meshsplats.scene.base_mesh import Texture
+from meshsplats.scene.origin import choose_origin
 
 _OF_CORNERS, _NUMBER = "texcoord", "texnumber"
 _OF_VERTICES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget, warn_of_coarse_steps, warn_of_lost_detail
 from meshsplats.formats.opened import Splats
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.origin import choose_origin, sampled, zero_origin
 
 
 class SplatRows(NamedTuple):

@@ -6,7 +6,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from meshsplats._geometry import morton_codes, quaternions_of
+from meshsplats._common.geometry import morton_codes, quaternions_of
 
 BOOK = 256
 """Entries of a codebook."""

@@ -11,7 +11,6 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.splats._spz_layout import (
     MAGIC,
@@ -24,6 +23,7 @@ from meshsplats.formats.splats._spz_layout import (
     unpacking_errors,
     zstandard_modules,
 )
+from meshsplats.scene.origin import SAMPLE
 
 _PIECE = 1 << 18
 """Bytes of a file that are unpacked at a time."""

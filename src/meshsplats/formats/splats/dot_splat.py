@@ -16,14 +16,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.formats.splats._quantising import as_bytes
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
-from meshsplats.gaussians import SH_C0, GaussianCloud, constant_harmonics
+from meshsplats.scene.gaussians import SH_C0, GaussianCloud, constant_harmonics
+from meshsplats.scene.origin import SAMPLE
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _AT_ONCE = 1 << 16

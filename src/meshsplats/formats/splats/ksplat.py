@@ -16,12 +16,12 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
-from meshsplats.gaussians import constant_harmonics
+from meshsplats.scene.gaussians import constant_harmonics
+from meshsplats.scene.origin import SAMPLE
 
 _HEADER, _SECTION = 4096, 1024
 _AT_ONCE = 1 << 16

@@ -16,14 +16,14 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from meshsplats._json import json_object
-from meshsplats._origin import SAMPLE
+from meshsplats._common.json_files import json_object
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import Y_DOWN_FROM_Z_UP
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
-from meshsplats.gaussians import constant_harmonics
+from meshsplats.scene.gaussians import constant_harmonics
+from meshsplats.scene.origin import SAMPLE
 
 _MAX_META_BYTES = 4 << 20
 _MAX_LEVELS = 64

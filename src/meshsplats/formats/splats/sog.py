@@ -19,15 +19,15 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from meshsplats._json import json_object
-from meshsplats._origin import SAMPLE
+from meshsplats._common.json_files import json_object
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats._zipped import Archive
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
-from meshsplats.gaussians import Kernel
+from meshsplats.scene.gaussians import Kernel
+from meshsplats.scene.origin import SAMPLE
 
 T = TypeVar("T")
 _MAX_META_BYTES = 4 << 20

@@ -27,7 +27,7 @@ from meshsplats.formats.splats._quantising import (
     sorted_in_space,
 )
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 _PALETTE = 1 << 16
 _COLUMNS = 64

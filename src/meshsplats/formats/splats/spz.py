@@ -15,7 +15,6 @@ from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
@@ -44,7 +43,8 @@ from meshsplats.formats.splats._spz_layout import (
     zstandard_modules,
 )
 from meshsplats.formats.splats._spz_streams import open_streams
-from meshsplats.gaussians import Kernel
+from meshsplats.scene.gaussians import Kernel
+from meshsplats.scene.origin import SAMPLE
 
 _AT_ONCE = 1 << 16
 

@@ -21,7 +21,7 @@ from meshsplats.formats._orientation import HALF_TURN_X
 from meshsplats.formats.splats._quantising import as_bytes, nearest_axes, order_for_streams
 from meshsplats.formats.splats._spz_layout import ANTIALIASED, COLOR_SCALE, MAGIC, REST, zstandard_modules
 from meshsplats.formats.writing import FormatWriter, Writing, warn_of_losses
-from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud
+from meshsplats.scene.gaussians import LEAST_OPACITY, GaussianCloud
 
 _FEWEST_BITS, _MOST_BITS = 12, 22
 _STEPS = 8

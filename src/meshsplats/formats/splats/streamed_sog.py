@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._json import json_object
-from meshsplats._origin import choose_origin
+from meshsplats._common.json_files import json_object
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
@@ -23,7 +22,8 @@ from meshsplats.formats.opened import Splats
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import SplatReader, joined_within
 from meshsplats.formats.splats.sog import read_sog, sog_corners
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.gaussians import GaussianCloud, Kernel
+from meshsplats.scene.origin import choose_origin
 
 _MAX_INDEX_BYTES = 64 << 20
 _MAX_DEPTH = 64

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import edge_groups
+from meshsplats._common.geometry import edge_groups
 from meshsplats.errors import MissingDependencyError
 
 PARTS = 32

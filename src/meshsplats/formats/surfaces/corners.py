@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import vertex_normals
-from meshsplats.base_mesh import BaseMesh, Texture, Wrap
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats._common.geometry import vertex_normals
 from meshsplats.errors import DataWarning
 from meshsplats.formats.surfaces.tangents import corner_frames
 from meshsplats.images.writing import encode_image
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh, Texture, Wrap
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.mesh import SplatMesh
 
 LARGE_PNG = 1 << 20
 """Textures whose PNG is larger than this, in bytes, are written as JPEG where nothing else is asked for."""

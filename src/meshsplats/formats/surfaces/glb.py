@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
-from meshsplats.colors import srgb_to_linear
 from meshsplats.formats.gltf.binary_chunk import BinaryChunk, placed_node, write_binary
 from meshsplats.formats.gltf.cameras import camera_node, lens_of
 from meshsplats.formats.gltf.scene_parts import COLLIDES, INVISIBLE
 from meshsplats.formats.surfaces.convex import convex_parts
 from meshsplats.formats.surfaces.corners import corners_of, normal_file, texture_file
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import srgb_to_linear
 
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
 _WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._geometry import edge_groups
-from meshsplats.base_mesh import BaseMesh
+from meshsplats._common.geometry import edge_groups
 from meshsplats.errors import DataWarning
 from meshsplats.formats._orientation import Z_UP_FROM_Y_UP, up_rotation
+from meshsplats.scene.base_mesh import BaseMesh
 
 _TYPES = (
     '<?xml version="1.0" encoding="UTF-8"?>\n'

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._geometry import vertex_normals
+from meshsplats._common.geometry import vertex_normals
 
 
 class Frames(NamedTuple):

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._files.atomic import write_bytes
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats.obj.mesh import (
     comments,
     turned_directions,
@@ -24,6 +23,7 @@ from meshsplats.formats.surfaces.corners import (
     texture_file,
     wraps_beyond_edges,
 )
+from meshsplats.scene.base_mesh import BaseMesh
 
 
 def write_surface_obj(base: BaseMesh, path: Path, target: Path, image: str | None) -> None:

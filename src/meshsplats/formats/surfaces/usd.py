@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from meshsplats._files.atomic import write_bytes
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.camera import Camera
-from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats.surfaces.corners import normal_file, smooth_normals, texture_file
 from meshsplats.formats.usd.cameras import add_cameras
 from meshsplats.formats.usd.materials import normal_reader, preview_material, primvar_reader, texture_reader
 from meshsplats.formats.usd.splats_writer import export, packed
 from meshsplats.formats.usd.stage import make_collider, placed_mesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.colors import srgb_to_linear
 
 
 def write_surface_usd(

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from meshsplats._kinds import need
-from meshsplats.base_mesh import BaseMesh
+from meshsplats._common.kinds import need
 from meshsplats.formats.surfaces.corners import plain_mesh, smooth_normals
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 TRIANGLES = 1_000_000
 """Triangles into which those of a texture are divided, at most, unless there are more of them already."""

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import Camera, to_opengl
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._file_cameras import near_plane, placed_camera
 from meshsplats.formats.content import Content
 from meshsplats.formats.usd.crate import holds_token, is_crate
 from meshsplats.formats.usd.reader import extracted
+from meshsplats.scene.camera import Camera, to_opengl
 
 _PRIM = b"Camera"
 _APERTURE = 0.36

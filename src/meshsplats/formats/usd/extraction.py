@@ -14,9 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import joined_rows
-from meshsplats._origin import choose_origin, lost_detail, sampled, zero_origin
-from meshsplats.colors import srgb_to_linear
+from meshsplats._common.arrays import joined_rows
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.usd.looks import GREY, Looks
@@ -25,7 +23,9 @@ from meshsplats.formats.usd.opening import BLENDER, main, metres, opened, say_un
 from meshsplats.formats.usd.own_notes import is_own_placement, our_note, restored
 from meshsplats.formats.usd.polygons import Polygons, polygons_of, primvar
 from meshsplats.formats.usd.skeletons import pose
-from meshsplats.spherical_harmonics import moved_harmonics
+from meshsplats.scene.colors import srgb_to_linear
+from meshsplats.scene.origin import choose_origin, lost_detail, sampled, zero_origin
+from meshsplats.scene.spherical_harmonics import moved_harmonics
 
 
 class Piece(NamedTuple):

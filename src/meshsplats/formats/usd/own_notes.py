@@ -10,8 +10,8 @@ import numpy as np
 
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import up_quaternion
-from meshsplats.mesh import Blending, SplatMesh
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats.scene.mesh import Blending, SplatMesh
+from meshsplats.scene.spherical_harmonics import TERMS
 
 
 def our_note(shape: Any) -> dict[str, Any]:

@@ -21,8 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._origin import relative
-from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import (
     AnimationWarning,
     DataWarning,
@@ -32,7 +30,9 @@ from meshsplats.errors import (
 )
 from meshsplats.formats._validation import Budget, checked, straight_colors
 from meshsplats.formats.content import Content
-from meshsplats.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.colors import linear_to_srgb
+from meshsplats.scene.mesh import MAX_COLOR, SplatMesh
+from meshsplats.scene.origin import relative
 
 _SECONDS = 60
 _BYTES_A_SECOND = 1 << 20

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh
-from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._scene import SceneParts
 from meshsplats.formats.gltf.scene_writer import alpha_mode, png_of
@@ -22,6 +20,8 @@ from meshsplats.formats.usd.materials import normal_reader, preview_material, te
 from meshsplats.formats.usd.splats_writer import export, packed, splats_stage
 from meshsplats.formats.usd.stage import make_collider, new_stage, placed_mesh
 from meshsplats.formats.usd.writer import mesh_stage
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.colors import srgb_to_linear
 
 _NORMALS = "normals.png"
 

@@ -14,14 +14,14 @@ from typing import Any, get_args
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.usd.motion import in_metres
 from meshsplats.formats.usd.opening import main, metres, opened, say_units, visible_prims
 from meshsplats.formats.usd.splats_writer import PRIM, turn_of
-from meshsplats.gaussians import Kernel
+from meshsplats.scene.gaussians import Kernel
 
 _SH = "radiance:sphericalHarmonics"
 _HIGHEST = 3

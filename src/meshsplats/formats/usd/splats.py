@@ -14,7 +14,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import Y_DOWN_FROM_Z_UP
@@ -25,7 +24,8 @@ from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within
 from meshsplats.formats.usd.crate import holds_token, is_crate
 from meshsplats.formats.usd.reader import extracted
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.origin import choose_origin, sampled, zero_origin
 
 _PRIM = b"ParticleField3DGaussianSplat"
 _TEXT = 8 << 20

@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._geometry import rotation_rows
+from meshsplats._common.geometry import rotation_rows
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._display import linear_cloud
 from meshsplats.formats._orientation import HALF_TURN_X, up_quaternion
 from meshsplats.formats.usd.stage import new_stage
 from meshsplats.formats.writing import FormatWriter, Writing
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 
 PRIM = "ParticleField3DGaussianSplat"
 DISPLAY, LINEAR = "srgb_rec709_scene", "lin_rec709_scene"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import BaseMesh
 from meshsplats.formats._orientation import turned_origin, up_quaternion
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.base_mesh import BaseMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 def new_stage(name: str = "/Splats") -> tuple[Any, Any]:

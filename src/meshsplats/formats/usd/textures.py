@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.base_mesh import Texture
-from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._beside import file_beside, shown_name, warn_of_missing
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.textures import cut_out
 from meshsplats.formats.usd.reader import extracted
+from meshsplats.scene.base_mesh import Texture
+from meshsplats.scene.colors import linear_to_srgb
 
 _KINDS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic")
 """Images that are read; USD may name others, such as .exr."""

@@ -20,7 +20,7 @@ from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.gltf.writer import computed_normals, linear_colors
 from meshsplats.formats.usd.materials import preview_material, primvar_reader
 from meshsplats.formats.usd.stage import placed_mesh
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.mesh import SplatMesh
 
 
 def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:

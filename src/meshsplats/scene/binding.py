@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._geometry import vertex_normals
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.geometry import vertex_normals
 
 _ROWS = 1 << 15
 _MOST_STRETCH = 8.0

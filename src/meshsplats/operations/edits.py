@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from meshsplats._common.kinds import as_path
+from meshsplats._common.words import plural
 from meshsplats._files.atomic import together
-from meshsplats._kinds import as_path
-from meshsplats._words import plural
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.conversion import bake_filter
 from meshsplats.conversion.cleaning import Findings, find, remove, save_strip
@@ -25,7 +24,6 @@ from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import cameras_named
 from meshsplats.errors import FileFormatError, OptionValueError, StraysWarning
 from meshsplats.evaluation.viewers import alpha_for_viewers
-from meshsplats.file_options import BakingOptions, SimplifyOptions
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.formats.outputs import (
@@ -38,9 +36,11 @@ from meshsplats.formats.outputs import (
 )
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import written_ending
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.operations.options import BakingOptions, SimplifyOptions
 from meshsplats.rendering.plain_colors import plain_colors_of
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 Place = Callable[[Any], Any]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._geometry import affine_parts
-from meshsplats._origin import loses_detail, lost_by_rounding, sampled
+from meshsplats._common.arrays import checked_array
+from meshsplats._common.geometry import affine_parts
 from meshsplats.errors import DataWarning, warn_of_data
-from meshsplats.spherical_harmonics import moved_harmonics, turned_harmonics
+from meshsplats.scene.origin import loses_detail, lost_by_rounding, sampled
+from meshsplats.scene.spherical_harmonics import moved_harmonics, turned_harmonics
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from meshsplats._options import changed, check_options
-from meshsplats._words import optional_color
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.options import changed, check_options
+from meshsplats._common.words import optional_color
 from meshsplats.conversion.options import Preset
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import MasksOfData, MissingOfData, SceneViews, check_photographs
@@ -19,7 +19,7 @@ from meshsplats.errors import OptionsError, OptionValueError
 from meshsplats.finetuning.config import FinetuneConfig, make_config
 from meshsplats.formats.mesh_formats import takes
 from meshsplats.formats.outputs import MeshEnding
-from meshsplats.order import Order
+from meshsplats.scene.order import Order
 
 if TYPE_CHECKING:
     import numpy as np

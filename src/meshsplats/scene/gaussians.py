@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, chosen_rows, guarded
-from meshsplats._geometry import affine_parts, quaternion_product, quaternions_of, rotation_rows
-from meshsplats._kinds import need_all, need_choice
-from meshsplats._origin import (
+from meshsplats._common.arrays import checked_array, chosen_rows, guarded
+from meshsplats._common.geometry import affine_parts, quaternion_product, quaternions_of, rotation_rows
+from meshsplats._common.kinds import need_all, need_choice
+from meshsplats.errors import warn_of_data
+from meshsplats.scene.origin import (
     in_words,
     loses_detail,
     lost_by_rounding,
@@ -19,8 +20,7 @@ from meshsplats._origin import (
     shared_origin,
     zero_origin,
 )
-from meshsplats.errors import warn_of_data
-from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
+from meshsplats.scene.spherical_harmonics import ODD_AXES, harmonics_map
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

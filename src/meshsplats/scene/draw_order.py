@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._common.arrays import checked_array
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, guarded
-from meshsplats._origin import in_words, lost_by_rounding, relative, zero_origin
-from meshsplats.binding import check_indices
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats._common.arrays import checked_array, guarded
 from meshsplats.errors import warn_of_data
+from meshsplats.scene.binding import check_indices
+from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.scene.origin import in_words, lost_by_rounding, relative, zero_origin
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -12,18 +12,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from meshsplats._common.kinds import as_path
 from meshsplats._files.atomic import replace_folder, write_json
-from meshsplats._kinds import as_path
 from meshsplats.conversion.gaps import without_gaps
 from meshsplats.errors import FileFormatError, OptionValueError
 from meshsplats.evaluation.level_tables import TABLE, load_table
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
-from meshsplats.file_options import ChainOptions
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 from meshsplats.finetuning.checkpoint import cloud_digest
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs, check_resumption
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import (
     SAMPLES,
     Level,
@@ -37,7 +35,9 @@ from meshsplats.levels import (
     plan_levels,
     views_to_score,
 )
-from meshsplats.mesh import SplatMesh
+from meshsplats.operations.options import ChainOptions
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 
 OnLevel = Callable[[int, Level], AbstractContextManager[Callable[[Progress], None] | None]]
 

@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats._arrays import joined_rows
-from meshsplats._origin import shared_origin
-from meshsplats.spherical_harmonics import TERMS
+from meshsplats._common.arrays import joined_rows
+from meshsplats.scene.origin import shared_origin
+from meshsplats.scene.spherical_harmonics import TERMS
 
 MAY_MISS = ("depth_group", "plain_colors")
 """Optional arrays that only some of the parts may have."""

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from meshsplats._options import Advanced, changed, check_options
-from meshsplats._words import optional_up
-from meshsplats.choices import Look
+from meshsplats._common.choices import Look
+from meshsplats._common.options import Advanced, changed, check_options
+from meshsplats._common.words import optional_up
 from meshsplats.conversion.options import ConversionOptions, Preset
 from meshsplats.datasets.scene_views import MissingOfData, cameras_named, check_photographs
 from meshsplats.errors import OptionsError, OptionValueError
@@ -26,9 +26,9 @@ from meshsplats.formats.outputs import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from meshsplats.camera import Camera
     from meshsplats.datasets.scene_files import SceneReading
-    from meshsplats.jobs import Job
+    from meshsplats.operations.batches import Job
+    from meshsplats.scene.camera import Camera
 
 _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect on splats, too."""
@@ -120,7 +120,7 @@ class Product:
             ValueError: one is out of range.
             OverwritingError: ``output`` is a mesh that goes into it.
         """
-        from meshsplats.jobs import sources
+        from meshsplats.operations.batches import sources
 
         if self.fidelity is not None and self.fidelity < 1:
             raise OptionValueError(f"``fidelity`` must be a number of views, at least 1, got {self.fidelity}")
@@ -188,7 +188,7 @@ class Product:
     def _check_stream(self, kinds: Sequence[str], inputs: Sequence[Path]) -> None:
         """OptionsError or ValueError for what needs the whole scene in memory."""
         from meshsplats.conversion.streaming import refuse_whole
-        from meshsplats.jobs import sources
+        from meshsplats.operations.batches import sources
 
         if tuple(kinds) != ("ply",):
             raise OptionsError(

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import check_faces, checked_array, checked_attributes, chosen_rows, guarded
-from meshsplats._kinds import need_all, need_choice
-from meshsplats._origin import in_words, lost_by_rounding, relative, zero_origin
-from meshsplats.binding import ArrayField, Binding, check_fields
+from meshsplats._common.arrays import check_faces, checked_array, checked_attributes, chosen_rows, guarded
+from meshsplats._common.kinds import need_all, need_choice
 from meshsplats.errors import warn_of_data
-from meshsplats.face_splats import FaceSplats, check_ascending, check_harmonics
-from meshsplats.mesh_joining import joined_meshes
-from meshsplats.mesh_moving import moved_mesh, transformed_mesh
-from meshsplats.order import Order, checked_order
-from meshsplats.spherical_harmonics import TERMS, degree_of
+from meshsplats.scene.binding import ArrayField, Binding, check_fields
+from meshsplats.scene.face_splats import FaceSplats, check_ascending, check_harmonics
+from meshsplats.scene.joining import joined_meshes
+from meshsplats.scene.moving import moved_mesh, transformed_mesh
+from meshsplats.scene.order import Order, checked_order
+from meshsplats.scene.origin import in_words, lost_by_rounding, relative, zero_origin
+from meshsplats.scene.spherical_harmonics import TERMS, degree_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

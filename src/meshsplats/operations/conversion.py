@@ -12,18 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._common.choices import Look
+from meshsplats._common.words import plural
 from meshsplats._files.atomic import in_words, together
-from meshsplats._words import plural
-from meshsplats.camera import Camera
 from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
-from meshsplats.choices import Look
 from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.gaps import with_usual_look
 from meshsplats.conversion.merging_views import convert_within_limits, simplify_for_views
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.conversion.streaming import convert_blocks
-from meshsplats.draw_order import DrawOrder
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.comparison import fidelity
 from meshsplats.evaluation.viewers import SIDE, VIEWS
@@ -37,10 +35,12 @@ from meshsplats.formats.scenes import save_scene
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_formats import listed, written_ending
 from meshsplats.formats.streaming import SplatStream
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.jobs import Job
-from meshsplats.mesh import SplatMesh
-from meshsplats.product import Product
+from meshsplats.operations.batches import Job
+from meshsplats.operations.product import Product
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.draw_order import DrawOrder
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.showing import default_views
 
 LARGE_BYTES = 1_000_000_000

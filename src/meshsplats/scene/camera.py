@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, subsample
-from meshsplats._kinds import need, need_choice, need_numbers
-from meshsplats.choices import MAX_SIDE
+from meshsplats._common.arrays import checked_array, subsample
+from meshsplats._common.choices import MAX_SIDE
+from meshsplats._common.kinds import need, need_choice, need_numbers
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from meshsplats._options import alternatives
+from meshsplats._common.options import alternatives
 
 
 def from_text(text: str, hint: Any) -> Any:

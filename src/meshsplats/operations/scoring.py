@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._kinds import as_path
-from meshsplats._origin import shared_origin
-from meshsplats._words import optional_color
+from meshsplats._common.kinds import as_path
+from meshsplats._common.words import optional_color
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cluster import Workers
 from meshsplats.conversion.gaps import without_gaps
@@ -44,12 +43,13 @@ from meshsplats.evaluation.results import (
 )
 from meshsplats.evaluation.strips import image_folder, mesh_names
 from meshsplats.evaluation.trained_views import find_trained_on, find_trained_width, warn_of_trained_on
-from meshsplats.file_options import ScoringOptions
 from meshsplats.finetuning.candidates import tuned_candidates
 from meshsplats.finetuning.targets import Targets
 from meshsplats.formats.outputs import CONFIGURATION, check_outputs, view_names
-from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.operations.options import ScoringOptions
+from meshsplats.scene.gaussians import GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import shared_origin
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 

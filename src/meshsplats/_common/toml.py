@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from meshsplats._words import legible
+from meshsplats._common.words import legible
 
 if sys.version_info >= (3, 11):
     import tomllib

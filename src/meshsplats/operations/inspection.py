@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._json import read_json
-from meshsplats._kinds import as_path
-from meshsplats._origin import choose_origin
-from meshsplats.camera import Camera
+from meshsplats._common.json_files import read_json
+from meshsplats._common.kinds import as_path
 from meshsplats.cameras.camera_path import is_camera_path
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds, warn_of_strays_in, warn_of_unseen
@@ -28,8 +26,10 @@ from meshsplats.formats.gltf.reader import listed_nodes
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.sniff import identify
 from meshsplats.formats.splat_paths import splat_file
-from meshsplats.gaussians import LEAST_OPACITY, GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.scene.camera import Camera
+from meshsplats.scene.gaussians import LEAST_OPACITY, GaussianCloud
+from meshsplats.scene.mesh import SplatMesh
+from meshsplats.scene.origin import choose_origin
 from meshsplats.tiles import is_tileset
 
 SAMPLE = 4000

@@ -14,9 +14,9 @@ import numpy as np
 from meshsplats.errors import PACKAGE
 
 if TYPE_CHECKING:
-    from meshsplats.camera import Camera
-    from meshsplats.choices import Device
-    from meshsplats.mesh import SplatMesh
+    from meshsplats._common.choices import Device
+    from meshsplats.scene.camera import Camera
+    from meshsplats.scene.mesh import SplatMesh
 
 
 def examine() -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _gpu() -> dict[str, Any]:
 
 def _triangle() -> tuple[SplatMesh, Camera]:
     from meshsplats.cameras.trajectories import look_at
-    from meshsplats.mesh import SplatMesh
+    from meshsplats.scene.mesh import SplatMesh
 
     corners = np.array([[-9, -9, 0], [9, -9, 0], [0, 9, 0]])
     mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0.5, 0, 0.5]] * 3))
@@ -141,7 +141,7 @@ def _has_gradient() -> bool:
 def _draws(device: Literal["cpu", "gpu"] = "cpu") -> bool:
     """Whether ``device`` draws a triangle, of one colour and of one that depends on the view."""
     from meshsplats.rendering import render
-    from meshsplats.spherical_harmonics import sh_basis
+    from meshsplats.scene.spherical_harmonics import sh_basis
 
     mesh, camera = _triangle()
     harmonics = np.array([[[0, 0.2, 0], [-0.4, 0, 0], [0, 0, 0]]], np.float32)

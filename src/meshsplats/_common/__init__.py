@@ -1,0 +1,1 @@
+"""What every room uses: checks of arguments, options, geometry, parsing, and words for messages."""
