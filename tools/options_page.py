@@ -2,7 +2,7 @@
 
     .venv/bin/python tools/options_page.py
 
-tests/test_option_fields.py fails where the page is older than the options.
+tests/common/test_option_fields.py fails where the page is older than the options.
 """
 
 from __future__ import annotations

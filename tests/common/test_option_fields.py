@@ -30,7 +30,7 @@ from meshsplats.finetuning import FinetuneConfig, RunOptions
 from meshsplats.tiles.building import TileOptions
 from meshsplats.training.config import TrainConfig
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCUMENTED = [
     *(ConversionOptions, FinetuneConfig, TrainConfig),
     *(RunOptions, TileOptions, CleaningRules, LightOptions, SceneOptions),
