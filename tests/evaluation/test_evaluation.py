@@ -16,14 +16,13 @@ from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.benchmarks import BENCHMARKS, Benchmark, find_input, run_benchmark
-from meshsplats.evaluation.metrics import psnr, ssim
+from meshsplats.evaluation.metrics import ssim
 from meshsplats.evaluation.report import (
     COLUMNS,
     MethodScores,
     Report,
     ViewScores,
     evaluate,
-    fit_exposure_to,
     image_of,
     masked_ssim,
 )
@@ -104,17 +103,31 @@ def test_floaters_are_counted_away_from_the_subject():
 
 
 def test_exposure_fit_undoes_gain_and_offset():
+    """Of what counts, of flat channels, and of a cut-out subject whatever is behind it."""
     rng = np.random.default_rng(1)
     image = rng.random((12, 9, 3)).astype(np.float32)
-    truth = image * np.array([0.5, 0.7, 0.6], np.float32) + np.array([0.1, 0.2, 0.3], np.float32)
-    assert psnr(fit_exposure_to(image, truth, None), truth) > 100
+    gain, offset = np.array([0.5, 0.7, 0.6], np.float32), np.array([0.1, 0.2, 0.3], np.float32)
+    camera, mask = Camera(np.eye(4), 9, 9, 4.5, 6, 9, 12), np.zeros((12, 9), bool)
+
+    def fitted(image, color, alpha=None, mask=None, background=(1, 1, 1)):
+        view = View(camera, ViewImage(color, alpha, mask), background)
+        dataset = Dataset((), (view,))
+        found = evaluate(None, dataset, images=lambda *_: (image, alpha), fit_exposure=True)
+        return found.method("images").views[0].psnr_exposure
+
+    truth = image * gain + offset
+    assert fitted(image, truth) > 100
     spoilt = truth.copy()
     spoilt[:6] = 0
-    mask = np.zeros((12, 9), bool)
     mask[6:] = True
-    assert psnr(fit_exposure_to(image, spoilt, mask), spoilt, mask=mask) > 100
-    flat = np.full((4, 4, 3), 0.5, np.float32)
-    assert np.allclose(fit_exposure_to(flat, flat * 0.5, None), 0.25)
+    assert fitted(image, spoilt, mask=mask) > 100
+    flat = np.full((12, 9, 3), 0.5, np.float32)
+    assert fitted(flat, flat * 0.5) > 100
+    alpha = rng.choice(np.array([0, 0.3, 1, 1], np.float32), (12, 9))
+    subject = ViewImage(alpha[..., None] * image, alpha)
+    for background in ((1, 1, 1), (0, 0, 0), (0.2, 0.6, 0.1)):
+        photograph = alpha[..., None] * truth
+        assert fitted(subject.over(background), photograph, alpha, None, background) > 100
 
 
 def test_linear_meshes_are_blended_in_linear_light():

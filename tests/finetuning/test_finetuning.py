@@ -30,6 +30,7 @@ from meshsplats.finetuning.step import (
     TRAINING_MIN_TRANSMITTANCE,
     dropout_factors,
     dropout_share,
+    exposed,
     for_views,
     kept_faces,
     make_step,
@@ -344,6 +345,22 @@ def test_every_epoch_shows_every_view_once_in_another_order():
 
 
 # ---- Steps
+
+
+def test_an_exposure_is_that_of_the_photograph_not_of_the_background():
+    """A photograph of a half transparent subject, with a gain and an offset, over any background: the mesh's
+    image, exposed as a whole, is exactly its target."""
+    rng = np.random.default_rng(3)
+    color, alpha = rng.random((6, 5, 3)).astype(np.float32), rng.random((6, 5)).astype(np.float32)
+    exposure = np.array([0.7, 1.2, 0.9, 0.1, -0.05, 0.02], np.float32)
+    camera = Camera(np.eye(4), 5, 5, 2.5, 3, 5, 6)
+    photograph = View(camera, ViewImage(alpha[..., None] * exposed(color, exposure), alpha), (1, 1, 1))
+    subject = ViewImage(alpha[..., None] * color, alpha)
+    for step, background in enumerate(("white", "black", "random", "mixed")):
+        target = target_of(photograph, make_config(background=background), step, exposure=exposure)
+        assert np.allclose(exposed(subject.over(target.background), exposure), target.color, atol=1e-6)
+    opaque = View(camera, ViewImage(color))  # all of it is the photograph's
+    assert np.array_equal(target_of(opaque, make_config(), 0, exposure=exposure).color, color)
 
 
 def test_backgrounds_are_random_only_where_alpha_is_known(scene):

@@ -295,6 +295,18 @@ def test_growth_halves_where_several_views_see_errors(ball, state):
     assert fan_count(grow(state, right, n + 50).mesh) == fan_count(grow(state, found, 0).mesh) <= n
 
 
+def test_exposures_are_judged_as_those_of_photographs(ball, state):
+    """Cut-out photographs of one exposure, over white: where it is known, errors are as without."""
+    plain, offset = score(state, ball.train).error, np.float32(0.05)
+    state.exposures = np.tile(np.array([0.8] * 3 + [offset] * 3, np.float32), (len(ball.train), 1))
+    views = []
+    for view in ball.train:
+        image = view.load()
+        color = image.color * np.float32(0.8) + offset * view.alpha[..., None]
+        views.append(replace(view, source=replace(image, color=color)))
+    assert np.allclose(score(state, views).error, plain * 0.8**2, rtol=1e-2, atol=1e-3 * plain.max())
+
+
 def test_an_error_in_one_view_alone_halves_nothing(ball, state):
     bright = ball.train[4].load()
     views = list(ball.train)

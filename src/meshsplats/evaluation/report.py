@@ -282,12 +282,6 @@ def masked_ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None, threads: 
     return compare_images(x, y, inside, ssim_rate=1, threads=threads).ssim / (pixels * a.shape[2])
 
 
-def fit_exposure_to(image: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """``image`` (h, w, 3) with the gain and the offset of ``exposure_between``, clipped to [0, 1]."""
-    gain, offset = exposure_between(image, target, mask)
-    return np.clip(image * gain + offset, 0, 1)
-
-
 def exposure_between(
     image: np.ndarray, target: np.ndarray, mask: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -312,6 +306,10 @@ class _GroundTruth(NamedTuple):
     """(h, w, 3) float32 display RGB in [0, 1]."""
     mask: np.ndarray | None
     """(h, w) bool: pixels that count; None: all."""
+    alpha: np.ndarray | None
+    """(h, w) float32 of the photograph; None: all of it is opaque."""
+    background: tuple[float, float, float]
+    """Display RGB that shows through where it is not."""
     empty: np.ndarray | None
     """``_empty``."""
 
@@ -320,7 +318,22 @@ class _GroundTruth(NamedTuple):
         """ValueError if no pixel counts."""
         if view.mask is not None and not view.mask.any():
             raise ValueError(f"view {view.name!r}: its mask leaves no pixel to score")
-        return cls(view.name, np.clip(view.image, 0, 1), view.mask, _empty(view))
+        shown = np.clip(view.image, 0, 1)
+        return cls(view.name, shown, view.mask, view.alpha, view.background, _empty(view))
+
+    def psnr_exposed(self, image: np.ndarray) -> float:
+        """PSNR of ``image``, (h, w, 3) over the same background, in the exposure that fits best: that of the
+        photograph, not of the background."""
+        counted, shown = self.mask, self.image
+        if self.alpha is not None:
+            opaque = self.alpha == 1 if counted is None else (self.alpha == 1) & counted
+            counted = opaque if opaque.any() else counted
+        gain, offset = exposure_between(image, self.image, counted)
+        if self.alpha is not None:
+            background = np.asarray(self.background, np.float32)
+            shown = shown + (1 - self.alpha)[..., None] * (background * (gain - 1) + offset)
+            shown = np.clip(shown, 0, 1)
+        return psnr(np.clip(image * gain + offset, 0, 1), shown, mask=self.mask)
 
 
 class _Measures(NamedTuple):
@@ -332,7 +345,7 @@ class _Measures(NamedTuple):
 
     def of(self, image: np.ndarray, alpha: np.ndarray | None, truth: _GroundTruth) -> ViewScores:
         """The scores of an image, (h, w, 3) in [0, 1], with its (h, w) alpha or None."""
-        name, target, mask, empty = truth
+        name, target, mask, empty = truth.name, truth.image, truth.mask, truth.empty
         floaters = distance = fitted = None
         if empty is not None and alpha is not None:
             floaters = int((alpha[empty] > FLOATER_ALPHA).sum())
@@ -340,7 +353,7 @@ class _Measures(NamedTuple):
             compared = image if mask is None else np.where(mask[..., None], image, target)
             distance = self.lpips(compared, target)
         if self.fit_exposure:
-            fitted = psnr(fit_exposure_to(image, target, mask), target, mask=mask)
+            fitted = truth.psnr_exposed(image)
         score, likeness = psnr(image, target, mask=mask), masked_ssim(image, target, mask, self.threads)
         return ViewScores(name, score, likeness, distance, fitted, floaters)
 

@@ -119,8 +119,23 @@ def uses_point_targets(view: View, config: FinetuneConfig, fraction: float) -> b
     return fraction < config.point_share and isinstance(source, RenderedSplats) and source.look == "area"
 
 
-def target_of(view: View, config: FinetuneConfig, step: int, points: bool = False) -> Target:
-    """The target of ``view`` in step ``step``; ``points``: sampled at the pixel centres, not averaged."""
+def exposed(image: np.ndarray, exposure: np.ndarray | None) -> np.ndarray:
+    """``image`` (..., 3) as a photograph of ``exposure`` (6,) shows it: times the gain, plus the offset."""
+    return image if exposure is None else image * exposure[GAIN] + exposure[OFFSET]
+
+
+def target_of(
+    view: View,
+    config: FinetuneConfig,
+    step: int,
+    points: bool = False,
+    exposure: np.ndarray | None = None,
+) -> Target:
+    """The target of ``view`` in step ``step``; ``points``: sampled at the pixel centres, not averaged.
+
+    ``exposure`` is that of the whole image of the step. It belongs to the photograph, not to the background
+    that shows through where this is transparent: the target has the background in the same exposure.
+    """
     image = view.source.points() if points and isinstance(view.source, RenderedSplats) else view.load()
     background = view.background
     if image.alpha is not None:
@@ -128,7 +143,8 @@ def target_of(view: View, config: FinetuneConfig, step: int, points: bool = Fals
         if config.background == "random" or (config.background == "mixed" and step % MIXED_INTERVAL == 1):
             color = np.random.default_rng([config.seed, step, 1]).random(3)
             background = tuple(color.astype(np.float32).tolist())
-    return Target(image.over(background), image.mask, background)
+    shown = image.over(exposed(np.asarray(background, np.float32), exposure))
+    return Target(shown, image.mask, background)
 
 
 class RenderedView:
@@ -246,7 +262,8 @@ def make_step(
     index = view_of_step(config, step, len(views))
     view = views[index]
     plan = schedule.plan(view, step, fraction)
-    target = target_of(view, config, step, plan.points)
+    exposure = None if state.exposures is None else state.exposures[index]
+    target = target_of(view, config, step, plan.points, exposure)
     if target.mask is not None and not target.mask.any():
         return None
     loss = loss or DefaultLoss.of(config, state.threads)
@@ -271,10 +288,8 @@ def view_gradients(
     factors = dropout_factors(state, plan.dropout, step) if plan.dropout else None
     taped, linear = state.tape(view.camera, options, factors), state.mesh.blending == "linear"
     rendered = RenderedView(taped, linear, state.harmonics)
-    image = rendered.color
-    if state.exposures is not None:
-        exposure = state.exposures[index]
-        image = image * exposure[GAIN] + exposure[OFFSET]
+    exposure = None if state.exposures is None else state.exposures[index]
+    image = exposed(rendered.color, exposure)
     if isinstance(loss, DefaultLoss):
         value, grad_image = loss(image, target)
     else:
@@ -284,7 +299,7 @@ def view_gradients(
     if not np.isfinite(value):
         raise _divergence(step, view, "the loss")
     grad_exposure = None
-    if state.exposures is not None:
+    if exposure is not None:
         grad_exposure = exposure_gradient(rendered.color, grad_image)
         grad_image = grad_image * exposure[GAIN]
     edges = None

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats.datasets.views import View
-from meshsplats.finetuning.state import GAIN, OFFSET, State
-from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, samples_of
+from meshsplats.finetuning.state import State
+from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, exposed, samples_of
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import scatter_to_vertices
@@ -70,12 +70,11 @@ def score(state: State, views: Sequence[View], turn: int = 0, fraction: float = 
         samples = samples_of(view, state.config, fraction)
         options = TapeOptions(view.background, samples, TRAINING_MIN_TRANSMITTANCE[mesh.blending])
         rendering = drawing.tape(triangles, view.camera, options)
-        image = rendering.color
-        if state.exposures is not None:
-            exposure = state.exposures[index]
-            image = image * exposure[GAIN] + exposure[OFFSET]
+        exposure = None if state.exposures is None else state.exposures[index]
+        image = exposed(rendering.color, exposure)
+        target = view.load().over(exposed(np.asarray(view.background, np.float32), exposure))
         counts = np.ones(image.shape[:2], np.float32)
-        difference = np.square(image - view.image).sum(axis=2)
+        difference = np.square(image - target).sum(axis=2)
         if view.mask is not None:
             difference[~view.mask] = 0
             counts[~view.mask] = 0
