@@ -13,6 +13,7 @@ from meshsplats.datasets.silhouettes import has_alpha, has_silhouettes, with_cle
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.rendering import render
+from meshsplats.scene.camera import Camera
 from meshsplats.training import hull, initial, starting_fans, train_config
 from meshsplats.training.hull import carve, in_silhouettes
 from meshsplats.training.initial import (
@@ -60,6 +61,47 @@ def test_a_misplaced_view_does_not_cut_the_hull(ball):
     views[7] = replace(views[7], camera=replace(views[7].camera, world_to_camera=wrong))
     surface = carve(views, 1500)
     assert np.linalg.norm(surface.points, axis=1).min() > 1 - surface.side
+
+
+def views_of_a_column(rows: np.ndarray, half: float, distance: float = 3.0) -> list[View]:
+    """Of a column along y around the origin, 1 wide, which ends at +-``half``: eight around it at each of the
+    heights ``rows``, a third of ``distance`` to each side in the image."""
+    views = []
+    for y in rows:
+        for angle in np.pi / 4 * np.arange(8):
+            back = np.array([np.sin(angle), 0, -np.cos(angle)])
+            axes = np.array([[-back[2], 0, back[0]], [0, 1, 0], -back])
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = axes, -axes @ (distance * back + [0, y, 0])
+            camera = Camera(matrix, 96, 96, 32, 32, 64, 64)
+            across = distance * (np.arange(64) + 0.5 - 32) / 96
+            alpha = np.outer(np.abs(across + y) < half, np.abs(across) < 0.5).astype(np.float32)
+            views.append(View(camera, ViewImage(0.5 * alpha[..., None].repeat(3, axis=2), alpha)))
+    return views
+
+
+def check_column(views: list[View], half: float) -> None:
+    surface = carve(views, 500)
+    x, y, z = surface.points.T
+    assert np.hypot(x, z).max() < 0.7 + surface.side
+    ends = y.min(), y.max()
+    assert np.allclose(ends, (-half, half), atol=0.25 * half + surface.side), ends
+    # All around it, at each height.
+    bins = np.histogram2d(y, np.arctan2(x, z), (6, 4), ((-0.8 * half, 0.8 * half), (-np.pi, np.pi)))[0]
+    assert bins.min() > 0
+
+
+def test_a_subject_may_be_photographed_in_parts():
+    rows = np.array([-2.0, 0.0, 2.0])
+    check_column(views_of_a_column(rows[1:2], 1.0), 1.0)
+    check_column(views_of_a_column(rows, 3.0), 3.0)
+
+
+def test_ends_of_a_subject_that_few_close_ups_show_stay():
+    """With a few photographs of the whole."""
+    whole = views_of_a_column(np.zeros(1), 3.0, distance=12.0)
+    middle = views_of_a_column(np.array([-0.3, 0.0, 0.3]), 3.0)
+    check_column([*whole, *middle], 3.0)
 
 
 def test_silhouettes_of_nothing_in_common_are_refused(ball):

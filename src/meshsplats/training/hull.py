@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._common.arrays import subsample
 from meshsplats.datasets.silhouettes import OPAQUE, has_alpha
 from meshsplats.datasets.views import View
 from meshsplats.scene.camera import Camera
@@ -22,8 +23,15 @@ MISPLACED = 0.75
 and takes no further part."""
 ASTRAY = 0.04
 """Share of the views that may have a point outside of their silhouettes."""
-SEEN_SHARE = 0.5
-"""Share of the views that must have a cell in their image."""
+SEEN_SHARES = (0.5, 0.25, 0.1, 0.04)
+"""Share of the views that must have a cell in their image: the first for which the hull lacks nothing that it
+has for the last, as subjects may be photographed in parts. Where few see a cell, little rules it out..."""
+FEWEST_SEEN = 3
+"""...so that at least so many must, but for sets of few views."""
+LACKING = 0.01
+"""Share of a silhouette that the image of a hull lacks, from which on it is too small..."""
+COVERED_VIEWS = 48
+"""...and maximum number of views, evenly spread, in which that is looked at."""
 SILHOUETTE_BYTES = 1 << 30
 """Limit on the silhouettes of all views together. Larger ones are made smaller."""
 PIXEL_BYTES = 5
@@ -137,19 +145,18 @@ def carve(
     factor = silhouette_factor(views)
     outlines = [_Silhouette(view, factor) for view in views]
     low, side = _root(outlines)
-    count, tolerance = FIRST_LEVEL, int(TOLERANCE * len(outlines))
-    index = _grid(count)
-    index = _kept(outlines, index, low, side / count, tolerance)
+    count = FIRST_LEVEL
+    index, rule = _first_hull(outlines, low, side / count)
     if not len(index):
         return None
     # The root cube is a guess: the grid is laid anew around what the first carving left.
     first, last = index.min(axis=0), index.max(axis=0) + 1
     low, side = low + (first - 1) * side / count, float((last - first + 2).max()) * side / count
-    index = _grid(count)
-    index = _kept(outlines, index, low, side / count, tolerance)
-    if tolerance and len(index):
+    index = _kept(outlines, _grid(count), low, side / count, rule)
+    if rule.tolerance and len(index):
         outlines = _placed(outlines, low + (index + 0.5) * side / count, side / count)
-        index = _kept(outlines, index, low, side / count, 0)
+        rule = rule._replace(tolerance=0)
+        index = _kept(outlines, index, low, side / count, rule)
     while len(index):
         surface = _surface(index, count, low, side / count)
         if len(surface.points) >= cells or count >= LAST_LEVEL or 8 * len(index) > MOST_CELLS:
@@ -157,7 +164,7 @@ def carve(
         count *= 2
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
         index = (2 * index[:, None] + corners).reshape(-1, 3)
-        index = _kept(outlines, index, low, side / count, 0)
+        index = _kept(outlines, index, low, side / count, rule)
         if solid is not None and len(index):
             parts = [part[solid(low + (part + 0.5) * side / count)] for part in _parts(index)]
             index = np.concatenate(parts)
@@ -201,13 +208,37 @@ def _root(outlines: Sequence[_Silhouette]) -> tuple[np.ndarray, float]:
     return middle - half, 2 * half
 
 
+class _Rule(NamedTuple):
+    """Which cells are kept."""
+
+    tolerance: int
+    """Views that may rule a cell out without effect where all have it in their image."""
+    share: float
+    """Of ``SEEN_SHARES``."""
+
+    def keeps(self, seen: np.ndarray, against: np.ndarray, views: int) -> np.ndarray:
+        """(n,) bool for cells that of so many ``views`` some have ``seen`` (n,), and some are ``against``."""
+        half = 0.5 * views
+        enough = seen >= max(self.share * views, min(FEWEST_SEEN, half), 1)
+        return np.asarray(enough & (against <= self.tolerance * np.minimum(seen / half, 1)))
+
+
 def _kept(
-    outlines: Sequence[_Silhouette], index: np.ndarray, low: np.ndarray, side: float, tolerance: int
+    outlines: Sequence[_Silhouette], index: np.ndarray, low: np.ndarray, side: float, rule: _Rule
 ) -> np.ndarray:
-    """The cells ``index`` (n, 3) of the given ``side`` that at most ``tolerance`` views rule out."""
-    if len(index) > CELLS_AT_ONCE:
-        return np.concatenate([_kept(outlines, part, low, side, tolerance) for part in _parts(index)])
-    points = low + (index + 0.5) * side
+    """The cells ``index`` (n, 3) of the given ``side`` that ``rule`` keeps."""
+    kept = [
+        part[rule.keeps(*_counts(outlines, low + (part + 0.5) * side, side, rule.tolerance), len(outlines))]
+        for part in _parts(index)
+    ]
+    return np.concatenate(kept)
+
+
+def _counts(
+    outlines: Sequence[_Silhouette], points: np.ndarray, side: float, tolerance: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) each: views that have the cells of ``side`` at ``points`` (n, 3) in their image, and that rule
+    them out. Nothing more is counted where more than ``tolerance`` do."""
     seen, against = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     rows = np.arange(len(points))
     for outline in outlines:
@@ -215,9 +246,30 @@ def _kept(
         seen[rows] += in_image
         against[rows] += empty
         rows = rows[against[rows] <= tolerance]
-    keep = np.zeros(len(points), bool)
-    keep[rows] = seen[rows] >= max(SEEN_SHARE * len(outlines), 1)
-    return index[keep]
+    return seen, against
+
+
+def _first_hull(outlines: Sequence[_Silhouette], low: np.ndarray, side: float) -> tuple[np.ndarray, _Rule]:
+    """The cells (n, 3) of ``side`` that are kept of the first grid, from ``low`` on, and the rule by which
+    they and all later ones are."""
+    tolerance, grid = int(TOLERANCE * len(outlines)), _grid(FIRST_LEVEL)
+    some = subsample(outlines, COVERED_VIEWS)
+    seen, against = _counts(outlines, low + (grid + 0.5) * side, side, tolerance)
+    rules = [_Rule(tolerance, share) for share in SEEN_SHARES]
+    hulls = [grid[rule.keeps(seen, against, len(outlines))] for rule in rules]
+
+    def covered(hull: np.ndarray) -> np.ndarray:
+        return _coverage(some, low + (hull + 0.5) * side, side)
+
+    def enough(found: np.ndarray, most: np.ndarray | float) -> bool:
+        return bool(np.count_nonzero(found < most - LACKING) <= TOLERANCE * len(some))
+
+    found, chosen = covered(hulls[0]), 0
+    most = 1.0 if enough(found, 1.0) else covered(hulls[-1])
+    while not enough(found, most):
+        chosen += 1
+        found = covered(hulls[chosen])
+    return hulls[chosen], rules[chosen]
 
 
 def _placed(outlines: Sequence[_Silhouette], points: np.ndarray, side: float) -> list[_Silhouette]:
@@ -226,11 +278,29 @@ def _placed(outlines: Sequence[_Silhouette], points: np.ndarray, side: float) ->
     return [o for o, share in zip(outlines, overlap, strict=True) if share >= MISPLACED * np.median(overlap)]
 
 
+def _coverage(outlines: Sequence[_Silhouette], points: np.ndarray, side: float) -> np.ndarray:
+    """(views,) share of each silhouette that the image of the cells of ``side`` at ``points`` (n, 3)
+    covers."""
+    shares = []
+    for outline in outlines:
+        inside = np.count_nonzero(outline.inside)
+        both = np.count_nonzero(_image(outline, points, side) & outline.inside) if len(points) else 0
+        shares.append(both / inside if inside else 1.0)
+    return np.array(shares)
+
+
 def _overlap(outline: _Silhouette, points: np.ndarray, side: float) -> float:
     """Pixels in both the silhouette and the image of the cells, as a share of those in either."""
+    covered = _image(outline, points, side)
+    either = np.count_nonzero(covered | outline.inside)
+    return np.count_nonzero(covered & outline.inside) / either if either else 0.0
+
+
+def _image(outline: _Silhouette, points: np.ndarray, side: float) -> np.ndarray:
+    """(h, w) bool: pixels of the cells of ``side`` at ``points`` (n, 3)."""
     camera = outline.camera
     positions, depth = camera.project(points)
-    rows = camera.in_image(positions)
+    rows = depth > max(side, camera.near or 0)  # also those beside the image, into which they reach
     drawn = np.zeros((camera.height + 1, camera.width + 1), np.int32)
     size = max(camera.fx, camera.fy) * side / 2 / depth[rows]
     x, y = positions[rows].T
@@ -238,9 +308,7 @@ def _overlap(outline: _Silhouette, points: np.ndarray, side: float) -> float:
     top, bottom = (np.clip(np.floor(v), 0, camera.height).astype(np.int64) for v in (y - size, y + size + 1))
     for row, column, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
         np.add.at(drawn, (row, column), sign)
-    covered = drawn.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
-    either = np.count_nonzero(covered | outline.inside)
-    return np.count_nonzero(covered & outline.inside) / either if either else 0.0
+    return np.asarray(drawn.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0)
 
 
 def _surface(index: np.ndarray, count: int, low: np.ndarray, side: float) -> Surface:

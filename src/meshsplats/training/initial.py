@@ -97,7 +97,7 @@ def starting_patches(
     if dense is not None and not len(dense.points):
         dense = None
     radius = shell_radius(views, surface.points.astype(np.float64) + origin, far)
-    return dense, shell_patches(views, dense, radius, shell)
+    return dense, shell_patches(views, dense, radius, shell, threads)
 
 
 def lost_points(views: Sequence[View], points: ScenePoints) -> float:
@@ -144,8 +144,8 @@ def _masked_patches(views: Sequence[View], count: int, threads: int | None) -> P
     rough = carve(views, ROUGH_CELLS)
     if rough is None:
         raise ValueError(
-            "the alpha of the photographs leaves nothing that is the same subject in all of them: cameras and"
-            " masks do not fit each other"
+            "no place is inside of the silhouettes of the photographs that show it: cameras and masks do not"
+            " fit each other, or fewer than three photographs show each part of the subject"
         )
     near, far = depth_ranges(views, rough.points)
     depths = find_depths(views, near, far, rough.points, threads)
@@ -228,18 +228,18 @@ def shell_radius(views: Sequence[View], points: np.ndarray, far: np.ndarray) -> 
 
 
 def shell_patches(
-    views: Sequence[View], patches: Patches | None, radius: float, count: int
+    views: Sequence[View], patches: Patches | None, radius: float, count: int, threads: int | None = None
 ) -> Patches | None:
     """About ``count`` pieces of a sphere of ``radius`` around the cameras, where views see it past
     ``patches``, and a coarse backdrop behind them, which is much wider."""
     middle = np.median(np.array([view.camera.center for view in views]), axis=0)
-    mesh = None if patches is None else fans_of(flat_splats(patches), 4)
+    mesh = None if patches is None else fans_of(flat_splats(patches), 4, threads)
     looks = []
     for view in subsample(views, SHELL_VIEWS):
         camera = view.camera.within(SHELL_SIDE)
         covered = np.zeros((camera.height, camera.width), np.float32)
         if mesh is not None:
-            covered = render(mesh, camera).alpha
+            covered = render(mesh, camera, threads=threads).alpha
         # Views between these see a little more than they do.
         wider = _widened(camera, SHELL_MARGIN)
         x, y = (wider.width - camera.width) // 2, (wider.height - camera.height) // 2
@@ -321,10 +321,17 @@ def depth_ranges(views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray,
     return near, far
 
 
-def fans_of(cloud: GaussianCloud, sides: int) -> SplatMesh:
+def fans_of(cloud: GaussianCloud, sides: int, threads: int | None = None) -> SplatMesh:
     """One fan of ``sides`` triangles for each splat, in order; none is left out."""
     return convert(
-        cloud, mode="flat", sides=sides, footprint="none", min_opacity=0.0, shrink_faint=False, up=(0, -1, 0)
+        cloud,
+        mode="flat",
+        sides=sides,
+        footprint="none",
+        min_opacity=0.0,
+        shrink_faint=False,
+        up=(0, -1, 0),
+        threads=threads,
     )
 
 
