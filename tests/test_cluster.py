@@ -149,6 +149,18 @@ def test_local_workers_share_the_processors(monkeypatch):
         assert workers.threads is None
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 imports from the current folder first")
+def test_local_workers_import_nothing_from_the_current_folder(monkeypatch, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    (tmp_path / "pickle.py").write_text("open('ran', 'w').close(); from _pickle import *")
+    monkeypatch.chdir(tmp_path)
+    with open_workers("local", 64) as workers:
+        assert list(workers.run(abs, [-3])) == [(0, 3)]
+    assert not (tmp_path / "ran").exists()
+    assert "PYTHONSAFEPATH" not in os.environ
+
+
 def test_a_task_has_one_thread_unless_it_is_given_more(scheduler):
     with open_workers(scheduler) as workers:
         assert workers.threads == 1

@@ -7,6 +7,7 @@ again and repeats their tasks. A result does not depend on where its task ran.
 from __future__ import annotations
 
 import importlib
+import os
 import secrets
 import sys
 import threading
@@ -136,6 +137,7 @@ def open_workers(address: str | None, threads: int | None = None) -> Iterator[Wo
         with ExitStack() as stack:
             if address == LOCAL:
                 count = max(1, processors() // each)
+                stack.enter_context(_importing_safely())
                 local = dask.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=ANY_PORT)
                 client = stack.enter_context(dask.Client(stack.enter_context(local)))
             else:
@@ -144,6 +146,21 @@ def open_workers(address: str | None, threads: int | None = None) -> Iterator[Wo
     finally:
         with _lock:
             _made.clear()
+
+
+@contextmanager
+def _importing_safely() -> Iterator[None]:
+    """Within the block, new processes of Python 3.11 and later import nothing from the current folder, which
+    may be a stranger's."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 def _dask() -> Any:

@@ -53,7 +53,7 @@ def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
         draw(random_mesh(3), cameras()[:1], images=["a.png"])
 
 
-def test_executable_that_is_not_blender(program, tmp_path):
+def test_executable_that_is_not_blender(program, tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="no such program"):
         launch.command(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"3\.6 is too old; 4\.2 or newer"):
@@ -64,9 +64,25 @@ def test_executable_that_is_not_blender(program, tmp_path):
     broken.write_text("#!/bin/sh\necho 'cannot open libX11.so.6' >&2\nexit 127\n")
     with pytest.raises(ValueError, match=r"not Blender.*cannot open libX11\.so\.6"):
         launch.command(broken)
-    command = launch.command(program("Blender 4.2.1 LTS"))
+    monkeypatch.chdir(tmp_path.parent)
+    command = launch.command(program("Blender 4.2.1 LTS").relative_to(tmp_path.parent))
+    assert command[0] == str(tmp_path / "blender")  # it is run from another folder
     assert command[1:3] == ["--background", "--factory-startup"]
     assert command[-2].endswith("worker.py")
+
+
+def test_nothing_is_imported_from_the_current_folder(tmp_path, monkeypatch):
+    """It may be a downloaded one, with a json.py in it."""
+    (tmp_path / "json.py").write_text("open('ran', 'w').close(); raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep)
+    monkeypatch.setattr(launch, "command", lambda executable: [sys.executable, "-m", launch.worker.__name__])
+    with launch.begun(SceneOptions(engine="cycles")) as job:
+        (job.folder / launch.JOB).write_text("[]")  # no job: it ends
+        said = job.process.stdout.read()
+        job.process.wait()
+    assert "Error" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["json.py"]
 
 
 def test_what_blender_said_last_is_in_the_error(program, tmp_path):

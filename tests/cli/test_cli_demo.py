@@ -59,6 +59,13 @@ def test_what_is_there_stays_unless_it_is_forced(tmp_path, capsys):
     assert load_mesh(tmp_path / "scene.glb").splat_count == 500
 
 
+def test_it_imports_nothing_from_its_folder(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(demo, "STEPS", ("--version",))
+    (tmp_path / "json.py").write_text("raise SystemExit('a stranger')")
+    assert main(["demo", "-o", str(tmp_path), "--no-open"]) == 0
+    assert "\nmeshsplats " in capfd.readouterr().out
+
+
 def test_a_command_that_fails_ends_it_with_its_code(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(demo, "STEPS", ("convert missing.ply -o scene.glb", "view scene.ply -o scene.html"))
     assert main(["demo", "-o", str(tmp_path), "--no-open"]) == 1

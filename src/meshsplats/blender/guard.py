@@ -37,9 +37,9 @@ def main(plan_path: str) -> int:
             _kill(process)
 
     threading.Thread(target=watch, daemon=True).start()
-    status = 0
+    status, folder = 0, os.path.dirname(os.path.abspath(plan_path))
     for _ in range(plan["attempts"]):
-        running[:] = [_started(plan["command"])]
+        running[:] = [_started(plan["command"], folder)]
         if abandoned.is_set():
             _kill(running[0])
         status = running[0].wait()
@@ -58,9 +58,10 @@ def main(plan_path: str) -> int:
     return 0
 
 
-def _started(command: "list[str]") -> "subprocess.Popen[bytes]":
+def _started(command: "list[str]", folder: str) -> "subprocess.Popen[bytes]":
+    # Python and Blender's own import from the current folder first, which may be a stranger's: it is ours.
     # Blender leads a process group of its own, so that children of a wrapper script end with it.
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    process = subprocess.Popen(command, cwd=folder, stdin=subprocess.PIPE, start_new_session=True)
     assert process.stdin is not None
     with contextlib.suppress(OSError):
         process.stdin.write(b"\n")  # shows the worker that this pipe is ours

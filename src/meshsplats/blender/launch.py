@@ -95,7 +95,7 @@ def command(executable: Path | None) -> list[str]:
     if (int(version[1]), int(version[2])) < OLDEST:
         raise ValueError(f"{found}: Blender {version[1]}.{version[2]} is too old; 4.2 or newer is needed")
     flags = ["--background", "--factory-startup", "--python-exit-code", "1", "--python"]
-    return [str(found), *flags, str(Path(worker.__file__).resolve()), "--"]
+    return [os.path.abspath(found), *flags, str(Path(worker.__file__).resolve()), "--"]
 
 
 @dataclass(frozen=True)
@@ -232,9 +232,10 @@ def _scratch() -> Iterator[tuple[Path, int]]:
 def _start(command: Sequence[str], folder: Path, lock: int) -> subprocess.Popen[str]:
     environment = dict(os.environ)
     if command[1] == "-m":
-        # The worker must import this very package, wherever this process found it.
-        paths = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+        # The worker must import this very package, wherever this process found it, from another folder.
+        paths = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
+        paths = [*map(os.path.abspath, paths), str(Path(worker.__file__).resolve().parents[3])]
+        environment["PYTHONPATH"] = os.pathsep.join(paths)
     # Blender's own temporary files go into our folder.
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
     return subprocess.Popen(

@@ -20,6 +20,8 @@ STEPS = (
     "view scene.ply -o scene.html",
 )
 """What is run in the folder, after the splats were made."""
+_RUN = "import sys; sys.path = [p for p in sys.path if p]; import meshsplats.cli as m; sys.exit(m.main())"
+"""As ``python -m meshsplats``, but importing nothing from the folder, in which a stranger's files may lie."""
 MADE = ("scene.ply", "scene.glb", "compare", "turntable", "scene.html")
 
 
@@ -51,7 +53,7 @@ class Demo(Command):
         for step in STEPS:
             print(f"\n$ meshsplats {step}", flush=True)
             words = [*step.split(), *(["--force"] if self.force else [])]
-            done = subprocess.run([sys.executable, "-m", "meshsplats", *words], cwd=folder, check=False)
+            done = subprocess.run([sys.executable, "-c", _RUN, *words], cwd=folder, check=False)
             if done.returncode:
                 return done.returncode
         page = folder / "scene.html"
