@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import sys
 from ctypes import POINTER, c_char_p, c_int, c_int64, c_void_p
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._core.layout import check_layout
+from meshsplats._core.quota import processor_quota
 from meshsplats._core.structures import (
     CameraStruct,
     ImageGradientsStruct,
@@ -168,8 +170,14 @@ def thread_count(threads: int | None) -> int:
 
 
 def processors() -> int:
-    """Processors this process may use."""
+    """Processors this process may use: those that it may run on, or as many as its container's share of
+    their time is worth, rounded up."""
     try:
-        return len(os.sched_getaffinity(0))
+        count = len(os.sched_getaffinity(0))
     except AttributeError:  # not on every system
-        return os.cpu_count() or 1
+        count = os.cpu_count() or 1
+    quota = _quota()
+    return count if quota is None else min(count, math.ceil(quota))
+
+
+_quota = cache(processor_quota)
