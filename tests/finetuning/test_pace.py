@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from meshsplats import FileFormatError, make_config, splat_dataset
+from meshsplats._core import library
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning.pace import (
@@ -77,6 +78,14 @@ def test_a_pace_is_measured():
         assert pace.target > 0
         assert pace.step > 0
         assert pace.merging > 0
+
+
+def test_measuring_leaves_other_processors_alone(monkeypatch):
+    cloud = make_scene(300)
+    data = splat_dataset(cloud, train=2, test=1, width=32, threads=1)
+    monkeypatch.setattr(library, "_quota", lambda: pytest.fail("all processors are asked for"))
+    for config in make_config(minutes=1), make_config(minutes=1, order="file"):
+        measure_pace(cloud, data, config, ConversionOptions(), threads=1)
 
 
 @pytest.mark.parametrize("record", [StartRecord(), StartRecord(2000, 7), StartRecord(brief_steps=12)])

@@ -154,10 +154,10 @@ def measure_pace(
     every = -(-len(cloud) // TRIAL_SPLATS)
     part = cloud.take(np.arange(0, len(cloud), every))
     start = time.perf_counter()
-    simplify(part, max(1, len(part) // 2))
+    simplify(part, max(1, len(part) // 2), threads=threads)
     merging = (time.perf_counter() - start) / len(part)
     free = replace(without_cameras(options), max_splats=None, max_triangles=None, crop=None)
-    mesh = convert(part, free)
+    mesh = convert(part, free, threads=threads)
     views = dataset.train[:2]
     times = []
     for view in views:
@@ -165,7 +165,7 @@ def measure_pace(
         view.load()
         times.append(time.perf_counter() - start)
     state = State.begin(mesh, len(views), config, threads, device=device)
-    listing = drawing_order(mesh, quick=True) if config.order == "file" else None
+    listing = drawing_order(mesh, quick=True, threads=threads) if config.order == "file" else None
     phase = first_phase(config, mesh, state, listing=listing)
     state = phase.before_step(state, phase.usual)
     steps = []
