@@ -17,7 +17,7 @@ from meshsplats._files import atomic
 from meshsplats.cli import main
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.errors import EarlierRunError, FileFormatError
+from meshsplats.errors import EarlierRunError, FileFormatError, OverwritingError
 from meshsplats.tiles import building, start
 from meshsplats.tiles.building import build_tiles
 from meshsplats.tiles.journal import Journal
@@ -270,6 +270,19 @@ def test_a_file_is_taken_once(splats, tmp_path):
     with pytest.raises(ValueError, match=r"city\.ply and .*link\.ply are one file"):
         build_tiles(ms.stream_gaussians([splats, link]), tmp_path / "tiles", OPTIONS)
     assert [path.name for path in tmp_path.iterdir()] == ["link.ply"]
+
+
+def test_the_splats_of_a_tileset_are_not_replaced_by_tiles_of_them(splats, tmp_path):
+    folder = tmp_path / "city"
+    build_tiles(ms.stream_gaussians(splats), folder, TileOptions(as_splats=True))
+    before = digest(folder)
+    for named in (folder, tmp_path / "." / "city" / "tileset.json"):
+        with pytest.raises(OverwritingError, match=r"city/tileset\.json is read, and .*: give another folder"):
+            build_tiles(ms.stream_gaussians(named), folder, OPTIONS, replace_old=True)
+    assert main(["tiles", str(folder), "-o", str(folder), "--force"]) == 2
+    assert digest(folder) == before
+    assert not (tmp_path / "city.partial").exists()
+    start.need_other_folder([folder / "mine.ply", splats], folder)  # what is not of the tileset stays
 
 
 def test_one_scene_in_two_formats_is_told_of(splats, tmp_path, recwarn):

@@ -43,7 +43,13 @@ from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, harmonics_degree, stored_survey
 from meshsplats.tiles.options import TileOptions
-from meshsplats.tiles.start import need_each_once, need_same_start, start_facts, warn_of_copies
+from meshsplats.tiles.start import (
+    need_each_once,
+    need_other_folder,
+    need_same_start,
+    start_facts,
+    warn_of_copies,
+)
 from meshsplats.tiles.tileset import (
     Node,
     Tileset,
@@ -128,6 +134,7 @@ def build_tiles(
     Raises:
         FileExistsError: the folder or a partial one exists, or with ``replace_old`` one of another program.
         FileNotFoundError: there is nothing to resume.
+        OverwritingError: the splats are those of the tileset that it would replace.
         ValueError: options out of range, or other ones than the interrupted run had; no splat to convert;
             a file that is given twice; files that are too far apart for one origin.
         FileFormatError: the interrupted run has lost some of what it had done.
@@ -152,6 +159,7 @@ def build_tiles(
     with locked(target.with_name(f".{target.name}.lock")) as ours:
         if not ours:
             raise FileExistsError(f"{unfinished}: another process is at work on this tileset")
+        need_other_folder(source.paths, target)
         _check_folders(target, unfinished, resume, replace_old)
         build = _Build(source, unfinished, chosen, conversion, threads, workers, on_progress)
         try:

@@ -17,11 +17,12 @@ import numpy as np
 from meshsplats import __version__
 from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
-from meshsplats.errors import DataWarning, FileFormatError, OptionValueError
+from meshsplats.errors import DataWarning, FileFormatError, OptionValueError, OverwritingError
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.scene.origin import in_words
 from meshsplats.tiles.options import TileOptions
+from meshsplats.tiles.tileset import is_tile_file
 
 _NAMING = (".json", ".gltf", ".lcc")
 """Suffixes of documents beside whose files the splats are."""
@@ -38,6 +39,15 @@ def need_each_once(paths: Sequence[Path]) -> None:
         if other is not path:
             names = f"{path} is given twice" if other == path else f"{other} and {path} are one file"
             raise ValueError(f"{names}: its splats would lie upon themselves; name it once")
+
+
+def need_other_folder(paths: Sequence[Path], folder: Path) -> None:
+    """OverwritingError if one of ``paths`` is of the tileset ``folder``: what else lies there stays."""
+    root = Path(os.path.realpath(folder))
+    for path in paths:
+        real = Path(os.path.realpath(path))
+        if real.is_relative_to(root) and is_tile_file(real.relative_to(root).as_posix()):
+            raise OverwritingError(f"{path} is read, and a part of the tileset {folder}: give another folder")
 
 
 def warn_of_copies(source: SplatStream) -> None:
