@@ -7,6 +7,7 @@ import json
 import _splat_encoders as encode
 import numpy as np
 import pytest
+from _local import make_link
 from _splat_files import expected_cloud, random_splats
 from _splats import refused
 
@@ -179,6 +180,8 @@ for _ in range(70):
         (tile("https://example.com/0.glb"), "no path below its folder"),
         (tile("%2e%2e/0.glb"), "no path below its folder"),
         (tile("/etc/passwd"), "no path below its folder"),
+        (tile("\ud800.glb"), "no path below its folder"),
+        (tile("\u00e9" * 200 + ".glb"), "no path below its folder"),
         (tile("9.glb"), "'9.glb' that it names is missing"),
         (tile(None, [tile("0.glb"), tile("0.glb")]), "names '0.glb' twice"),
         (tile("tileset.json"), "names 'tileset.json' twice"),
@@ -205,3 +208,23 @@ def test_broken_tilesets_are_refused(tmp_path, root, message):
 
 def test_other_versions_are_refused(tmp_path):
     refused(put(tmp_path, tile("0.glb"), asset={"version": "2.0"}), "3D Tiles of version '2.0'", 96 << 20)
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ([[10**400] * 3] * 3, "a row of the axes must be 3 numbers"),
+        ([[1, 0], [0, 1]], "a row of the axes must be 3 numbers"),
+        ([[1, 0, 0]] * 3, "the axes must be a rotation"),
+        ([], "the axes must be a rotation"),
+        (3, "the axes must be a rotation"),
+    ],
+)
+def test_axes_that_are_none(tmp_path, axes, message):
+    note = {"contents": "splats", "up": [0, 0, 1], "axes": axes}
+    refused(put(tmp_path, tile("0.glb"), extras={"meshsplats": note}), message, 96 << 20)
+
+
+def test_links_make_no_other_tiles(tmp_path):
+    make_link(tmp_path / "again", tmp_path)
+    refused(put(tmp_path, tile("again/tileset.json")), "names 'tileset.json' twice", 96 << 20)

@@ -632,11 +632,20 @@ def test_a_tileset_inside_itself_ends(tileset, tmp_path):
             key: document["root"][key] for key in ("boundingVolume", "geometricError")
         } | {"content": {"uri": "tileset.json"}}
 
-    monkey = pytest.MonkeyPatch()
-    monkey.setattr("meshsplats.formats.gltf.tileset_file.MAX_TILES", 500)
-    with pytest.raises(FileFormatError, match="nested too deeply, or too many: 64 levels and 500 tiles"):
-        list(Tileset(broken(tileset, tmp_path, loop)).tiles())
-    monkey.undo()
+    found = Tileset(broken(tileset, tmp_path, loop))
+    for _ in range(2):
+        with pytest.raises(
+            FileFormatError, match=r"names 'tileset\.json' twice; a tileset file is read once"
+        ):
+            list(found.tiles())
+
+
+def test_files_of_a_tileset_share_its_limits(tileset, tmp_path, monkeypatch):
+    copy = broken(tileset, tmp_path, lambda document: None)
+    levels = max(level for _, level in Tileset(copy).tiles())
+    monkeypatch.setattr("meshsplats.formats.gltf.tileset_file.MAX_DEPTH", levels - 2)
+    with pytest.raises(FileFormatError, match=f"nested too deeply, or too many: {levels - 2} levels"):
+        list(Tileset(copy).tiles())
 
 
 def test_a_tileset_file_is_read_once(tileset, monkeypatch):

@@ -8,6 +8,7 @@ in a folder of its own, so that no file grows with the scene.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -243,6 +244,8 @@ class Tile:
     children: list[Tile] = field(default_factory=list)
     is_file: bool = False
     """Whether the content is another tileset file."""
+    depth: int = 0
+    """Tiles above it."""
 
     def corners(self) -> np.ndarray:
         """(8, 3) float64 corners of its box, in the coordinates of ``center``."""
@@ -294,6 +297,7 @@ class Tileset:
         _error(document, self.path)
         self._to_world = tile_frame(self.up).T
         self._count = 0
+        self._read = {os.path.realpath(self.path)}
         self._coarsest: np.ndarray | None = None
         self.root = self._tile(self._root_entry(document), self.path, 0)
 
@@ -307,7 +311,8 @@ class Tileset:
 
     def children(self, tile: Tile) -> list[Tile]:
         """The tiles that take the place of ``tile``; none for a leaf. A tileset file is read once."""
-        tile.children = [self._opened(child) for child in tile.children]
+        for i, child in enumerate(tile.children):
+            tile.children[i] = self._opened(child)
         return tile.children
 
     def tiles(self) -> Iterator[tuple[Tile, int]]:
@@ -321,8 +326,13 @@ class Tileset:
     def _opened(self, tile: Tile) -> Tile:
         if not tile.is_file:
             return tile
+        real = os.path.realpath(tile.content)
+        if real in self._read:
+            name = tile.content.name
+            raise FileFormatError(f"{self.path}: its tree names {name!r} twice; a tileset file is read once")
+        self._read.add(real)
         document = _load(tile.content)
-        root = self._tile(_object(document, "root", tile.content), tile.content, 0)
+        root = self._tile(_object(document, "root", tile.content), tile.content, tile.depth)
         if root.is_file:
             raise FileFormatError(f"{tile.content}: its root must have a mesh, not another tileset")
         return root
@@ -362,6 +372,7 @@ class Tileset:
             vertices=0 if is_file else _whole(extras.get("vertices"), "vertices", file),
             children=[self._tile(child, file, depth + 1) for child in children],
             is_file=is_file,
+            depth=depth,
         )
         worst = max((child.error for child in tile.children), default=0.0)
         if worst > tile.error:

@@ -8,6 +8,7 @@ https://docs.ogc.org/cs/22-025r4/22-025r4.html.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from functools import cached_property
@@ -53,10 +54,8 @@ class _Tile(NamedTuple):
 
 def axes_of(value: object, path: Path) -> np.ndarray:
     """(3, 3) float64 turn from the axes of a globe to those of the world, of the note of a tileset."""
-    try:
-        axes = np.array(value, np.float64)
-    except (TypeError, ValueError):
-        axes = np.zeros(0)
+    rows = value if isinstance(value, list) else []
+    axes = np.array([numbers(row, 3, "a row of the axes", path) for row in rows])
     if axes.shape != (3, 3) or not np.abs(axes @ axes.T - np.eye(3)).max() < 1e-6:
         raise FileFormatError(f"{path}: the axes must be a rotation, 3 rows of 3 numbers")
     return axes
@@ -67,7 +66,7 @@ class _Tree:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._read: set[Path] = set()
+        self._read: set[str] = set()
         self._count = 0
         document = self._document(path)
         self.root = self._root(document, path)
@@ -160,9 +159,10 @@ class _Tree:
         return False
 
     def _once(self, path: Path) -> None:
-        if path in self._read:
+        real = os.path.realpath(path)  # links lead to one file by many names
+        if real in self._read:
             raise FileFormatError(f"{self._path}: its tree names {path.name!r} twice; a tile is read once")
-        self._read.add(path)
+        self._read.add(real)
 
     def _matrix(self, tile: dict[str, Any], file: Path) -> np.ndarray:
         if "transform" not in tile:

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from meshsplats._common.json_files import json_object
+from meshsplats._common.json_files import can_be_named, json_object
 from meshsplats.errors import FileFormatError
 
 MAX_BYTES = 64 << 20
@@ -79,8 +79,9 @@ def file_below(file: Path, uri: str) -> Path:
     """The file that ``uri`` in ``file`` names, if it is a plain path below the folder of ``file``."""
     plain = unquote(uri)
     steps = [step for step in plain.split("/") if step != "."]
-    if not _PLAIN.fullmatch(plain) or ".." in steps:
+    path = file.parent.joinpath(*steps)
+    if not _PLAIN.fullmatch(plain) or ".." in steps or not can_be_named(path):
         raise FileFormatError(
             f"{file}: it refers to {uri[:80]!r}, which is no path below its folder; refused"
         )
-    return file.parent.joinpath(*steps)
+    return path
