@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import struct
+import time
 import tracemalloc
 import warnings
 import zipfile
@@ -362,7 +363,6 @@ def test_gltf_that_lie(tmp_path, change, match):
         "link.bin",
         "..\\secret.bin",
         "C:\\x",
-        "a\x00b",
         ".",
     ],
 )
@@ -373,6 +373,11 @@ def test_gltf_reads_no_file_outside_its_folder(tmp_path, uri):
     if uri == "link.bin":
         make_link(inside / "link.bin", tmp_path / "secret.bin")
     broken_gltf(inside, put("buffers", 0, "uri", uri), "outside its folder")
+
+
+@pytest.mark.parametrize("uri", ["a\x00b", "\ud800.bin", "a" * 300 + ".bin", "%00"])
+def test_gltf_names_what_no_file_can_be_called(tmp_path, uri):
+    broken_gltf(tmp_path, put("buffers", 0, "uri", uri), "which is no name of a file")
 
 
 def test_gltf_indices_beyond_the_vertices(tmp_path):
@@ -406,6 +411,18 @@ def test_a_small_gltf_that_repeats_one_mesh_for_ever(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_checks, "_BASE_BYTES", 1 << 20)
     monkeypatch.setattr(mesh_checks, "_FACTOR", 16)
     refused(path, "beyond what a file of", megabytes=32)
+
+
+def test_gltf_of_many_nodes_takes_linear_time(tmp_path):
+    """The arrays of a document are checked once, not for each reference to an entry of theirs."""
+    count = 20_000
+    path = tmp_path / "m.gltf"
+    nodes = {"scenes": [{"nodes": list(range(count))}], "nodes": [{}] * count}
+    path.write_text(json.dumps({"asset": {"version": "2.0"}, **nodes}))
+    start = time.process_time()
+    with pytest.raises(FileFormatError, match="no triangles"):
+        load_mesh(path)
+    assert time.process_time() - start < 5  # 26 s if each look-up checks all nodes
 
 
 def test_glb_containers_that_lie(tmp_path):

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from meshsplats._common.choices import Masks, Missing
+from meshsplats._common.json_files import can_be_named
 from meshsplats.datasets.lens import Lens, Pinhole, check_shape, fits, pinholes
 from meshsplats.datasets.photo_file import PhotoFile
 from meshsplats.datasets.views import ImageCache
@@ -54,15 +55,14 @@ def inside(folder: Path, name: str, where: str) -> Path:
     """The path of ``name`` in ``folder``. FileFormatError if it is absolute or leads out of the folder, by
     ``..`` or by a symbolic link; ``where`` begins the message."""
     clean = name.replace("\\", "/")
-    parts = PurePosixPath(clean).parts
-    if not clean or len(clean) > MAX_NAME or "\0" in clean:
-        raise FileFormatError(f"{where}: a file name must have 1 to {MAX_NAME} characters, got {name[:60]!r}")
     if leads_out(clean):
         raise FileFormatError(
             f"{where}: names the file {name[:200]!r}; only files inside the data set's folder are read, named"
             " relative to it"
         )
-    path = folder.joinpath(*parts)
+    path = folder.joinpath(*PurePosixPath(clean).parts)
+    if path == folder or len(clean) > MAX_NAME or not can_be_named(path):
+        raise FileFormatError(f"{where}: no file can be called {name[:60]!r}: 1 to {MAX_NAME} characters")
     real, root = os.path.realpath(path), os.path.realpath(folder)
     if os.path.commonpath([real, root]) != root:
         raise FileFormatError(

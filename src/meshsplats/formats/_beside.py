@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from meshsplats._common.json_files import can_be_named
 from meshsplats.errors import DataWarning, FileFormatError
 
 
@@ -20,7 +21,10 @@ def file_beside(path: Path, name: bytes) -> Path:
         clean = _below(clean, Path(os.path.abspath(path)).parent, folder)
         parts = PurePosixPath(clean).parts
         leads_out = clean.startswith("/") or ".." in parts or bool(PureWindowsPath(clean).drive)
-        target = Path(os.path.realpath(folder.joinpath(*(parts[-1:] if leads_out else parts))))
+        named = folder.joinpath(*(parts[-1:] if leads_out else parts))
+        if not can_be_named(named):
+            raise FileFormatError(f"{path}: refers to {shown_name(name)!r}, which is no name of a file")
+        target = Path(os.path.realpath(named))
         if folder in target.parents and (not leads_out or target.is_file()):
             return target
     raise FileFormatError(

@@ -18,6 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from meshsplats._common.json_files import can_be_named
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.meshopt import decoded_attributes, decoded_triangles
@@ -64,6 +65,7 @@ class GltfDocument:
         if not isinstance(version, str) or version.split(".")[0] != "2":
             raise self.error(f"not a glTF 2 file: its asset version is {str(version)[:20]!r}, expected '2.0'")
         self._refuse_extensions()
+        self._arrays: dict[str, list[dict[str, Any]]] = {}
         self._buffers: dict[int, memoryview] = {}
         self._unpacked: dict[int, memoryview] = {}
         self.unflagged: set[str] = set()
@@ -82,7 +84,9 @@ class GltfDocument:
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """The top-level array ``kind`` ("meshes", "nodes" ...), empty where it is absent."""
-        return self.objects(self.json.get(kind, []), kind)
+        if kind not in self._arrays:  # each is checked once: every reference to an entry asks for it
+            self._arrays[kind] = self.objects(self.json.get(kind, []), kind)
+        return self._arrays[kind]
 
     def objects(self, value: object, what: str) -> list[dict[str, Any]]:
         """``value``, an array of objects. FileFormatError for anything else; ``what`` names it."""
@@ -339,8 +343,12 @@ class GltfDocument:
         """A file that a .gltf file refers to. It must lie in the folder of the .gltf file or below."""
         folder = Path(os.path.realpath(self.path)).parent
         name = unquote(uri)
-        target = Path(os.path.realpath(folder / name)) if "\0" not in name else folder
-        if ":" in uri or "\\" in name or os.path.isabs(name) or folder not in target.parents:
+        if ":" in uri or "\\" in name or os.path.isabs(name):
+            raise self.error(f"refers to {uri[:80]!r} outside its folder; refused")
+        if not can_be_named(folder / name):
+            raise self.error(f"refers to {uri[:80]!r}, which is no name of a file; refused")
+        target = Path(os.path.realpath(folder / name))
+        if folder not in target.parents:
             raise self.error(f"refers to {uri[:80]!r} outside its folder; refused")
         if not target.is_file():
             raise self.error(f"its file {uri[:80]!r} is missing")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._common.json_files import json_object
+from meshsplats._common.json_files import can_be_named, json_object
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.content import Content
@@ -149,7 +149,11 @@ class _Index:
     def _checked(self, name: Any) -> str:
         """``name`` if it is a path below the folder of the index, on any system; else FileFormatError."""
         plain = isinstance(name, str) and _PATH.fullmatch(name)
-        if not plain or any(step in (".", "..") for step in name.split("/")):
+        if (
+            not plain
+            or any(step in (".", "..") for step in name.split("/"))
+            or not can_be_named(self._path.parent / name)
+        ):
             raise self._error(f"it refers to {str(name)[:80]!r}, which is no path below its folder; refused")
         return name
 
