@@ -136,6 +136,8 @@ def test_a_small_thing_in_a_large_place(monkeypatch):
         base = make_surface(scene, cameras=cameras, **options)
         away = np.linalg.norm(base.vertices, axis=1)
         found.append(int((np.abs(away - 0.25) < 0.03).sum()))
-        assert np.median(away[away > 10]) == pytest.approx(20, rel=0.1)
+        # At the border of the images it bends towards the cameras.
+        assert np.quantile(away, 0.9) == pytest.approx(20, rel=0.1)
+        assert away.max() < 30, "and there is nothing behind it"
     assert found[0] > 40
     assert found[1] == 0

@@ -104,6 +104,19 @@ def test_only_what_is_missing_below_and_between_the_views_is_added():
     assert len(missing_ground(points, faces, walkers(0.5), np.array([0, 0, 1.0]), VOXEL)[1]) == 0
 
 
+def test_a_far_background_costs_nothing():
+    """Mountains within the plan of the ground would have 10^11 cells."""
+    points, faces = sheet(((-1.0, -1.0, 1.0, 1.0),))
+    up = np.array([0, 0, 1.0])
+    alone = missing_ground(points, faces, walkers(), up, VOXEL, margin=8.0)
+    far = np.array([(3e4, -3e4, -5), (3e4, 3e4, 80), (-3e4, 3e4, 2)]), np.array([(0, 1, 2)], np.int32)
+    with_mountains = missing_ground(*both([(points, faces), far]), walkers(), up, VOXEL, margin=8.0)
+    x, y = np.random.default_rng(4).uniform(-2, 2, (2, 100))
+    for more in (alone, with_mountains):
+        landed = fall(*both([(points, faces), more]), x, y)
+        np.testing.assert_allclose(landed, ground(x, y), atol=TUCKED * VOXEL + 1e-6)
+
+
 def test_furniture_and_noise_below_are_no_ground():
     points, faces = sheet(((-1.0, -1.0, 1.0, 1.0),))
     table, deep = sheet((), height=0.8), sheet((), height=-1.0)

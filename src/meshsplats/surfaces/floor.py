@@ -50,7 +50,12 @@ class _Plan(NamedTuple):
 
 
 def missing_ground(
-    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], up: np.ndarray, voxel: float
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    up: np.ndarray,
+    voxel: float,
+    margin: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a place lacks of the ground below and between ``cameras``.
 
@@ -59,6 +64,8 @@ def missing_ground(
         cameras: at the height of the eye.
         up: (3,) unit direction.
         voxel: distance of the points of the grid that the surface is from; new ground has cells of twice it.
+        margin: how far around the cameras ground counts, scene units: more than eyes are high. A background
+            that reaches far beyond would have as many cells as nothing can hold.
 
     Returns:
         Vertices (k, 3) float64 and triangles (l, 3) int32, whose rim lies below the ground around it. None
@@ -68,7 +75,7 @@ def missing_ground(
 
     nothing = np.empty((0, 3)), np.empty((0, 3), np.int32)
     eyes = np.array([camera.center for camera in cameras], np.float64)
-    plan = _plan_of(vertices, eyes, up, CELL * voxel)
+    plan = _plan_of(vertices, eyes, up, CELL * voxel, margin)
     centers, feet, eye = plan.centers(), eyes @ plan.axes[:2].T, eyes @ up
     nearest = cKDTree(feet).query(centers)[1]
     top = _top_below(vertices, faces, plan, eye[nearest].reshape(plan.shape)).ravel()
@@ -88,11 +95,12 @@ def missing_ground(
     return _sheet(missing.reshape(plan.shape), heights, plan, TUCKED * voxel)
 
 
-def _plan_of(vertices: np.ndarray, eyes: np.ndarray, up: np.ndarray, cell: float) -> _Plan:
-    """The plan around the surface and what lies below the cameras."""
+def _plan_of(vertices: np.ndarray, eyes: np.ndarray, up: np.ndarray, cell: float, margin: float) -> _Plan:
+    """The plan around what lies below the cameras and, within the ``margin`` around that, the surface."""
     axes = np.stack([*level_axes(up), up])
-    level = np.concatenate([vertices, eyes]) @ axes[:2].T
-    low, high = level.min(axis=0) - cell, level.max(axis=0) + cell
+    level, feet = np.concatenate([vertices, eyes]) @ axes[:2].T, eyes @ axes[:2].T
+    low = np.maximum(level.min(axis=0), feet.min(axis=0) - margin) - cell
+    high = np.minimum(level.max(axis=0), feet.max(axis=0) + margin) + cell
     rows, columns = np.ceil((high - low) / cell).astype(int)
     return _Plan(axes, low, cell, (int(rows), int(columns)))
 

@@ -118,19 +118,19 @@ def close_gaps(field: np.ndarray) -> None:
     field[np.isnan(field) & near] = -_CLOSE
 
 
-def isosurface(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The surface where ``field``, an (x, y, z) grid, is 0, between points that all are numbers.
+def isosurface(field: np.ndarray, *, closed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """The surface where ``field``, an (x, y, z) grid, is 0, in the cells whose corners all are numbers.
 
     The triangles face the positive side. Parts of the interior with less than ``MIN_PART`` of the volume of
     the largest part are removed, and of an open surface those with less than that of its triangles. Hollows
-    of a closed one, whose points all are numbers, are filled.
+    of a closed one are filled.
 
     Returns:
         (n, 3) float64 vertices in grid steps, (m, 3) int32 triangles.
     """
     label, marching_cubes, _ = libraries()
     known = np.isfinite(field)
-    if known.all():
+    if closed:
         field = _without_pockets(field, label)
     part = label(field < 0, connectivity=1)
     sizes = np.bincount(part.ravel())
@@ -138,16 +138,29 @@ def isosurface(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
     small = sizes < MIN_PART * sizes[1:].max()
     small[0] = False
-    vertices, triangles, _, _ = marching_cubes(
-        np.where(known, np.where(small[part], -field, field), 1),
-        0.0,
-        gradient_direction="descent",
-        allow_degenerate=False,
-        mask=None if known.all() else known,
-    )
-    if not known.all():
+    try:
+        vertices, triangles, _, _ = marching_cubes(
+            np.where(known, np.where(small[part], -field, field), 1),
+            0.0,
+            gradient_direction="descent",
+            allow_degenerate=False,
+            mask=None if known.all() else _whole_cells(known),
+        )
+    except RuntimeError:  # no cell that is whole has a surface
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)
+    if not closed:
         vertices, triangles = large_parts(vertices, triangles)
     return vertices.astype(np.float64), triangles.astype(np.int32)
+
+
+def _whole_cells(known: np.ndarray) -> np.ndarray:
+    """(x, y, z) bool: at the highest corner of each cell, by which marching cubes are chosen, whether all
+    eight are ``known``."""
+    whole = known.copy()
+    for axis in range(3):
+        along = np.moveaxis(whole, axis, 0)
+        along[1:] &= along[:-1]
+    return whole
 
 
 def _without_pockets(field: np.ndarray, label: Callable[..., Any]) -> np.ndarray:

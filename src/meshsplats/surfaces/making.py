@@ -69,6 +69,9 @@ _LATER = 0.3
 """Steps of the vertices in the last round, relative to those before."""
 _FLOOR = 4
 """New ground has at most as many triangles as the surface divided by this."""
+_MARGIN = 2.0
+"""Ground counts this far around the cameras, in radii of the ball in which the grid is even: a background
+beyond is nothing to walk on."""
 _BOX_SIDE = 128
 """Sides of the depth images by which the box of a place is found."""
 
@@ -103,8 +106,8 @@ def make_surface(
 
     Returns:
         The mesh in scene units and relative to the scene's origin, with a texture or, with ``texture=0``,
-        with vertex colours. A closed one is a solid that faces outwards: with vertices at one place joined,
-        each edge has two triangles.
+        with vertex colours. Up is as ``convert`` has it for the same scene. A closed one is a solid that
+        faces outwards: with vertices at one place joined, each edge has two triangles.
 
     Raises:
         ValueError: an option out of its range, a scene without extent, images that show nothing solid, or a
@@ -257,7 +260,7 @@ def _fused(
         each=lambda *_: done(),
     )
     progress("triangles", 0, 1)
-    vertices, faces = isosurface(field)
+    vertices, faces = isosurface(field, closed=sources.closed)
     if not len(faces):
         raise ValueError(
             "the images show nothing solid: a surface is made of objects and places, not of haze"
@@ -270,7 +273,7 @@ def _fused(
         vertices, faces = close_holes(vertices, faces)
     vertices = grid.in_scene(grid.low + grid.voxel * vertices)
     if options.shape == "floor":
-        vertices, faces = _floored(scene, vertices, faces, sources, grid.voxel)
+        vertices, faces = _floored(scene, vertices, faces, sources, grid)
     return vertices, faces, relief, grid
 
 
@@ -279,12 +282,13 @@ def _floored(
     vertices: np.ndarray,
     faces: np.ndarray,
     sources: Sources,
-    voxel: float,
+    grid: Grid,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The surface with the ground that it lacks."""
     found, cameras = sources.found, sources.depth
     up = guess_up(scene, cameras) if found is None else found.up
-    points, ground = missing_ground(vertices, faces, cameras, up.astype(np.float64), voxel)
+    margin = _MARGIN * grid.radius or np.inf
+    points, ground = missing_ground(vertices, faces, cameras, up.astype(np.float64), grid.voxel, margin)
     if len(ground) > len(faces) // _FLOOR:
         points, ground = collapsed(points, ground, max(2, len(faces) // _FLOOR))
     return np.concatenate([vertices, points]), np.concatenate([faces, ground + np.int32(len(vertices))])
