@@ -8,6 +8,8 @@ import re
 import sys
 import zipfile
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -33,13 +35,17 @@ from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats.gltf.cameras import cameras_in_mesh
+from meshsplats.formats.outputs import placed
 from meshsplats.prior import bind
-from meshsplats.surfaces import make_surface, making
+from meshsplats.surfaces import files as surface_files
+from meshsplats.surfaces import make_surface, making, views
 from meshsplats.surfaces.files import SurfaceFileOptions, SurfaceRun
-from meshsplats.surfaces.fusion import TRUNCATION, collapsed, grid_of, isosurface
+from meshsplats.surfaces.fusion import TRUNCATION, close_gaps, collapsed, grid_of, isosurface
 from meshsplats.surfaces.holes import close_holes
 from meshsplats.surfaces.manifold import simplified
 from meshsplats.surfaces.options import CLOSED, OPEN, SurfaceOptions, level_options
+from meshsplats.viewpoints.finding import FoundCameras
 
 _TAGS = {"vertex": "xyz", "triangle": ("v1", "v2", "v3")}
 """Elements of a model in 3MF, and their numbers."""
@@ -90,6 +96,48 @@ def test_the_surface_of_a_plane_and_of_a_ball():
     assert volume(vertices, faces) == pytest.approx(4 / 3 * np.pi * 64, rel=0.05)
     for empty in (np.ones((4, 4, 4)), -np.ones((4, 4, 4))):
         assert len(isosurface(empty)[1]) == 0
+
+
+@needs_extra
+@pytest.mark.parametrize("axis", range(3))
+def test_an_open_surface_has_no_second_sheet_behind_the_one_that_is_seen(axis):
+    """A wall whose back nobody sees, whichever way it faces."""
+    away = np.moveaxis(np.broadcast_to(np.arange(24.0), (24, 24, 24)), 2, axis)
+    made = []
+    for steps in (away, 23 - away):
+        field = np.clip((steps - 12.3) / TRUNCATION, -1, 1).astype(np.float32)
+        field[steps < 12 - TRUNCATION] = np.nan
+        close_gaps(field)
+        vertices, faces = isosurface(field, closed=False)
+        made.append((len(faces), np.unique(vertices[:, axis].round(1)).tolist()))
+    assert made == [(2 * 23**2, [12.3]), (2 * 23**2, [10.7])]
+
+
+@needs_extra
+def test_an_open_surface_between_no_known_points_is_empty():
+    field = np.full((6, 6, 6), np.nan)
+    field[2, 2, 2:4] = -0.5, 0.5
+    assert len(isosurface(field, closed=False)[1]) == 0
+
+
+@needs_extra
+def test_a_room_that_is_seen_completely_is_one():
+    """Its air does not reach the border of the grid: it is no hollow in a solid."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [part for a, b, c, d in sides for part in ((a, b, c), (a, c, d))]
+    box = SplatMesh(corners, faces, np.tile([0.5, 0.5, 0.5, 1], (8, 1)))
+    cameras = [
+        look_at(place, np.add(place, way), up=np.roll(way, 1), width=128, height=128, fov=100)
+        for place in ((0.3, 0.2, 0.1), (-0.3, -0.2, -0.1))
+        for way in (*np.eye(3), *-np.eye(3))
+    ]
+    options = {**QUICK, "resolution": 40, "faces": 0}
+    room = make_surface(box, shape="open", cameras=cameras, **options)
+    away = np.abs(room.vertices).max(axis=1)
+    assert np.abs(away - 1).max() < 2 / 36 * 2
+    walls = np.histogram((room.vertices / away[:, None]).round(3), [-1.0001, -0.999, 0.999, 1.0001])[0]
+    assert walls[0] == pytest.approx(walls[2], rel=0.02)
 
 
 @needs_extra
@@ -242,6 +290,10 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     options = [*PLAIN, "--resolution", "24", "--faces", "600"]
     assert main(["surface", str(tmp_path / "scene.ply"), "-o", str(out), *options]) == 0
     assert "next: meshsplats prior" in capsys.readouterr().out
+    # Where base and splats stand apart, the next command would train in the wrong place.
+    larger = ["surface", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "large.obj"), *options]
+    assert main([*larger, "--scale", "2"]) == 0
+    assert "next:" not in capsys.readouterr().out
     base = load_mesh(out)
     assert np.abs(np.linalg.norm(base.vertices, axis=1) - 1).max() < 0.15
     assert open_edges(base.faces) == 0
@@ -446,6 +498,54 @@ def test_the_default_size_of_an_open_surface_is_said(tmp_path):
         assert heard == said
         side = len(base.textures[0].pixels) if base.textures else 0
         assert side == named.get("texture", 4096)
+
+
+def seen_from(cameras, kind="place") -> FoundCameras:
+    return FoundCameras(kind, 1.0, np.array([0.0, 0, 1]), 1.0, 0.0, 4.0, tuple(cameras))
+
+
+@needs_extra
+def test_the_views_in_a_file_stand_where_its_surface_does(tmp_path, monkeypatch):
+    save_mesh(wall(), tmp_path / "wall.npz")
+    cameras = [look_at((x, 0, -4), (0, 0, 0), up=(0, -1, 0), width=48, height=48) for x in (-1, 0, 1)]
+    save_cameras(cameras, tmp_path / "cameras.json")
+    monkeypatch.setattr(surface_files, "place_of", lambda *_: seen_from(cameras))
+    surface = SurfaceOptions(shape="open", resolution=16, size=48, rounds=0, texture=0)
+    files = SurfaceFileOptions(surface, cameras=tmp_path / "cameras.json", scale=2.0)
+    run = SurfaceRun(tmp_path / "wall.npz", tmp_path / "wall.glb", files, threads=1)
+    for point in ((0, 0, 0), (5, -3, 1)):
+        ((_, base),) = replace(run, place=partial(placed, origin=point)).save(force=True)[1]
+        written = load_mesh(run.output).vertices
+        for limit in (np.min, np.max):
+            wanted = 2 * limit(base.vertices, axis=0) - point
+            np.testing.assert_allclose(limit(written, axis=0), wanted, atol=1e-5)
+        first = cameras_in_mesh(run.output)[0]
+        np.testing.assert_allclose(first.center, 2 * cameras[0].center - point, atol=1e-5)
+
+
+@needs_extra
+def test_the_mesh_of_a_place_is_open(tmp_path, monkeypatch):
+    """Its fans were splats, which tell what it is; of other triangles that is said."""
+    inside = [look_at((0, 0, 0), way, up=(0, 1, 0.1), width=32, height=32) for way in np.eye(3)]
+    for kind in ("place", "object"):
+        found = seen_from(inside * 4, kind)
+        monkeypatch.setattr(views, "find_cameras", lambda cloud, count, found=found, **_: found)
+        sources = views.sources_of(convert(discs()), None, None, SurfaceOptions(views=4, size=32), 1)
+        assert sources.closed == (kind == "object")
+        if kind == "place":
+            assert [camera.center.tolist() for camera in sources.depth] == [[0, 0, 0]] * 4
+            assert views.place_of(convert(discs()), sources) is found
+    save_mesh(wall(), tmp_path / "wall.npz")
+    heard: list[str] = []
+    options = SurfaceOptions(resolution=16, size=32, views=4, rounds=0, texture=0)
+    run = SurfaceRun(tmp_path / "wall.npz", tmp_path / "w.obj", SurfaceFileOptions(options), say=heard.append)
+    run.save()
+    assert heard == ["taken for an object, as its triangles are no splats: ``shape`` open is for places"]
+
+
+def test_a_print_is_closed_by_default():
+    for suffix, shape in ((".stl", "closed"), (".3mf", "closed"), (".glb", "auto")):
+        assert SurfaceFileOptions().checked(Path(f"place{suffix}")).shape == shape
 
 
 @needs_extra

@@ -79,9 +79,9 @@ class Surface(Command):
             look = f"{len(base.textures[0].pixels)} texels, " if base.textures else "colours of vertices, "
             look = "" if path.suffix.lower() in PRINTED else look
             lines.append(f"{path} ({len(base.faces):,} triangles, {look}{size_of(path)})")
-        lines.append(f"in {seconds:.1f} s")
-        lines += [] if self.files.no_preview else [f"preview: {run.preview}"]
-        if self.output.suffix.lower() not in (*PRINTED, ".usdz"):
+        lines += [f"in {seconds:.1f} s", *([] if self.files.no_preview else [f"preview: {run.preview}"])]
+        in_place = self.files.scale is None and self.origin == "keep"
+        if in_place and self.output.suffix.lower() not in (*PRINTED, ".usdz"):
             splats = ["--splats", str(self.input), *self.reading.again()]
             words = ["--data", "photos/"] if isinstance(scene, SplatMesh) else splats
             words = ["meshsplats", "prior", str(self.output), *words, "-o", "prior.npz"]

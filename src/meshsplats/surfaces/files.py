@@ -73,12 +73,12 @@ class SurfaceFileOptions:
             ValueError: one is out of range.
         """
         suffix, known = output.suffix.lower(), ", ".join(base_meshes.BASE_SUFFIXES)
+        printed, plain = suffix in base_meshes.PRINTED, suffix in base_meshes.UNTEXTURED
         if suffix not in base_meshes.BASE_SUFFIXES:
             raise OptionsError(f"``output`` must end in {known}, got {output.name!r}")
         base_meshes.check_writing(output, unlit=self.unlit, image=self.image, collision=self.collision)
-        if suffix in base_meshes.PRINTED and self.surface.shape in ("open", "floor"):
+        if printed and self.surface.shape in ("open", "floor"):
             raise OptionsError(f"{suffix} is for printing, which wants a solid: ``shape`` closed")
-        plain = suffix in base_meshes.UNTEXTURED
         if plain and self.surface.texture:
             raise OptionsError(f"``texture`` is for formats that hold one, not for {suffix}")
         if self.image is not None and (plain or self.surface.texture == 0):
@@ -87,7 +87,8 @@ class SurfaceFileOptions:
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise OptionsError(f"``scale`` must be above 0, got {self.scale}")
         given = {name: value for name, value in asdict(self.surface).items() if value is not None}
-        options = SurfaceOptions(**given | ({"texture": 0} if plain else {})).checked()
+        given |= ({"texture": 0} if plain else {}) | ({"shape": "closed"} if printed else {})
+        options = SurfaceOptions(**given).checked()
         level_options(options.sized(closed=True), self.levels)  # open surfaces have more of everything
         return options
 
@@ -150,6 +151,8 @@ class SurfaceRun:
         given = None if chosen.cameras is None else load_cameras(chosen.cameras, origin=scene.origin)
         said("looking for views", 0, 1)
         sources = sources_of(scene, data, given, options, self.threads)
+        if options.shape == "auto" and sources.closed and sources.found is None:
+            self.say("taken for an object, as its triangles are no splats: ``shape`` open is for places")
         sized = options.sized(sources.closed)
         chosen_here = [f"at most {sized.faces:,} triangles"] if options.faces is None else []
         chosen_here += [f"a texture of {sized.texture} texels"] if options.texture is None else []
@@ -166,8 +169,12 @@ class SurfaceRun:
         views = self._views(place, sources) if place is not None else []
         with together():
             for base, path in zip(bases, files, strict=True):
-                own = views if path == files[0] and path.suffix.lower() in base_meshes.SHADED else ()
-                save(self.place(scaled(base, chosen.scale)), path, cameras=own)
+                here = scaled(base, chosen.scale)
+                there = self.place(here)
+                moved = np.mean(here.vertices.astype(np.float64) - there.vertices, axis=0)
+                has_views = path == files[0] and path.suffix.lower() in base_meshes.SHADED
+                own = [camera.relative_to(moved) for camera in views] if has_views else ()
+                save(there, path, cameras=own)
             if self.output.suffix.lower() in base_meshes.PRINTED:
                 self._say_size(bases[0])
             self.record(beside(self.output, CONFIGURATION))
@@ -203,7 +210,7 @@ class SurfaceRun:
         self.say(text)
 
     def _views(self, place: FoundCameras, sources: Sources) -> list[Camera]:
-        """Views of the place in the frame of the surface that is written, the first one to open with."""
+        """Views of the place in the units of the surface that is written, the first one to open with."""
         factor = 1.0 if self.options.scale is None else self.options.scale
         seen = [*place.cameras[:_VIEWS], *subsample(sources.depth, _VIEWS - 1)][:_VIEWS]
         made = []

@@ -10,8 +10,9 @@ import numpy as np
 
 from meshsplats._common.arrays import block_means
 from meshsplats.cameras.framing import guess_up
-from meshsplats.cameras.placing import has_surroundings
+from meshsplats.cameras.placing import SURROUNDED_ELEVATIONS, has_surroundings, outside_cameras
 from meshsplats.cameras.trajectories import dome
+from meshsplats.conversion.recovery import splats_of
 from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.rendering import render
@@ -39,7 +40,7 @@ class Sources:
     closed: bool
     """Whether the surface is a solid."""
     found: FoundCameras | None
-    """What ``find_cameras`` found, where it was asked."""
+    """What ``find_cameras`` found in the splats, where it was asked and they are known."""
 
 
 def sources_of(
@@ -50,7 +51,8 @@ def sources_of(
     threads: int | None,
 ) -> Sources:
     """The cameras and images for a surface of ``scene``: of an object on all sides of it, else where data
-    sets of splats have theirs.
+    sets of splats have theirs. A mesh is what the splats are that its fans were; of other triangles nothing
+    tells an object from a place, and they count as one.
 
     Raises ValueError for too few cameras, and MissingDependencyError without the extra ``base``, before the
     work.
@@ -62,17 +64,22 @@ def sources_of(
     if [] in (given, photos):
         raise ValueError("a surface needs at least one camera")
     found, surrounded = None, False
-    if isinstance(scene, GaussianCloud):
-        surrounded = has_surroundings(scene)
-        if (shape == "auto" and not surrounded) or (shape != "closed" and own):
+    splats = splats_of(scene) if shape != "closed" else None
+    if splats is not None:
+        surrounded = has_surroundings(splats)
+        if own or (shape == "auto" and not surrounded):
             count = HELD_OUT + options.views if own else 1
-            found = find_cameras(scene, count, width=side, height=side, threads=threads)
+            found = find_cameras(splats, count, width=side, height=side, threads=threads)
     is_object = not surrounded and (found is None or found.kind == "object")
     closed = shape == "closed" or (shape == "auto" and is_object)
     if photos is None:
         seen = given
         if own and found is not None and found.kind != "object":
             seen = list(found.cameras[HELD_OUT:])
+        elif own and surrounded and splats is not None and splats is not scene:
+            seen = outside_cameras(
+                splats, options.views, elevations=SURROUNDED_ELEVATIONS, width=side, height=side
+            )
         photos = _drawn(scene, seen, surrounded and not closed, options, threads)
     if given is None:
         around = closed and not (data is not None and from_one_side([view.camera for view in photos]))
@@ -81,11 +88,13 @@ def sources_of(
 
 
 def place_of(scene: GaussianCloud | SplatMesh, sources: Sources) -> FoundCameras | None:
-    """What ``find_cameras`` finds in a scene that is no object; None for objects and meshes."""
-    if sources.closed or isinstance(scene, SplatMesh):
+    """What ``find_cameras`` finds in a scene that is no object; None for objects and triangles that are no
+    splats."""
+    if sources.closed:
         return None
-    found = find_cameras(scene, 1) if sources.found is None else sources.found
-    return None if found.kind == "object" else found
+    splats = splats_of(scene) if sources.found is None else None
+    found = sources.found if splats is None else find_cameras(splats, 1)
+    return None if found is None or found.kind == "object" else found
 
 
 def from_one_side(cameras: Sequence[Camera]) -> bool:
