@@ -127,7 +127,7 @@ def test_gltf_nodes_place_their_meshes(tmp_path):
     # Under the scale of (1, 2, 1) the normal (-0.8, 0.6) goes with (1, 1/2, 1).
     turned = np.array([-0.8, 0.3, 0]) / np.hypot(0.8, 0.3)
     np.testing.assert_allclose(mesh.normals[0], turned, atol=1e-6)
-    np.testing.assert_allclose(np.abs(mesh.normals[6]), [0.8, 0.6, 0], atol=1e-6)
+    np.testing.assert_allclose(mesh.normals[6], [0.8, 0.6, 0], atol=1e-6)
 
 
 def test_gltf_skins_stand_as_their_joints_do(tmp_path):

@@ -75,9 +75,11 @@ class Placed(NamedTuple):
             linear = matrices[:, :3, :3]
             moved[part] = np.einsum("nij,nj->ni", linear, vertices[part]) + (matrices[:, :3, 3] - origin)
             if normals is not None and turned is not None:
-                # Normals follow the inverse transpose or, as their length does not matter, the cofactors.
+                # Normals follow the inverse transpose or, as their length does not matter, the cofactors with
+                # the sign of the determinant, by which they are divided.
                 a, b, c = np.moveaxis(linear, 2, 0)
                 cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+                cofactors[np.einsum("ni,ni->n", a, cofactors[:, :, 0]) < 0] *= -1
                 sides = np.einsum("nij,nj->ni", cofactors, normals[part])
                 length = np.linalg.norm(sides, axis=1, keepdims=True)
                 turned[part] = sides / np.where(length > 0, length, 1)
