@@ -414,6 +414,19 @@ def test_exported_layers_are_lifted_along_the_normal():
     assert bind(cube(), layers=1).export_lift == 0
 
 
+def test_shells_of_a_card_with_faces_of_both_windings_lie_along_its_normal():
+    """Leaves, hair and fences of games: normals of a place cancel, and each face goes its own way."""
+    corners = np.array([(0, 0, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1)], float)
+    faces = np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)])
+    mesh = bind(BaseMesh(corners, faces), layers=2, spacing=0.1).mesh
+    binding = mesh.binding
+    side = np.where(binding.vertex_face < 2, 1, -1)
+    np.testing.assert_allclose(mesh.vertices[:, 0], 0.1 * binding.layers * side, atol=1e-7)
+    np.testing.assert_allclose(mesh.normals[:, 0], side)
+    in_plane = [np.sort(mesh.vertices[binding.layers == layer, 1:], axis=0) for layer in (0, 1)]
+    np.testing.assert_allclose(*in_plane, atol=1e-7)
+
+
 def test_shells_lie_at_their_distance_and_grow_with_the_base():
     """A flat base: its shells are copies, moved down; those of a base of twice the size twice as far."""
     base = bumpy()

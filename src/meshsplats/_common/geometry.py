@@ -82,6 +82,10 @@ def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(up, first)
 
 
+_CANCELLED = 1e-6
+"""Length of a sum of normals, as a share of the sum of their lengths, up to which they cancel out."""
+
+
 def vertex_normals(
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -96,7 +100,8 @@ def vertex_normals(
         faces: (m, 3) vertex indices.
         same_place: (n,) index of a place for each vertex; vertices of one place share a normal. By default,
             each vertex is a place of its own.
-        fallback: (3,) unit vector where the triangles around a vertex have no area.
+        fallback: (3,) vector where the triangles around a vertex have no area, or their normals cancel out,
+            as on cards with triangles of both windings.
     """
     place = np.arange(len(vertices)) if same_place is None else same_place
     count = int(place.max()) + 1 if len(place) else 0
@@ -105,14 +110,17 @@ def vertex_normals(
     edges = [[p[corners[k]] - p[corners[0]] for p in coordinates] for k in (1, 2)]
     if same_place is not None:
         corners = [place[corner] for corner in corners]
-    sums = np.empty((count, 3))
+    sums, squares = np.empty((count, 3)), np.zeros(len(faces))
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         doubled = edges[0][i] * edges[1][j] - edges[0][j] * edges[1][i]  # twice the area times the normal
+        squares += np.square(doubled, dtype=np.float64)
         sums[:, axis] = sum(np.bincount(corner, doubled, minlength=count) for corner in corners)
     length = np.sqrt(np.einsum("ij,ij->i", sums, sums))
-    sums[length == 0] = fallback
-    return (sums / np.where(length > 0, length, 1)[:, None])[place]
+    around = sum(np.bincount(corner, np.sqrt(squares), minlength=count) for corner in corners)
+    lost = length <= _CANCELLED * around
+    sums[lost] = fallback
+    return (sums / np.where(lost, 1, length)[:, None])[place]
 
 
 def edge_groups(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -158,10 +158,16 @@ def _faces_with_area(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:
 def _protruding(binding: Binding, depth_views: DepthViews) -> np.ndarray:
     """(v,) bool: the vertices of shells whose face at their layer has a corner outside the base."""
     result = np.zeros(len(binding.layers), bool)
+    # Faces with corners where the base has no normal move by themselves.
+    has_normal = np.any(binding.base_normals, axis=1)
+    alone = np.flatnonzero(~has_normal[binding.base_faces].all(axis=1))
     for layer in range(1, int(binding.layers.max()) + 1):
         out = depth_views.protruding(binding.base_vertices + layer * binding.lift * binding.base_normals)
+        of_face = out[binding.base_faces].any(axis=1)
+        corners = binding.lifted(alone, np.full(len(alone), layer)).reshape(-1, 3)
+        of_face[alone] = depth_views.protruding(corners).reshape(-1, 3).any(axis=1)
         own = binding.layers == layer
-        result[own] = out[binding.base_faces[binding.vertex_face[own]]].any(axis=1)
+        result[own] = of_face[binding.vertex_face[own]]
     return result
 
 

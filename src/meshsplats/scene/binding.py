@@ -18,6 +18,8 @@ _MOST_STRETCH = 8.0
 flies off in a simulation must not take the layers around it along."""
 _EVEN = 1e-4
 """Largest difference between the stretches of a base that counts as scaled as a whole."""
+_ANY = (0.0, 0.0, 1.0)
+"""The normal where there is none."""
 SUM_TOLERANCE = 1e-6
 """Largest error of the sum of a vertex's weights, 1: a few roundings of float32."""
 
@@ -132,10 +134,22 @@ class Binding:
 
     def corners(self, rows: np.ndarray | slice) -> np.ndarray:
         """(r, 3, 3) float64 corners of the face of each of the chosen vertices, moved to its layer."""
-        indices = self.base_faces[self.vertex_face[rows]]
+        return self.lifted(self.vertex_face[rows], self.layers[rows])
+
+    def lifted(self, faces: np.ndarray, layers: np.ndarray) -> np.ndarray:
+        """(r, 3, 3) float64 corners of ``faces`` (r,) of the base, moved to ``layers`` (r,). Where the base
+        has no normal, faces have their own: those of a card with a face on either side move apart."""
+        indices = self.base_faces[faces]
         result = self.base_vertices[indices].astype(np.float64)
         if self.lift:
-            out = (self.layers[rows] * self.lift)[:, None, None] * self.base_normals[indices]
+            normals = self.base_normals[indices]
+            lost = ~normals.any(axis=2)
+            if lost.any():
+                own = np.cross(result[:, 1] - result[:, 0], result[:, 2] - result[:, 0])
+                length = np.linalg.norm(own, axis=1, keepdims=True)
+                own /= np.where(length > 0, length, 1)
+                normals = np.where(lost[:, :, None], own[:, None], normals)
+            out = (layers * self.lift)[:, None, None] * normals
             result += out if self.stretch is None else out * self.stretch[indices][:, :, None]
         return result
 
@@ -153,15 +167,18 @@ class Binding:
                 mixed[lost] = np.cross(b - a, c - a)
                 length[lost] = np.linalg.norm(mixed[lost], axis=1)
                 flat = np.flatnonzero(length == 0)
-                mixed[flat], length[flat] = self.base_normals[indices[flat, 0]], 1
+                corner = self.base_normals[indices[flat, 0]]
+                mixed[flat] = np.where(corner.any(axis=1, keepdims=True), corner, _ANY)
+                length[flat] = 1
             result[part] = mixed / length[:, None]
         return result
 
     @cached_property
     def base_normals(self) -> np.ndarray:
-        """(n, 3) float64 unit normals of the base at its vertices, continuous across seams."""
+        """(n, 3) float64 unit normals of the base at its vertices, continuous across seams; 0 where the faces
+        around have no area, or cancel out."""
         vertices = self.base_vertices.astype(np.float64)
-        return vertex_normals(vertices, self.base_faces, same_place=self.places)
+        return vertex_normals(vertices, self.base_faces, same_place=self.places, fallback=(0, 0, 0))
 
     def _face_sides(self, base_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Two sides of each of the base's faces, (m, 3) float64 vectors from its first corner."""
