@@ -19,6 +19,7 @@ from meshsplats.conversion import ConversionOptions, merging, merging_groups, me
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.merging import (
     FEWEST_OF_BLOCK,
+    MERGED_OPAQUE,
     opacity_of,
     optical_depth,
     simplify_in_blocks,
@@ -128,7 +129,7 @@ class TestByHand:
     def test_many_opaque_layers_are_one(self):
         cloud = random_cloud(1).take(np.zeros(50, int))
         one = simplify(replace(cloud, opacities=np.ones(50)), 1, low_pass=0)
-        assert one.opacities[0] == 1
+        assert one.opacities[0] == MERGED_OPAQUE
         np.testing.assert_allclose(one.means, cloud.means[:1], rtol=1e-6)
 
     def test_what_is_never_drawn_has_no_mass(self):

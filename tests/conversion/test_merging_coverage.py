@@ -103,7 +103,7 @@ def middle_alpha(cloud: ms.GaussianCloud) -> np.ndarray:
     return ms.render_splats(cloud, Camera(pose, 200, 200, 32, 32, 64, 64)).alpha
 
 
-@pytest.mark.parametrize("opacity", [0.9, 0.99])
+@pytest.mark.parametrize("opacity", [0.9, 0.99, 1])
 @pytest.mark.parametrize("share", [4, 16])
 def test_a_sheet_stays_without_holes(opacity, share):
     """Merged by mass and covariance alone, they would have a mean alpha of 0.69 and 0.56."""

@@ -41,11 +41,14 @@ DENSE = 0.9
 may cover more than it does: their opacities add up to less than this."""
 
 SOLID, SOLID_SHARE = 0.98, 0.95
-"""Splats of at least the first opacity, but less than 1, that have at least the second share of all mass are
-a surface sampled by opaque splats. Merged ones that are so opaque get 1, so that no cloud becomes such a
-surface by merging..."""
+"""Splats of at least the first opacity that have at least the second share of all mass are a surface sampled
+by opaque splats..."""
+MERGED_OPAQUE = np.nextafter(np.float32(1), np.float32(0))
+"""...unless they have this one, which merged ones get that are so opaque: no cloud becomes such a surface by
+merging. Such surfaces..."""
 SOLID_COVER = 1.4
-"""... and cover this multiple of their area: through gaps between merged ones shows what is behind all."""
+"""...cover this multiple of their area when they are merged: through gaps between merged ones shows what is
+behind all."""
 
 FEWEST_OF_BLOCK = 64
 """Splats that it leaves of a block at least, before the blocks are joined."""
@@ -276,7 +279,7 @@ def _depths(masses: np.ndarray, drawn: np.ndarray) -> np.ndarray:
 
 def _are_solid(cloud: GaussianCloud, masses: np.ndarray) -> bool:
     """Whether nearly all of ``cloud`` is opaque, as where splats were made of points or of a mesh."""
-    opaque = (cloud.opacities >= SOLID) & (cloud.opacities < 1)
+    opaque = (cloud.opacities >= SOLID) & (cloud.opacities != MERGED_OPAQUE)
     return float(masses[opaque].sum()) >= SOLID_SHARE * float(masses.sum())
 
 
@@ -331,7 +334,7 @@ def _merged(
     fields["quaternions"][changed] = quaternions_of(axes)
     fields["scales"][changed] = scales
     opacity = opacity_of(depth)
-    fields["opacities"][changed] = np.where(opacity >= SOLID, 1, opacity)
+    fields["opacities"][changed] = np.where(opacity >= SOLID, MERGED_OPAQUE, opacity)
     for k in range(cloud.sh.shape[1]):
         fields["sh"][changed, k] = groups.averages(cloud.sh[rows, k])
     return replace(result, **fields)
