@@ -45,6 +45,16 @@ def test_normals_turn_with_the_scene():
     assert np.abs(difference).mean() < 0.02
 
 
+@pytest.mark.parametrize("stray", [-1e6, 1e6])
+def test_a_stray_leaves_the_normals_of_the_others(stray):
+    cloud, true = ball_splats(500)
+    far = cloud.take(np.zeros(1, int))
+    far = replace(far, means=far.means + np.float32([stray, 0, 0]))
+    mesh = convert(GaussianCloud.joined([cloud, far]))
+    found = angles(mesh, shading_normals(mesh), np.concatenate([true, true[:1]]))
+    assert found[:-1].mean() < 15
+
+
 def test_unit_length_and_own_normals_are_kept():
     cloud, _ = ball_splats(500)
     mesh = convert(cloud)

@@ -155,9 +155,9 @@ class _Neighbours:
 
     def __init__(self, points: np.ndarray, side: float, threads: int | None = None) -> None:
         self._points, self._side, self._threads = points, side, threads
-        low = points.min(axis=0)
-        # Distant strays must not overflow the cell indices.
-        x, y, z = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64).T + 1
+        # Distant strays, which would overflow the cell indices, are in the outermost cells.
+        low = np.maximum(points.min(axis=0), np.median(points, axis=0) - 2**19 * side)
+        x, y, z = np.clip((points - low) / side, 0, 2**20 - 4).astype(np.int64).T + 1
         keys, cell_of = np.unique((x << 42) | (y << 21) | z, return_inverse=True)
         self._cell_of = cell_of.reshape(-1).astype(np.int32)
         self._count = len(keys)
