@@ -14,7 +14,7 @@ class CleaningRules:
     """Which splats are removed: those that any of these rules names. None: no such rule."""
 
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Centre outside the box x0 y0 z0 x1 y1 z1, in the coordinates of the file."""
+    """Centre outside the box x0 y0 z0 x1 y1 z1, in coordinates of the world, as ``info`` prints them."""
     min_opacity: Annotated[float | None, Range(0, 1)] = None
     """Opacity below this."""
     max_distance: Annotated[float | None, Range(0, math.inf)] = None

@@ -89,7 +89,8 @@ class ConversionOptions:
     """Make faint splats smaller: 3DGS cuts them off where their opacity falls below 1/255, which leaves the
     share 1 - 1 / (255 opacity) of their area."""
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Box x0 y0 z0 x1 y1 z1 in scene units: leave out splats whose centre is outside."""
+    """Box x0 y0 z0 x1 y1 z1, in coordinates of the world, as ``info`` prints them: leave out splats whose
+    centre is outside."""
     max_splats: Annotated[int | None, Range(1, 2**31 - 1)] = None
     """Largest number of splats: see ``budget``."""
     max_triangles: Annotated[int | None, Range(1, 2**31 - 1)] = None
