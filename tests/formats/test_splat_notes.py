@@ -4,6 +4,7 @@ programs that write them."""
 from __future__ import annotations
 
 import re
+import time
 import warnings
 
 import _splat_encoders as encode
@@ -297,3 +298,13 @@ def test_gltf_kernels_that_are_not_known_are_named(tmp_path):
     path.write_bytes(encode.gltf(encode.splat_accessors(random_splats(9, 0)), properties={"kernel": "cube"}))
     with pytest.warns(DataWarning, match="kernel 'cube', which is not known"):
         load_gaussians(path)
+
+
+def test_comments_of_many_blanks_take_linear_time(tmp_path):
+    """Lines of a header may end in carriage returns, and a comment then hold a line feed."""
+    data = file_with(tmp_path, "up" + " " * 4000 + "x\0y").read_bytes()
+    at = data.index(b"end_header\n") + len(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(data[:at].replace(b"\n", b"\r").replace(b"\0", b"\n") + data[at:])
+    start = time.process_time()
+    assert len(load_gaussians(tmp_path / "a.ply")) == 50
+    assert time.process_time() - start < 10  # over a minute if a pattern divides the blanks in all ways

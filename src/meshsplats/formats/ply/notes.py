@@ -25,7 +25,7 @@ from meshsplats.formats.ply.header import PlyHeader
 from meshsplats.formats.ply.table import FloatTable
 from meshsplats.scene.gaussians import Kernel
 
-_UP = re.compile(r"(meshsplats up|vertical axis|up[ _-]?axis|up|world[ _-]up)\s*[:= ]\s*(.+)", re.IGNORECASE)
+_UP = re.compile(r"(meshsplats up|vertical axis|up[ _-]?axis|up|world[ _-]up) ?[:= ] ?(.+)", re.IGNORECASE)
 _AXIS = re.compile(r"([+-]?)([xyz])(?![a-z])", re.IGNORECASE)
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE)
 
@@ -87,16 +87,15 @@ def is_linear(file: BinaryIO, header: PlyHeader, where: object) -> bool:
 
 
 def _up_of_note(note: str, by_brush: bool) -> np.ndarray | None:
-    said = _UP.fullmatch(note.strip())
+    said = _UP.fullmatch(" ".join(note.split()))  # without runs of blanks, which it would divide in all ways
     if said is None:
         return None
-    text = said[2].strip()
-    if axis := _AXIS.match(text):
+    if axis := _AXIS.match(said[2]):
         # The very words of Brush, which writes nothing else for scenes with y down.
         downward = axis[0] == "y" and (by_brush or said[1] == "Vertical axis")
         sign = -1.0 if axis[1] == "-" or downward else 1.0
         return sign * np.eye(3)["xyz".index(axis[2].lower())]
-    numbers = np.array([float(word) for word in _NUMBER.findall(text)])
+    numbers = np.array([float(word) for word in _NUMBER.findall(said[2])])
     if len(numbers) != 3 or not np.isfinite(numbers).all() or not numbers.any():
         return None
     if by_brush and said[1].lower() == "vertical axis":
