@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import struct
 
 import numpy as np
 import pytest
 from PIL import Image, ImageFont
 
-from meshsplats.images.reading import load_image
+from meshsplats.errors import FileFormatError
+from meshsplats.images.reading import load_image, read_shot
 from meshsplats.images.writing import (
     CAPTION,
     GAP,
@@ -24,6 +26,20 @@ from meshsplats.images.writing import (
 )
 
 RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("kind", [2, 7, 11, 12])
+def test_a_broken_tiff_is_an_error_of_its_file(tmp_path, kind):
+    """Pillow raises a TypeError where the place of the pixels is no whole number."""
+    path = tmp_path / "a.tif"
+    Image.new("RGB", (9, 8)).save(path)
+    data = path.read_bytes()
+    changed = data.replace(struct.pack("<HH", 273, 4), struct.pack("<HH", 273, kind))
+    assert changed != data
+    path.write_bytes(changed)
+    for read in (load_image, read_shot):
+        with pytest.raises(FileFormatError, match=r"a\.tif: a broken image: "):
+            read(path)
 
 
 def test_bytes_are_rounded():

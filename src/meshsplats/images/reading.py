@@ -6,8 +6,9 @@ import io
 import math
 import os
 import re
-import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -75,7 +76,7 @@ class Shot:
 
 def read_header(path: Path) -> Header:
     """Size and kind of an image, without its pixels. FileFormatError if it is none, or too large."""
-    with _opened(path) as image:
+    with _opened(path) as image, _decoding(path):
         return Header(*_stored_size(image), _has_alpha(image), _orientation(image))
 
 
@@ -92,22 +93,17 @@ def load_image(
     Raises:
         FileFormatError: the image is broken, too large, or of no known format.
     """
-    with _opened(path, data) as opened:
-        try:
-            image = _as_stored(opened)
-            if image.mode.startswith("I;16") or image.mode == "I":
-                grey = np.asarray(image, np.int64)
-                if grey.min(initial=0) < 0 or grey.max(initial=0) > 65535:
-                    raise FileFormatError(f"{path}: an image cannot hold integers beyond 16 bits")
-                return np.repeat(np.rint(grey / 257).astype(np.uint8)[..., None], 3, axis=2)
-            if image.mode == "F":
-                raise FileFormatError(f"{path}: holds floating-point values; convert it to 8 bits")
-            plain = image.convert("RGBA" if _has_alpha(image) else "RGB")
-            return np.asarray(_in_srgb(image, plain, path) if to_srgb else plain)
-        except FileFormatError:
-            raise
-        except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
-            raise _broken(path, error) from None
+    with _opened(path, data) as opened, _decoding(path):
+        image = _as_stored(opened)
+        if image.mode.startswith("I;16") or image.mode == "I":
+            grey = np.asarray(image, np.int64)
+            if grey.min(initial=0) < 0 or grey.max(initial=0) > 65535:
+                raise FileFormatError(f"{path}: an image cannot hold integers beyond 16 bits")
+            return np.repeat(np.rint(grey / 257).astype(np.uint8)[..., None], 3, axis=2)
+        if image.mode == "F":
+            raise FileFormatError(f"{path}: holds floating-point values; convert it to 8 bits")
+        plain = image.convert("RGBA" if _has_alpha(image) else "RGB")
+        return np.asarray(_in_srgb(image, plain, path) if to_srgb else plain)
 
 
 def _in_srgb(image: Any, plain: Any, path: str | os.PathLike[str]) -> Any:
@@ -156,17 +152,14 @@ def _srgb_transform(profile: bytes) -> tuple[str, Any]:
 
 def read_shot(path: Path) -> Shot:
     """How a photograph was taken. FileFormatError if it is broken: it is decoded, a JPEG coarsely."""
-    with _opened(path) as image:
+    with _opened(path) as image, _decoding(path):
         size, kind = _stored_size(image), str(image.format)
         is_panorama = size[0] == 2 * size[1] and _is_equirectangular(image)
         # EXIF data of TIFF are in the file, which older versions of Pillow close as they load it; those of
         # PNG may be behind the pixels.
         lens = _lens(image) if kind == "TIFF" else None
-        try:
-            image.draft("RGB", (1, 1))
-            image.load()
-        except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
-            raise _broken(path, error) from None
+        image.draft("RGB", (1, 1))
+        image.load()
         return Shot(size, kind, _lens(image) if lens is None else lens, is_panorama)
 
 
@@ -179,8 +172,8 @@ def _lens(image: Any) -> tuple[str, ...]:
         numbers = (more.get(_FOCAL), more.get(_FOCAL_OF_FILM), more.get(_ZOOM))
         lens = (*(str(name or "") for name in names), *map(_positive, numbers))
         return lens if any(lens) else ()
-    except (OSError, ValueError, SyntaxError, TypeError, ArithmeticError, LookupError, struct.error):
-        return ()  # as any program may write there what it likes
+    except Exception:  # any program may write there what it likes
+        return ()
 
 
 def _positive(value: Any) -> str:
@@ -193,12 +186,19 @@ def _positive(value: Any) -> str:
 
 def read_exif(path: Path) -> bytes:
     """The EXIF data of an image; empty if it has none."""
-    with _opened(path) as image:
+    with _opened(path) as image, _decoding(path):
         return bytes(image.getexif().tobytes())
 
 
-def _broken(path: str | os.PathLike[str], error: BaseException) -> FileFormatError:
-    return FileFormatError(f"{path}: a broken image: {str(error)[:120]}")
+@contextmanager
+def _decoding(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Within the block, whatever goes wrong is a FileFormatError: decoders raise errors of any type."""
+    try:
+        yield
+    except (FileFormatError, DataWarning):
+        raise
+    except Exception as error:
+        raise FileFormatError(f"{path}: a broken image: {str(error)[:120]}") from None
 
 
 def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...]:
@@ -229,9 +229,9 @@ def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:
     try:
         formats = _formats(path, data)
         image = Image.open(path if data is None else io.BytesIO(data), formats=formats)
-    except (FileNotFoundError, PermissionError):
+    except (FileNotFoundError, PermissionError, MissingDependencyError):
         raise
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
+    except Exception as error:  # of any type, as in ``_decoding``
         raise FileFormatError(
             f"{path}: not an image of a known format ({', '.join(FORMATS)}): {str(error)[:120]}"
         ) from None
@@ -255,14 +255,14 @@ def _orientation(image: Any) -> int:
         try:
             found = image.getexif().get(_ORIENTATION)
             return int(found) if found in _UNTURNED else 1
-        except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error):
+        except Exception:
             return 1
 
 
 def _stored_size(image: Any) -> tuple[int, int]:
     """Width and height in pixels as they are stored; Pillow may give those of a TIFF upright."""
     if image.format == "TIFF":
-        return image.tag_v2[_WIDTH], image.tag_v2[_HEIGHT]
+        return int(image.tag_v2[_WIDTH]), int(image.tag_v2[_HEIGHT])
     return image.width, image.height
 
 
