@@ -51,6 +51,8 @@ def test_a_folder_is_read_and_z_points_up(tmp_path):
     np.testing.assert_allclose(cloud.means, np.stack([x, -z, y], axis=1))
     np.testing.assert_allclose(cloud.up, [0, -1, 0], atol=1e-6)
     assert sum(map(len, ms.stream_gaussians(tmp_path / "scene", block=4))) == 9
+    (tmp_path / "scene" / "meta.lcc").rename(tmp_path / "scene" / "Market Hall.lcc")  # after its project
+    np.testing.assert_array_equal(ms.load_gaussians(tmp_path / "scene").means, cloud.means)
 
 
 FILES = encode.lcc(random_splats(9, degree=3))

@@ -58,6 +58,8 @@ def splat_file(path: Path) -> Path:
     for name in folder_files():
         if (path / name).is_file():
             return path / name
+    if len(scenes := files_named(path, (".lcc",))) == 1:  # by the name of its project
+        return scenes[0]
     if scenes := files_named(path, (".lcc2",)):  # whose refusal says how to convert them
         return scenes[0]
     for folder in (path / "point_cloud", path):
