@@ -386,6 +386,8 @@ def test_gltf_without_a_texture_keeps_its_colours(tmp_path):
         ({"textures": []}, "refers to index 0 of 0 textures"),
         ({"samplers": []}, "refers to index 0 of 0 samplers"),
         ({"samplers": [{"wrapT": 7}]}, "unknown wrapping"),
+        ({"samplers": [{"wrapT": [1]}]}, "unknown wrapping"),
+        ({"textures": [{"source": [0]}]}, r"refers to index \[0\] of 1 images"),
     ],
 )
 def test_gltf_textures_that_lie(tmp_path, changes, message):

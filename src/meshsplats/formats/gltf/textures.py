@@ -146,10 +146,12 @@ class _Textures:
         if source is None:
             self.unread += 1
             return -1
+        document.item("images", source, "a texture")
         sampler: dict[str, Any] = {}
         if "sampler" in texture:
             sampler = document.item("samplers", texture["sampler"], "a texture")
-        wraps = [_WRAPS.get(sampler.get(way, 10497)) for way in ("wrapS", "wrapT")]
+        ways = [sampler.get(way, 10497) for way in ("wrapS", "wrapT")]
+        wraps = [_WRAPS.get(way) if isinstance(way, (int, float)) else None for way in ways]
         if None in wraps:
             raise document.error(f"unknown wrapping of a texture: {str(sampler)[:80]}")
         factor = np.ones(4) if look.factor is None else look.factor.copy()
