@@ -86,6 +86,13 @@ def test_the_only_splats_in_an_archive_are_read(tmp_path, kind, method):
         load_mesh(path)
 
 
+def test_any_meta_json_beside_splats_makes_no_sog_file(tmp_path):
+    files = {"scan/meta.json": b'{"author": "x"}', "scan/scan.ply": ply_bytes(tmp_path)}
+    path = zipped(tmp_path / "scan.zip", files)
+    same(load_gaussians(path), load_gaussians(tmp_path / "_source.ply"))
+    assert format_of(path) == "ply"
+
+
 def test_convert_names_the_mesh_after_the_archive(tmp_path):
     zipped(tmp_path / "scan.zip", {"a.ply": ply_bytes(tmp_path)})
     assert (
@@ -159,8 +166,10 @@ def test_nothing_is_written_and_no_path_is_followed(tmp_path):
         ({"x.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n"}, "PLY|header"),
         ({"x.ply": "cut"}, "x.ply|shorter|bytes"),
         ({"scene.usdz/x.glb": b"glTF"}, "no SOG file"),
+        ({"a/scene.sog": b"PK"}, r"a zip archive with 'a/scene\.sog' in it: unpack it, and give that"),
+        ({"meta.json": b"{}"}, r"meta\.json has no object 'means'"),
     ],
-    ids=["several", "none", "empty", "images", "header", "cut", "glb"],
+    ids=["several", "none", "empty", "images", "header", "cut", "glb", "sog", "meta"],
 )
 def test_other_archives_are_named(tmp_path, files, message):
     ply = ply_bytes(tmp_path)
@@ -186,6 +195,12 @@ def test_a_bomb_and_other_methods_are_refused(tmp_path, monkeypatch):
     zipped(tmp_path / "lzma.zip", {"x.ply": ply_bytes(tmp_path)}, zipfile.ZIP_LZMA)
     with pytest.raises(FileFormatError, match="compressed by method 14, not by deflate"):
         load_gaussians(tmp_path / "lzma.zip")
+    zipped(tmp_path / "lzma.sog", encode.sog(SPLATS), zipfile.ZIP_LZMA)
+    with pytest.raises(FileFormatError, match=r"'meta\.json': it is compressed by method 14"):
+        load_gaussians(tmp_path / "lzma.sog")
+    zipped(tmp_path / "lzma.pt", {"a/data.pkl": b"splats sh0"}, zipfile.ZIP_LZMA)
+    with pytest.raises(FileFormatError, match="a checkpoint of PyTorch.*the program that wrote it"):
+        load_gaussians(tmp_path / "lzma.pt")
     wrong = bytearray(zipped(tmp_path / "wrong.zip", {"x.ply": ply_bytes(tmp_path)}, 0).read_bytes())
     wrong[len(wrong) // 2] ^= 1
     (tmp_path / "wrong.zip").write_bytes(wrong)
@@ -213,7 +228,7 @@ def checkpoint(path: Path, content: object) -> Path:
         (
             "ckpt_29999_rank0.pt",
             {"step": 1, "splats": {"means": 0, "sh0": 1}},
-            r"it is gsplat's.*torch\.load\('.+ckpt",
+            r"it is gsplat's.*torch\.load\(sys\.argv\[1\].*ckpt",
         ),
         ("ckpt.zip", {"step": 1, "splats": {"means": 0, "sh0": 1}}, "it is gsplat's"),
         (
@@ -252,19 +267,36 @@ def test_a_checkpoint_that_cannot_be_unpacked_is_named(tmp_path):
         load_gaussians(path)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="quotes of other shells")
+@pytest.mark.parametrize("name", ["$(mkdir sprung) `x`.{}", "a'; \"b.{}"])
+def test_names_in_commands_to_paste_are_quoted(tmp_path, name):
+    path = checkpoint(tmp_path / name.format("pt"), {"splats": {"means": 0, "sh0": 1}})
+    with pytest.raises(FileFormatError) as caught:
+        load_gaussians(path)
+    words = shlex.split(str(caught.value).split("as .ply: ")[1])
+    assert words[:2] == ["python", "-c"]
+    assert words[3:] == [str(path), name.format("ply")]
+    (tmp_path / name.format("lcc2")).write_text("{}")
+    with pytest.raises(FileFormatError) as caught:
+        load_gaussians(tmp_path / name.format("lcc2"))
+    words = shlex.split(str(caught.value).split("convert it first: ")[1])
+    assert words[2:] == [name.format("lcc2"), name.format("ply")]
+
+
 @pytest.mark.slow
 def test_the_line_for_gsplats_checkpoints_works(tmp_path):
     torch = pytest.importorskip("torch")
     plain = load_gaussians(write_ply(tmp_path / "_source.ply", [splat_table(SPLATS)]))
     tensors = ms.gaussians_to_tensors(plain, "gsplat", torch=True)
-    path = tmp_path / "ckpt_29999_rank0.pt"
+    path = tmp_path / "$(mkdir sprung) 'ckpt'.pt"  # of a stranger
     torch.save({"step": 29999, "splats": dict(tensors)}, path)
     with pytest.raises(FileFormatError) as caught:
         load_gaussians(path)
     command = str(caught.value).split("as .ply: ")[1]
-    words = [sys.executable, *shlex.split(command)[1:]]
-    subprocess.run(words, cwd=tmp_path, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    again = load_gaussians(tmp_path / "ckpt_29999_rank0.ply")
+    command = command.replace("python", shlex.quote(sys.executable), 1)
+    subprocess.run(command, shell=True, cwd=tmp_path, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert not (tmp_path / "sprung").exists()
+    again = load_gaussians(path.with_suffix(".ply"))
     np.testing.assert_allclose(again.means, plain.means)
     np.testing.assert_allclose(again.scales, plain.scales, rtol=1e-5)
     np.testing.assert_allclose(again.sh, plain.sh, rtol=1e-6)

@@ -7,7 +7,9 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
+
+from meshsplats._common.words import command_line
 
 _HEAD = 4096
 """First bytes of a file that suffice here."""
@@ -88,6 +90,15 @@ BROKEN_ZIP = (
 _TORCH = (".pt", ".pth", ".ckpt")
 
 
+def open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    """The file ``name`` in an archive, to be read. KeyError without one, else errors of ``BROKEN_ZIP``; also
+    for other methods than deflate: LZMA may claim gigabytes for its dictionary."""
+    info = archive.getinfo(name)
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise NotImplementedError(f"it is compressed by method {info.compress_type}, not by deflate")
+    return archive.open(info)
+
+
 def foreign(path: Path, head: bytes) -> str:
     """What the file ``path`` is, which begins with ``head``, and what to do with it; empty if it is unknown.
     Its name decides first, as the formats of many programs are the same inside."""
@@ -135,9 +146,10 @@ def checkpoint(path: Path) -> str:
 
 def gsplat_export(path: Path) -> str:
     """The command that saves the splats of a checkpoint of gsplat's trainer as .ply."""
-    read = f"torch.load({str(path)!r}, map_location='cpu', weights_only=True)['splats']"
-    save = f"ms.save_gaussians(ms.gaussians_from_tensors({read}), {path.stem + '.ply'!r})"
-    return f'python -c "import torch, meshsplats as ms; {save}"'
+    read = "torch.load(sys.argv[1], map_location='cpu', weights_only=True)['splats']"
+    save = f"ms.save_gaussians(ms.gaussians_from_tensors({read}), sys.argv[2])"
+    names = command_line([path, f"{path.stem}.ply"])  # from strangers, perhaps, and quoted
+    return f'python -c "import sys, torch, meshsplats as ms; {save}" {names}'
 
 
 def _names_in(path: Path) -> bytes:
@@ -150,7 +162,7 @@ def _names_in(path: Path) -> bytes:
             name = next((n for n in archive.namelist() if n.endswith("data.pkl")), None)
             if name is None:
                 return b""
-            with archive.open(name) as member:
+            with open_member(archive, name) as member:
                 return member.read(_MAX_PICKLE)
     except BROKEN_ZIP:
         return b""

@@ -8,10 +8,12 @@ import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from meshsplats._common.foreign import BROKEN_ZIP
+from meshsplats._common.foreign import BROKEN_ZIP, open_member
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 
+MAX_META_BYTES = 4 << 20
+"""Of the meta.json of a SOG file."""
 _PIECE = 1 << 20
 _MAX_TRIED = 64
 """Of files that are named like splats, only this many are opened to see whether they are."""
@@ -55,9 +57,18 @@ class Archive:
         self._raw.close()
 
     @property
-    def has_meta(self) -> bool:
-        """Whether it may be a SOG file."""
-        return any(name.rsplit("/", 1)[-1] == "meta.json" for name in self.names)
+    def meta(self) -> str | None:
+        """The name of the meta.json that is least deep in it; None without one. SOG files have it."""
+        found = [name for name in self.names if name.rsplit("/", 1)[-1] == "meta.json"]
+        return min(found, key=lambda name: (name.count("/"), name), default=None)
+
+    @property
+    def is_sog(self) -> bool:
+        """Whether it has the meta.json of a SOG file, or one that cannot be unpacked: the reader says so."""
+        try:
+            return self.meta is not None and b'"means"' in self.bytes(self.meta, MAX_META_BYTES)
+        except FileFormatError:
+            return True
 
     def named(self, suffixes: tuple[str, ...]) -> list[str]:
         """The files in it whose names end in one of ``suffixes``; not too many."""
@@ -71,7 +82,7 @@ class Archive:
         """The whole of a file in it, at most ``limit`` bytes; else FileFormatError."""
         pieces, left = [], limit + 1
         try:
-            with self._zip.open(name) as file:
+            with open_member(self._zip, name) as file:
                 while left and (piece := file.read(min(left, _PIECE))):
                     pieces.append(piece)
                     left -= len(piece)
@@ -97,12 +108,8 @@ class ZippedFile(io.RawIOBase):
         self._at_end = False
         self._file: Any = io.BytesIO()
         try:
-            info = archive.getinfo(name)
-            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                # LZMA may claim gigabytes for its dictionary.
-                raise NotImplementedError(f"it is compressed by method {info.compress_type}, not by deflate")
-            self._file = archive.open(info)
-            self._length = info.file_size
+            self._file = open_member(archive, name)
+            self._length = archive.getinfo(name).file_size
             Budget(path).spend(self._length, f"{name[:200]!r} in it")
         except (KeyError, *BROKEN_ZIP) as error:
             if isinstance(error, FileFormatError):

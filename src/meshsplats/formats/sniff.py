@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from meshsplats._common.foreign import foreign, foreign_archive
+from meshsplats._common.words import command_line
 from meshsplats.errors import FileFormatError
 from meshsplats.formats import splat_formats
 from meshsplats.formats.content import Container, Content
@@ -49,7 +50,7 @@ def _members(content: Content) -> list[str]:
         archive = content.archive
     except FileFormatError:  # broken: the reader says so
         return []
-    if archive.has_meta or content.name.endswith(".usdz"):
+    if archive.is_sog or content.name.endswith(".usdz"):
         return []
     return [name for name in archive.named(zipped_suffixes()) if _is_splats(content.inside(name))]
 
@@ -94,6 +95,10 @@ def splat_format(content: Content) -> SplatFormat:
 def _archive_refusal(content: Content) -> FileFormatError:
     """The error for a zip archive in which nothing is read."""
     names = content.archive.names
+    if packed := content.archive.named((".sog",)):
+        return UnreadSplats(
+            f"{content.path}: a zip archive with {packed[0][:200]!r} in it: unpack it, and give that"
+        )
     if what := foreign_archive(content.path, names):
         return FileFormatError(f"{content.path}: {what}")
     found = ", ".join(sorted(names)[:5])[:200] or "nothing"
@@ -110,7 +115,8 @@ def _expected() -> str:
 def _unread(content: Content) -> str:
     """What splats are of a known format that is not read, and what to do with them; empty for others."""
     path, text = content.path, content.json_text
-    convert = f"convert it first: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
+    command = command_line(["npx", "@playcanvas/splat-transform", path.name, f"{path.stem}.ply"])
+    convert = f"convert it first: {command}"
     if content.head[:4] == _SPLATV or content.name.endswith(".splatv"):
         return (
             ".splatv files, of splats that move, are not read here; the .ply that they are made of is"

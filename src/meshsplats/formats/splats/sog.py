@@ -19,10 +19,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from meshsplats._common.json_files import json_object
+from meshsplats._common.json_files import can_be_named, json_object
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats._zipped import Archive
+from meshsplats.formats._zipped import MAX_META_BYTES, Archive
 from meshsplats.formats.content import Content
 from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
@@ -30,10 +30,10 @@ from meshsplats.scene.gaussians import Kernel
 from meshsplats.scene.origin import SAMPLE
 
 T = TypeVar("T")
-_MAX_META_BYTES = 4 << 20
 _SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
 """Words of every meta.json."""
 _MAX_SPLATS = 1 << 28
+_MAX_IMAGE_BYTES = 4 * _MAX_SPLATS
 _AT_ONCE = 1 << 16
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 _PALETTE_COLUMNS = 64
@@ -66,7 +66,7 @@ def _reader(content: Content, budget: Budget) -> _Reader:
 def _matches(content: Content) -> bool:
     if content.is_archive:
         try:
-            return content.archive.has_meta
+            return content.archive.meta is not None
         except FileFormatError:  # broken: the reader says so
             return True
     text = content.json_text
@@ -85,13 +85,16 @@ class _Folder:
 
     def read_meta(self) -> bytes:
         with open(self._meta, "rb") as file:
-            return file.read(_MAX_META_BYTES + 1)
+            return file.read(MAX_META_BYTES + 1)
 
     def read(self, name: str) -> bytes:
         found = self._folder / name
-        if not found.is_file():
+        if not (can_be_named(found) and found.is_file()):
             raise FileFormatError(f"{self._meta}: the file {name!r} that it names is missing")
-        self._budget.extend(os.stat(found).st_size)
+        size = os.stat(found).st_size
+        if size > _MAX_IMAGE_BYTES:
+            raise FileFormatError(f"{self._meta}: {name!r} has over {_MAX_IMAGE_BYTES:,} bytes; refused")
+        self._budget.extend(size)
         return found.read_bytes()
 
 
@@ -100,18 +103,17 @@ class _Archive:
 
     def __init__(self, archive: Archive) -> None:
         self._archive, self._names = archive, set(archive.names)
-        metas = [n for n in self._names if n.rsplit("/", 1)[-1] == "meta.json"]
-        if not metas:
+        if archive.meta is None:
             listed = ", ".join(sorted(self._names)[:5])[:200]
             raise FileFormatError(
                 f"{archive.path}: a zip archive without meta.json is no SOG file (it holds {listed})"
             )
-        self._meta = min(metas, key=lambda n: (n.count("/"), n))
+        self._meta = archive.meta
         # Images are compressed already: more than this is a decompression bomb.
         self._limit = (16 << 20) + 4 * os.stat(archive.path).st_size
 
     def read_meta(self) -> bytes:
-        return self._archive.bytes(self._meta, _MAX_META_BYTES)
+        return self._archive.bytes(self._meta, MAX_META_BYTES)
 
     def read(self, name: str) -> bytes:
         full = self._meta[: -len("meta.json")] + name
@@ -125,7 +127,7 @@ class _Archive:
 class _Reader:
     def __init__(self, files: _Folder | _Archive, where: Path, budget: Budget) -> None:
         self._files, self._where, self._budget = files, where, budget
-        self._meta = json_object(files.read_meta(), _MAX_META_BYTES, f"{where}: meta.json")
+        self._meta = json_object(files.read_meta(), MAX_META_BYTES, f"{where}: meta.json")
 
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._where}: {message}")
