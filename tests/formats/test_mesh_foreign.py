@@ -541,7 +541,7 @@ def test_ply_that_is_no_mesh(tmp_path):
 def test_obj(tmp_path):
     (tmp_path / "m.obj").write_text(
         "# two faces\no thing\nv 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0 0 0 1\nv 0 0 1 .2 .2 .2\nvt 0 0\n"
-        "f 1/1 2/1 3/1\r\nf -4//1 -3 \\\n-2 -1\n"
+        "f 1/1 2/1 3/1\r\nf -4//1 \\\n-3 \\\n-2 -1\n"
     )
     mesh = load_mesh(tmp_path / "m.obj")
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]

@@ -19,6 +19,7 @@ from test_mesh_foreign import TRIANGLE, gltf
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
 from meshsplats.formats import _validation as mesh_checks
+from meshsplats.formats.obj.mesh import statements
 
 MESH = random_mesh(np.random.default_rng(0), 5, 6)
 
@@ -423,6 +424,13 @@ def test_gltf_of_many_nodes_takes_linear_time(tmp_path):
     with pytest.raises(FileFormatError, match="no triangles"):
         load_mesh(path)
     assert time.process_time() - start < 5  # 26 s if each look-up checks all nodes
+
+
+def test_obj_of_one_endless_line_takes_linear_time():
+    start = time.process_time()
+    ((number, words),) = statements(b"v 1 \\\n" * 1_000_000)
+    assert (number, len(words)) == (1_000_001, 2_000_000)
+    assert time.process_time() - start < 8  # minutes if all that is joined is copied for each line
 
 
 def test_glb_containers_that_lie(tmp_path):

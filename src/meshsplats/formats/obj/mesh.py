@@ -179,13 +179,13 @@ def _turned(words: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
 
 def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
     """The words of each line with its line number; a backslash at the end joins the next line."""
-    joined = b""
+    joined: list[bytes] = []
     for number, line in enumerate(data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n"), 1):
         if line.endswith(b"\\"):
-            joined += line[:-1] + b" "
+            joined.append(line[:-1])
             continue
-        words = (joined + line).split() if joined else line.split()
-        joined = b""
+        words = b" ".join((*joined, line)).split() if joined else line.split()
+        joined = []
         if words:
             yield number, words
 
