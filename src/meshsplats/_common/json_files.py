@@ -12,7 +12,7 @@ from typing import Any
 from meshsplats.errors import FileFormatError
 
 MAX_BYTES = 16 << 20
-_MAX_DIGITS = 300
+_MAX_DIGITS = 308
 
 
 def read_json(path: Path, most: int = MAX_BYTES) -> Any:
