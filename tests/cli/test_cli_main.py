@@ -162,6 +162,29 @@ def test_a_folder_in_place_of_a_file_is_named_as_one(monkeypatch, tmp_path):
     assert messages.one_line(other) == f"{tmp_path / 'a'}: Permission denied"
 
 
+def test_what_terminals_obey_is_escaped(tmp_path, capsys):
+    """Names in files from strangers could set the title of a window, hide lines or turn their direction."""
+    path = tmp_path / "a.ply"
+    names = [*"xyz", "opacity", "f_dc_0", "rot_0", "scale_0", "\x1b]0;owned\7\x1b[2J"]
+    properties = "".join(f"property float {name}\n" for name in names)
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n")
+    assert main(["convert", str(path), "-o", str(tmp_path / "a.npz")]) == 1
+    said = capsys.readouterr().err
+    assert said.rstrip("\n").isprintable()
+    assert r"\x1b]0;owned\x07\x1b[2J" in said
+    messages.say("\u202e Fran\u00e7ais, \u65e5\u672c")
+    assert capsys.readouterr().err == "meshsplats: \\u202e Fran\u00e7ais, \u65e5\u672c\n"
+    Command().finish(None, "a\tb\nc\x1b\r")
+    assert capsys.readouterr().out == "a\tb\nc\\x1b\\r\n"
+
+
+def test_the_mesh_of_train_is_not_replaced_by_its_splats(tmp_path, monkeypatch, capsys):
+    """By whatever path they are named."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "photos", "-o", "mesh.ply", "--as-splats", str(tmp_path / "mesh.ply")]) == 2
+    assert "--as-splats must not be the mesh itself" in capsys.readouterr().err
+
+
 def test_bugs_are_not_hidden(monkeypatch):
     monkeypatch.setitem(COMMANDS, "raises", (f"{__name__}:Raises", ""))
     monkeypatch.setattr(Raises, "error", AttributeError("a bug"))

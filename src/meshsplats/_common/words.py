@@ -23,6 +23,7 @@ NAMED_COLORS: dict[str, tuple[float, float, float]] = {
 }
 
 _NO_CHARACTER = re.compile("[\ud800-\udfff]")
+_CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 SOON = 3.0
 """Seconds of a phase before its end is estimated."""
 
@@ -92,6 +93,12 @@ def _numbers(text: str) -> tuple[float, float, float] | None:
 def legible(text: str) -> str:
     """``text`` with a mark for each byte of a file name that is not UTF-8, which no file of text can hold."""
     return _NO_CHARACTER.sub("\ufffd", text)
+
+
+def printable(text: str) -> str:
+    """``text`` with escapes for what terminals obey and what turns the direction of text, as names in files
+    from strangers may have it."""
+    return _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
 
 
 def natural_key(name: str) -> list[int | str]:

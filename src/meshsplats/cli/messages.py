@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from meshsplats._common.words import naming
+from meshsplats._common.words import naming, printable
 from meshsplats._files import DISK_FULL
 from meshsplats.errors import ClusterError, DeviceError, NamingOptions, OverwritingError, with_options
 
@@ -100,8 +100,8 @@ def write_options(how: Callable[[str], str]) -> None:
 
 
 def with_flags(text: str) -> str:
-    """``text`` with flags for the names of options in double backquotes."""
-    return with_options(text, _spelled or flag)
+    """``text`` with flags for the names of options in double backquotes, fit for terminals."""
+    return printable(with_options(text, _spelled or flag))
 
 
 def shown_path(path: str | os.PathLike[str]) -> str:
@@ -122,13 +122,13 @@ def one_line(error: object) -> str:
         text = "out of memory"
     if _standard_input is not None:
         text = text.replace(_standard_input, "standard input")
-    return " ".join(with_flags(text).split()) or type(error).__name__
+    return with_flags(" ".join(text.split())) or type(error).__name__
 
 
 def say(text: str) -> None:
     """Prints a line on standard error, if anybody reads it."""
     with suppress(OSError):
-        print(f"meshsplats: {naming(with_flags(text), subject)}", file=sys.stderr, flush=True)
+        print(f"meshsplats: {with_flags(naming(text, subject))}", file=sys.stderr, flush=True)
 
 
 @contextmanager

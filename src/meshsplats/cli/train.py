@@ -74,7 +74,7 @@ class Train(TrainingCommand):
         check_mesh_suffix(self.output)
         if self.as_splats is not None:
             check_splat_endings(written_ending(self.as_splats.name))
-            if self.as_splats == self.output:
+            if self.as_splats.resolve() == self.output.resolve():
                 raise UsageError("--as-splats must not be the mesh itself: give another name")
             check_outputs([self.as_splats], self.force, inputs=self.inputs)
         super().check()
