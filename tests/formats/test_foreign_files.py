@@ -199,7 +199,7 @@ def test_a_bomb_and_other_methods_are_refused(tmp_path, monkeypatch):
     with pytest.raises(FileFormatError, match=r"'meta\.json': it is compressed by method 14"):
         load_gaussians(tmp_path / "lzma.sog")
     zipped(tmp_path / "lzma.pt", {"a/data.pkl": b"splats sh0"}, zipfile.ZIP_LZMA)
-    with pytest.raises(FileFormatError, match="a checkpoint of PyTorch.*the program that wrote it"):
+    with pytest.raises(FileFormatError, match=r"a checkpoint of PyTorch.*the program that wrote it"):
         load_gaussians(tmp_path / "lzma.pt")
     wrong = bytearray(zipped(tmp_path / "wrong.zip", {"x.ply": ply_bytes(tmp_path)}, 0).read_bytes())
     wrong[len(wrong) // 2] ^= 1
