@@ -233,8 +233,8 @@ def _start(command: Sequence[str], folder: Path, lock: int) -> subprocess.Popen[
     environment = dict(os.environ)
     if command[1] == "-m":
         # The worker must import this very package, wherever this process found it, from another folder.
-        paths = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
-        paths = [*map(os.path.abspath, paths), str(Path(worker.__file__).resolve().parents[3])]
+        given = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
+        paths = [*map(os.path.abspath, given), str(Path(worker.__file__).resolve().parents[3])]
         environment["PYTHONPATH"] = os.pathsep.join(paths)
     # Blender's own temporary files go into our folder.
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
