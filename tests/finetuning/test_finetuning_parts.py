@@ -450,6 +450,22 @@ def test_the_first_signal_is_kept_and_the_second_interrupts():
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system has no SIGHUP")
+@pytest.mark.parametrize("before", [signal.SIG_DFL, signal.SIG_IGN])
+def test_a_lost_terminal_stops_a_run_unless_that_is_ignored(before):
+    kept = signal.signal(signal.SIGHUP, before)
+    try:
+        with StopSignals() as stop:
+            if before == signal.SIG_IGN:
+                assert signal.getsignal(signal.SIGHUP) == before
+            else:
+                signal.raise_signal(signal.SIGHUP)
+            assert stop.received == (signal.SIGHUP if before == signal.SIG_DFL else None)
+        assert signal.getsignal(signal.SIGHUP) == before
+    finally:
+        signal.signal(signal.SIGHUP, kept)
+
+
 def test_splats_begin_as_wide_as_in_the_photographs():
     """Those of 3DGS were widened in them, unless the photographs were larger then."""
     cloud = replace(make_scene(300), scales=make_scene(300).scales * np.float32(0.3))

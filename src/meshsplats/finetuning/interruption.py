@@ -1,10 +1,14 @@
-"""SIGINT and SIGTERM stop a run after the current step."""
+"""SIGINT, SIGTERM and SIGHUP, as where a terminal is closed, stop a run after the current step."""
 
 from __future__ import annotations
 
 import signal
 import threading
 from types import TracebackType
+
+
+_HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)
+"""Not on Windows."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -24,7 +28,8 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopSignals:
-    """Context manager that stores the first SIGINT or SIGTERM in ``received`` instead of ending the process.
+    """Context manager that stores the first SIGINT, SIGTERM or SIGHUP in ``received`` instead of ending the
+    process. SIGHUP stays ignored where it is (nohup).
 
     A second SIGINT raises KeyboardInterrupt at once. Outside the main thread, where Python handles no
     signals, it has no effect.
@@ -36,7 +41,10 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            numbers = [signal.SIGINT, signal.SIGTERM]
+            if _HANGUP is not None and signal.getsignal(_HANGUP) != signal.SIG_IGN:
+                numbers.append(_HANGUP)
+            for number in numbers:
                 self._before[number] = signal.signal(number, self._handle)
         return self
 

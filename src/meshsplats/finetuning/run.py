@@ -121,7 +121,7 @@ def finetune(
         MissingDependencyError: device 'gpu' without a GPU, or no library for it; nothing was written.
         DeviceError: the mesh has too many triangles at a vertex, or in a splat with a filter, for the GPU; of
             a run that starts, nothing was written. Or the GPU failed, or did not finish an image.
-        Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
+        Interrupted: SIGINT, SIGTERM or SIGHUP arrived; a checkpoint is in the folder, if there is one.
     """
     need(FinetuneConfig, config=config, optional=True)
     config = with_changes(config or FinetuneConfig(), **changes)
@@ -310,7 +310,8 @@ class TrainingLoop:
                     self._save_preview()
                 if time.perf_counter() - self.save_time >= self._checkpoint_interval:
                     self._save_checkpoint()
-                self._notify()
+                if signals.received is None:  # else the terminal may be gone
+                    self._notify()
             if clock.step > self.first_step:
                 self._report()
                 self._save_checkpoint()
