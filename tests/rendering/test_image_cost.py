@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,15 @@ def test_costs_are_said_with_their_minutes():
     announce_cost(mesh, [CAMERA.scaled(10)], 4, 2, said.append)
     assert "layers lie over each other at each pixel: this may take about" in said.pop()
     announce_cost(mesh, [CAMERA], 1, 2, said.append)
+    assert said == []
+
+
+def test_a_large_image_is_announced_however_few_layers_it_has():
+    mesh, said = facing(20, 100.0), []
+    huge = replace(CAMERA.scaled(200), width=16_384, height=16_384)
+    announce_cost(mesh, [huge], 4, 1, said.append)
+    assert said.pop().startswith("16,384 x 16,384 pixels of 4 x 4 samples take about ")
+    announce_cost(mesh, [CAMERA] * 100_000, 1, 1, said.append)  # of which progress tells
     assert said == []
 
 

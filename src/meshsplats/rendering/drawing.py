@@ -60,13 +60,17 @@ def announce_cost(
     threads: int | None,
     say: Callable[[str], object],
 ) -> None:
-    """Says before the work how long images may take, where layers upon layers make it long."""
+    """Says before the work how long images may take, where layers upon layers make it long, or a single
+    image is long: progress tells of many."""
     from meshsplats.rendering.layers import MANY_LAYERS, estimated_seconds, layers
 
-    count = layers(scene, cameras[0])
-    if (
-        count > MANY_LAYERS
-        and (seconds := estimated_seconds(scene, cameras, samples, threads)) > LONG_SECONDS
-    ):
+    camera = cameras[0]
+    count = layers(scene, camera)
+    many = count > MANY_LAYERS
+    if (seconds := estimated_seconds(scene, cameras if many else [camera], samples, threads)) > LONG_SECONDS:
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-        say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
+        if many:
+            say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
+        else:
+            size = f"{camera.width:,} x {camera.height:,} pixels of {samples} x {samples} samples"
+            say(f"{size} take about {long} or more")
