@@ -459,6 +459,7 @@ def test_a_lost_terminal_stops_a_run_unless_that_is_ignored(before):
             if before == signal.SIG_IGN:
                 assert signal.getsignal(signal.SIGHUP) == before
             else:
+                assert callable(signal.getsignal(signal.SIGHUP))
                 signal.raise_signal(signal.SIGHUP)
             assert stop.received == (signal.SIGHUP if before == signal.SIG_DFL else None)
         assert signal.getsignal(signal.SIGHUP) == before

@@ -6,7 +6,6 @@ import signal
 import threading
 from types import TracebackType
 
-
 _HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)
 """Not on Windows."""
 
