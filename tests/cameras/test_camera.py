@@ -277,6 +277,10 @@ def test_one_splat_is_framed_by_its_size():
         (lambda: orbit(ball(), 3, up=(0, 0, 0)), "up"),
         (lambda: look_at((1, 1, 1), (1, 1, 1)), "differ"),
         (lambda: look_at((1, 1, 1), (1, 0, 1)).scaled(0), "factor"),
+        (
+            lambda: look_at((1, 1, 1), (1, 0, 1), width=20_000, height=10).scaled(2),
+            r"an image of 20000 x 10 pixels cannot be drawn 2 times as large.*at most 16384",
+        ),
     ],
 )
 def test_what_cannot_be_placed_is_an_error(call, words):

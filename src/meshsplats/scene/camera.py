@@ -166,10 +166,16 @@ class Camera:
 
     def scaled(self, factor: float) -> Camera:
         """The same view with an image ``factor`` times as large, its sides rounded to whole pixels, at least
-        1."""
+        1. ValueError where a side would have more than 32,768."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"factor must be positive, got {factor}")
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        if max(width, height) > MAX_SIDE:
+            raise ValueError(
+                f"an image of {self.width} x {self.height} pixels cannot be drawn {factor:g} times as large, as"
+                f" is needed here: sides have at most {int(MAX_SIDE / factor)}. Take a smaller image, or parts of"
+                " it, one by one (Camera.window)"
+            )
         x, y = width / self.width, height / self.height  # not quite the factor where a side was rounded
         return replace(
             self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
