@@ -8,6 +8,7 @@ import tempfile
 import zipfile
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import _splat_encoders as encode
 import numpy as np
@@ -17,6 +18,7 @@ from fuzz.seeds import Seed
 from PIL import Image
 
 from meshsplats import load_cameras, load_dataset
+from meshsplats.images.reading import FORMATS, load_image, read_header, read_shot
 
 _NAMES = ["a (1).png", "b/c.png"]
 _CAMERAS = [(1, "PINHOLE", 12, 8, (10.0, 11.0, 6.5, 3.5))]
@@ -24,10 +26,20 @@ _POSES = [(name, (1, 0, 0, 0), (i, 0.5, -1.0), 1) for i, name in enumerate(_NAME
 _EYE = np.eye(4)
 
 
-def _png() -> bytes:
+def _image(kind: str, **more: Any) -> bytes:
     out = io.BytesIO()
-    Image.new("RGB", (12, 8), (10, 20, 30)).save(out, "PNG")
+    Image.new("RGB", (12, 8), (10, 20, 30)).save(out, kind, **more)
     return out.getvalue()
+
+
+def _png() -> bytes:
+    return _image("PNG")
+
+
+def _shot(path: Path) -> None:
+    read_header(path)
+    read_shot(path)
+    load_image(path, to_srgb=True)
 
 
 def _in_zip(method: int) -> bytes:
@@ -73,6 +85,7 @@ DATA_SEEDS = [
         {"a.zip": encode.bundle({"a.splat": encode.dot_splat(random_splats(5, degree=0))})},
         "a.zip",
     ),
+    *(Seed(f"image-{kind.lower()}", {"a": _image(kind)}, "a", load=_shot) for kind in FORMATS),
     Seed("colmap-beside", {**_IMAGES, **_BINARY}, ".", load=_load),
     Seed("colmap-beside-text", {**_IMAGES, **_TEXT}, ".", load=_load),
     Seed("transforms", {**_IMAGES, "transforms.json": _transforms()}, ".", load=_load),

@@ -51,6 +51,8 @@ WORDS = [
     b"null",
     b"true",
     b"[]",
+    b"[1]",
+    b'"."',
 ]
 WORDS += [b'"../../etc/passwd"', b'"/etc/passwd"', b"1" * 400, b"list", b"double", b"uchar", b"\xff\xfe"]
 

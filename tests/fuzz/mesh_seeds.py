@@ -128,16 +128,21 @@ def _binary_polygons() -> Seed:
     return Seed("mesh-ply-polygons", {"m.ply": header + b"".join(rows)}, "m.ply", load=load_mesh)
 
 
-def _textured_usd() -> list[Seed]:
-    """A triangle with a texture, beside and in a package; in text, which has more ways to be wrong."""
+def _textured(*names: str) -> dict[str, bytes]:
+    """The files of a triangle with a texture, under these names."""
     pixels = np.full((2, 2, 4), 255, np.uint8)
     base = BaseMesh(
         np.eye(3), [[0, 1, 2]], uv=np.zeros((1, 3, 2)), face_texture=[0], textures=[Texture(pixels)]
     )
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("m.usda", "p.usdz"):
+        for name in names:
             save_base(base, Path(folder) / name)
-        files = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def _textured_usd() -> list[Seed]:
+    """Beside and in a package; in text, which has more ways to be wrong."""
+    files = _textured("m.usda", "p.usdz")
     beside = {name: files[name] for name in ("m.usda", "m.png")}
     return [
         Seed("texture-usda", beside, "m.usda", load=load_base, slow=True),
@@ -162,6 +167,8 @@ MESH_SEEDS = [
     Seed("gltf-skinned", {"m.gltf": json.dumps(skinned()).encode()}, "m.gltf", load=load_mesh),
     Seed("gltf-instanced", {"m.gltf": json.dumps(_INSTANCED).encode()}, "m.gltf", load=load_mesh),
     Seed("obj", {"m.obj": _OBJ}, "m.obj", load=load_mesh),
+    Seed("texture-glb", _textured("m.glb"), "m.glb", _in_json, load=load_base),
+    Seed("texture-obj", _textured("m.obj"), "m.obj", load=load_base),
     *([_saved(s[1:], s, slow=True) for s in (".usdc", ".usda")] if importlib.util.find_spec("pxr") else []),
     *(_textured_usd() if importlib.util.find_spec("pxr") else []),
 ]
