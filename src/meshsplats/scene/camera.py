@@ -172,9 +172,9 @@ class Camera:
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         if max(width, height) > MAX_SIDE:
             raise ValueError(
-                f"an image of {self.width} x {self.height} pixels cannot be drawn {factor:g} times as large, as"
-                f" is needed here: sides have at most {int(MAX_SIDE / factor)}. Take a smaller image, or parts of"
-                " it, one by one (Camera.window)"
+                f"an image of {self.width} x {self.height} pixels cannot be drawn {factor:g} times as large,"
+                f" as is needed here: sides have at most {int(MAX_SIDE / factor)}. Take a smaller image, or"
+                " parts of it, one by one (Camera.window)"
             )
         x, y = width / self.width, height / self.height  # not quite the factor where a side was rounded
         return replace(
