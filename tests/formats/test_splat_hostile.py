@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import struct
 import zipfile
 
 import _splat_encoders as encode
 import numpy as np
 import pytest
+from _local import make_link
 from _splat_files import random_splats
 from _splats import refused
 
@@ -290,6 +292,24 @@ def test_sog_folders(tmp_path, name):
     for file_name, data in (files() if callable(files) else files).items():
         (tmp_path / "scene" / file_name).write_bytes(data)
     check(tmp_path / "scene", message)
+
+
+def test_parts_of_sog_may_be_links(tmp_path):
+    """As the caches of Hugging Face and of data versioning keep all files."""
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "scene").mkdir()
+    for name, data in SOG.items():
+        (tmp_path / "blobs" / name).write_bytes(data)
+        make_link(tmp_path / "scene" / name, tmp_path / "blobs" / name)
+    assert len(load_gaussians(tmp_path / "scene")) == 9
+
+
+def test_large_parts_of_sog_are_refused_unread(tmp_path):
+    """A file with holes takes no room in an archive."""
+    for name, data in SOG.items():
+        (tmp_path / name).write_bytes(data)
+    os.truncate(tmp_path / "quats.webp", (1 << 30) + 1)
+    check(tmp_path, "'quats.webp' has over 1,073,741,824 bytes; refused")
 
 
 @pytest.mark.parametrize("name", STREAMED)
