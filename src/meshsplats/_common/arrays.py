@@ -23,8 +23,16 @@ def subsample(items: tuple[T, ...], most: int) -> tuple[T, ...]: ...
 @overload
 def subsample(items: Sequence[T], most: int) -> Sequence[T]: ...
 def subsample(items: Sequence[T] | np.ndarray, most: int) -> Sequence[T] | np.ndarray:
-    """Every k-th of ``items``, a sequence or array, with the least k that leaves at most ``most``."""
-    return items[:: max(1, -(-len(items) // most))]
+    """At most ``most`` of ``items``, a sequence or array, evenly spread, from the first on: every k-th where
+    they are k times as many, also around a circle."""
+    count = len(items)
+    if count <= most:
+        return items
+    rows = np.arange(most) * count // most
+    if isinstance(items, np.ndarray):
+        return np.asarray(items[rows])
+    chosen = [items[i] for i in rows.tolist()]
+    return tuple(chosen) if isinstance(items, tuple) else chosen
 
 
 def block_means(values: np.ndarray, side: int) -> np.ndarray:
