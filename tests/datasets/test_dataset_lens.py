@@ -7,9 +7,12 @@ import math
 import numpy as np
 import pytest
 from _datasets import pinhole_rays, sky
+from PIL import Image
 
 from meshsplats._core.resampling import resample
 from meshsplats.datasets.lens import MODELS, Lens, pinholes, undistort
+from meshsplats.datasets.photo_file import PhotoFile
+from meshsplats.datasets.views import ImageCache
 
 # Where pycolmap 4.2.1 puts the point (0.6, -0.4, 1.6) on an image of 640 x 480.
 TRUTH = [
@@ -199,6 +202,79 @@ def test_values_between_pixels_by_hand(kind):
     np.testing.assert_array_equal(resample(image, points), np.array(want, kind))
     want[-2:] = (25, 50), (200, 0)  # the first column follows the last one
     np.testing.assert_array_equal(resample(image, points, wraps=True, threads=2), np.array(want, kind))
+
+
+def means_of(pixels: np.ndarray, factor: int) -> np.ndarray:
+    height, width = (side // factor for side in pixels.shape[:2])
+    return pixels.reshape(height, factor, width, factor, -1).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+@pytest.mark.parametrize("factor", [2, 3, 5])
+def test_photographs_are_not_made_smaller_before_they_are_undistorted(factor, kind):
+    """Either blurs: one after the other loses a quarter of the finest detail."""
+    fine = np.random.default_rng(0).integers(0, 256, (240, 300, 3), np.uint8)
+    whole = Lens("SIMPLE_RADIAL", 250, 250, 150, 120, 300, 240, (-0.05,))
+    small = whole.scaled(300 // factor, 240 // factor)
+    want = means_of(undistort(fine.astype(np.float32), whole, pinholes(whole)[0])[0], factor)
+    image, seen = undistort(fine.astype(kind), small, pinholes(small)[0])
+    assert image.dtype == kind
+    inner = slice(3, -3), slice(3, -3)
+    assert seen[inner].all()
+    twice = undistort(means_of(fine, factor), small, pinholes(small)[0])[0]
+    errors = [np.sqrt(np.square(found - want)[inner].mean()) for found in (image, twice)]
+    assert errors[0] < 0.75 * errors[1]
+    assert image[inner].std() > 1.15 * twice[inner].std()
+    assert image[seen].mean() == pytest.approx(
+        want[seen].mean(), abs=0.5
+    )  # no pixel beside the border is dark
+    assert image[seen].min() > 0
+
+
+def test_panoramas_are_not_made_smaller_before_either():
+    small = Lens("EQUIRECTANGULAR", 1, 1, 130, 65, 260, 130)
+    side = pinholes(small)[2]  # the back: its middle is the seam
+    x, y = np.meshgrid(2 * np.pi * (np.arange(520) + 0.5) / 520 - np.pi, np.arange(260) + 0.5)
+    y = np.pi * (y / 260 - 0.5)
+    panorama = sky(np.stack([np.cos(y) * np.sin(x), np.sin(y), np.cos(y) * np.cos(x)], axis=-1))
+    image, seen = undistort(panorama.astype(np.float32), small, side)
+    rays = pinhole_rays(65, 65, side.fx, side.fy, side.cx, side.cy) @ side.rotation
+    assert seen.all()
+    assert np.abs(image - sky(rays)).max() < 8e-3
+
+
+@pytest.mark.parametrize("mask", ["none", "counts", "subject"])
+def test_a_large_photograph_with_a_lens_keeps_its_alpha_and_mask(tmp_path, mask):
+    y, x = np.mgrid[:480, :640]
+    disc = np.hypot(x - 320, y - 240) < 150
+    pixels = np.where(disc[..., None], (200, 100, 50), (0, 255, 0)).astype(np.uint8)  # clear ones are green
+    light = (255 * disc).astype(np.uint8)
+    if mask == "none":
+        pixels = np.dstack([pixels, light])
+    Image.fromarray(pixels).save(tmp_path / "photo.png")
+    size = (640, 480) if mask == "counts" else (320, 240)
+    Image.fromarray(light).resize(size, Image.Resampling.NEAREST).save(tmp_path / "mask.png")
+    lens = Lens("SIMPLE_RADIAL", 100, 100, 40, 30, 80, 60, (-0.05,))
+    file = None if mask == "none" else tmp_path / "mask.png"
+    cut_out = mask == "subject"
+    photo = PhotoFile(
+        "", tmp_path / "photo.png", lens, pinholes(lens)[0], file, not file, ImageCache(0), cut_out
+    )
+    image = photo.load()
+    assert image.color.shape == (60, 80, 3)
+    if mask == "counts":
+        assert image.alpha is None
+        assert not image.mask[:8].any()
+        assert image.mask.sum() == pytest.approx(np.pi * 18.75**2, rel=0.15)
+        assert (image.color[image.mask] == (200, 100, 50)).all()
+        return
+    alpha = image.alpha.astype(np.float32)
+    assert alpha.sum() == pytest.approx(np.pi * 18.75**2, rel=0.05)
+    part = (alpha > 0.1) & (alpha < 0.9)
+    assert part.sum() > 40
+    if mask == "none":  # the mask is coarser than the photograph, which is green beside it
+        colors = image.color[part] / alpha[part, None]
+        assert np.abs(colors - np.array([200, 100, 50]) / 255).max() < 0.03
 
 
 def test_a_lens_is_worked_out_once_for_all_its_photographs(monkeypatch):

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from meshsplats.images.reading import Header
 
 ROWS_BYTES = 4 << 20
 """Images are undistorted in strips of rows, so that each array of a strip takes at most about this much."""
+APART = 1.5
+"""Pixels between look-ups whose mean is a pixel of a smaller image, at most: each mixes two along a side."""
 WHOLE = 0.999
 """A pixel between others counts only if all of those it mixes count, but for rounding."""
 MAX_STRETCH = 0.02
@@ -317,15 +320,55 @@ def pinholes(lens: Lens) -> tuple[Pinhole, ...]:
 
 
 def undistort(image: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-    """The image of the pinhole, from ``image`` (lens.height, lens.width, c), uint8 or floating-point.
+    """The image of the pinhole, from ``image`` (h, w, c), uint8 or floating-point, at the size of the lens or
+    a larger one.
 
-    Values between pixels are bilinear. Returns (h, w, c) of the same type, 0 where the lens saw nothing, and
-    (h, w) bool that is True where all four pixels around lie in the image.
+    Values between pixels are bilinear. Of a larger image, a pixel is the mean of look-ups all over it, no
+    more than ``APART`` apart: what is made smaller before is blurred twice. Returns
+    (pinhole.height, pinhole.width, c) of the same type, 0 where the lens saw nothing, and (h, w) bool that is
+    True where all four pixels around lie in the image of the lens.
     """
     points = _points(lens, pinhole)
     values = image if image.dtype == np.uint8 else image.astype(np.float32, copy=False)
-    result = resample(values, points, wraps=lens.model == "EQUIRECTANGULAR", threads=1)
-    return result.astype(image.dtype, copy=False), ~np.isnan(points[..., 0])
+    wraps = lens.model == "EQUIRECTANGULAR"
+    result = np.empty((*points.shape[:2], image.shape[2]), image.dtype)
+    scale = np.array([image.shape[1] / lens.width, image.shape[0] / lens.height], np.float32)
+    across, down = (max(1, ceil(float(times) / APART - 0.01)) for times in scale)
+    step = max(1, ROWS_BYTES // (24 * pinhole.width))
+    for start in range(0, pinhole.height, step):
+        rows = slice(start, start + step)
+        if across * down == 1:
+            at = points[rows] if (scale == 1).all() else (points[rows] + 0.5) * scale - 0.5
+            result[rows] = resample(values, at, wraps=wraps, threads=1)
+            continue
+        near = points[max(start - 1, 0) : start + step + 1]
+        inner = slice(min(start, 1), min(start, 1) + len(points[rows]))
+        along_x, along_y = (_slopes(near, axis, lens.width if wraps else None)[inner] for axis in (1, 0))
+        total = np.zeros_like(result[rows], np.float32)
+        for y in (np.arange(down, dtype=np.float32) + 0.5) / down - 0.5:
+            for x in (np.arange(across, dtype=np.float32) + 0.5) / across - 0.5:
+                at = (points[rows] + x * along_x + y * along_y + 0.5) * scale - 0.5
+                if wraps:
+                    at[..., 0] %= image.shape[1]
+                total += resample(values, at, wraps=wraps, threads=1)
+        total /= across * down
+        result[rows] = np.rint(total) if image.dtype == np.uint8 else total
+    return result, ~np.isnan(points[..., 0])
+
+
+def _slopes(points: np.ndarray, axis: int, around: int | None) -> np.ndarray:
+    """Differences (h, w, 2) of ``points`` (h, w, 2) from each pixel to the next along ``axis``, or from the
+    one before where there is none; 0 where there is neither. ``around``: columns after which the first one
+    follows."""
+    steps = np.diff(points, axis=axis)
+    if around is not None:
+        steps[..., 0] -= around * np.rint(steps[..., 0] / around)
+    missing = [(0, 0)] * 3
+    missing[axis] = (0, 1)
+    ahead = np.pad(steps, missing, constant_values=np.nan)
+    missing[axis] = (1, 0)
+    behind = np.pad(steps, missing, constant_values=np.nan)
+    return np.nan_to_num(np.where(np.isnan(ahead), behind, ahead))
 
 
 def fits(lens: Lens, header: Header) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +11,10 @@ import numpy as np
 from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, undistort
 from meshsplats.datasets.views import ImageCache, ViewImage
 from meshsplats.images.reading import load_image
+
+FINE = 2.5
+"""Photographs are undistorted at their own size, but for those of twice as many pixels along a side as these
+for each: finer ones take long, for what cannot be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,27 +53,61 @@ class PhotoFile:
         pixels = load_image(self.path, to_srgb=True)
         color = pixels[..., :3]
         share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
-        size = (self.lens.width, self.lens.height)
         light = None if self.mask is None else light_of_mask(self.mask, self.mask_turn)
         if self.cut_out and light is not None:
             inside = _resized(light, (color.shape[1], color.shape[0]))
             share = inside if share is None else share * inside
-        if share is None:
-            color = _resized(color, size)
-        else:
-            # Colours of clear pixels mean nothing: mixing must see each as much as it is opaque.
-            layers = [*(color[..., i].astype(np.float32) / 255 * share for i in range(3)), share]
-            color = np.stack([_resized(layer, size) for layer in layers], axis=-1).astype(np.float16)
-        mask = None if light is None or self.cut_out else _resized(light, size) >= WHOLE
+            light = None
         if not self.lens.is_pinhole:
-            color, seen = undistort(color, self.lens, self.pinhole)
-            if mask is not None:
-                counts = undistort(mask.astype(np.float32)[..., None], self.lens, self.pinhole)[0]
-                seen = counts[..., 0] >= WHOLE  # 0 where nothing was seen
-            mask = seen
+            return self._undistorted(color, share, light)
+        size = (self.lens.width, self.lens.height)
+        mask = None if light is None else _resized(light, size) >= WHOLE
         if share is None:
-            return ViewImage(color, None, mask)
-        return ViewImage(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
+            return ViewImage(_resized(color, size), None, mask)
+        layers = np.stack([_resized(layer, size) for layer in _premultiplied(color, share)], axis=-1)
+        return _with_alpha(layers.astype(np.float16), mask)
+
+    def _undistorted(
+        self, color: np.ndarray, share: np.ndarray | None, light: np.ndarray | None
+    ) -> ViewImage:
+        """The image of ``color`` (h, w, 3) uint8, with the opacity ``share`` (h, w) float32 and the mask
+        ``light`` (h, w) float32 of any size. Made smaller only as it is undistorted: either blurs."""
+        if share is None:
+            color = self._bounded(color)
+        else:  # in bytes: as floats, large photographs would take gigabytes
+            layers = (np.rint(255 * layer).astype(np.uint8) for layer in _premultiplied(color, share))
+            color = np.stack([self._bounded(layer) for layer in layers], axis=-1)
+        color, seen = undistort(color, self.lens, self.pinhole)
+        if light is not None:
+            counts = undistort(self._bounded(light)[..., None], self.lens, self.pinhole)[0]
+            seen = counts[..., 0] >= WHOLE  # 0 where nothing was seen
+        if share is None:
+            return ViewImage(color, None, seen)
+        return _with_alpha((color / np.float32(255)).astype(np.float16), seen)
+
+    def _bounded(self, pixels: np.ndarray) -> np.ndarray:
+        """``pixels`` (h, w) or (h, w, c), made smaller if they are more than twice as fine as they need be,
+        or larger if they are coarser than the lens."""
+        height, width = pixels.shape[:2]
+        lens = self.lens
+        if width < lens.width or height < lens.height:
+            return _resized(pixels, (lens.width, lens.height))
+        factor = int(min(width / lens.width, height / lens.height) / FINE)
+        return _resized(pixels, (round(width / factor), round(height / factor))) if factor > 1 else pixels
+
+
+def _premultiplied(color: np.ndarray, share: np.ndarray) -> Iterator[np.ndarray]:
+    """(h, w) float32 each: the channels of ``color`` (h, w, 3) uint8, in units of 1, times ``share`` (h, w),
+    and this. Colours of clear pixels mean nothing: mixing must see each as much as it is opaque."""
+    for i in range(3):
+        yield color[..., i].astype(np.float32) / 255 * share
+    yield share
+
+
+def _with_alpha(layers: np.ndarray, mask: np.ndarray | None) -> ViewImage:
+    """The image of ``layers`` (h, w, 4), colour times alpha, and alpha."""
+    color, alpha = (np.ascontiguousarray(part) for part in (layers[..., :3], layers[..., 3]))
+    return ViewImage(color, alpha, mask)
 
 
 def light_of_mask(path: Path, turn: int = 0) -> np.ndarray:
