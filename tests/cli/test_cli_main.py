@@ -23,6 +23,7 @@ from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main, messages
 from meshsplats.cli.arguments import Command
+from meshsplats.cli.common import print_table
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import PACKAGE, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.gaussians import save_gaussians
@@ -176,6 +177,9 @@ def test_what_terminals_obey_is_escaped(tmp_path, capsys):
     assert capsys.readouterr().err == "meshsplats: \\u202e Fran\u00e7ais, \u65e5\u672c\n"
     Command().finish(None, "a\tb\nc\x1b\r")
     assert capsys.readouterr().out == "a\tb\nc\\x1b\\r\n"
+    print_table(("view", "dB"), [("\x1b[2Ja", "30"), ("a[/b].png", "31"), ("[red]", "32")])
+    printed = capsys.readouterr().out
+    assert [line.split()[0] for line in printed.splitlines()] == ["view", r"\x1b[2Ja", "a[/b].png", "[red]"]
 
 
 def test_the_mesh_of_train_is_not_replaced_by_its_splats(tmp_path, monkeypatch, capsys):

@@ -150,8 +150,8 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], left: int =
     for i, head in enumerate(heads):
         table.add_column(head, justify="left" if i < left else "right")
     for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+        table.add_row(*map(with_flags, row))
+    Console(markup=False).print(table)  # names may have brackets
 
 
 def draw_preview(
