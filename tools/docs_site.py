@@ -93,6 +93,8 @@ PLACE_OF_SCENE = "<!-- On the site, the scene itself is here. -->"
 """What the scene of ``--page`` replaces in README.md."""
 SCENE = "live/scene.html"
 """Place of its page on the site."""
+TITLE = "<title>MeshSplats</title>"
+"""Of the first page, as docs/conf.py has it."""
 MOST_BYTES = 5_000_000
 """Of the page: visitors wait for it."""
 
@@ -271,12 +273,27 @@ def problems_of(site: Path) -> list[str]:
     return problems
 
 
+def check_output(folder: Path) -> None:
+    """SystemExit if ``folder``, which is replaced, holds anything but a site that was made here."""
+    if folder.exists() and not folder.is_dir():
+        raise SystemExit(f"{folder} is a file: -o takes a folder")
+    names = {path.name for path in folder.iterdir()} if folder.exists() else set()
+    # Nothing in a site that was made here is hidden, as .git would be.
+    made_here = {"index.html", "searchindex.js"} <= names and not any(name.startswith(".") for name in names)
+    if names and not (made_here and TITLE in (folder / "index.html").read_text(encoding="utf-8")):
+        raise SystemExit(
+            f"{folder} would be replaced, but is no site that was made here; "
+            "name another folder after -o, or empty this one"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Makes the documents a site.")
     parser.add_argument("-o", "--output", type=Path, default=Path("site"), help="folder of the site")
     parser.add_argument("--page", type=Path, help="page of meshsplats view, for the first page")
     arguments = parser.parse_args()
     output, page = arguments.output.resolve(), arguments.page
+    check_output(output)
     if page is not None and page.stat().st_size > MOST_BYTES:
         raise SystemExit(f"{page} has {page.stat().st_size:,} bytes, more than {MOST_BYTES:,}")
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -36,6 +36,8 @@ COMMANDS = (
     ["-m", "meshsplats", "compare", "scene.ply", "scene.glb", "-o", "compare", "--width", "100"],
 )
 """A newcomer's first minute."""
+RELEASED = re.compile(r"meshsplats-.+\.(whl|zip|tar\.gz|part)|SHA256SUMS")
+"""Names of the files of a release, those of a run that was ended included."""
 
 
 def output_of(*command: str) -> str:
@@ -63,6 +65,19 @@ def unfinished(number: str) -> list[str]:
     if changes := output_of("git", "status", "--porcelain"):
         reasons.append(f"uncommitted changes:\n{changes}")
     return reasons
+
+
+def check_output(folder: Path) -> None:
+    """SystemExit if ``folder``, which is emptied, holds anything but files of a release."""
+    if folder.exists() and not folder.is_dir():
+        raise SystemExit(f"{folder} is a file: -o takes a folder")
+    files = list(folder.iterdir()) if folder.exists() else []
+    others = sorted(file.name for file in files if not (file.is_file() and RELEASED.fullmatch(file.name)))
+    if others:
+        raise SystemExit(
+            f"{folder} would be emptied, but holds {len(others)} that are no part of a release: "
+            f"{', '.join(others[:5])}; name another folder after -o, or move them away"
+        )
 
 
 def check_sdist(path: Path) -> None:
@@ -179,12 +194,13 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("dist"), help="folder for the files")
     parser.add_argument("--rehearsal", action="store_true", help="an unfinished state is no error")
     options = parser.parse_args()
+    output = options.output.resolve()
+    check_output(output)
     number = version()
     reasons = unfinished(number)
     if reasons and not options.rehearsal:
         raise SystemExit("not ready for a release:\n" + "\n".join(reasons))
 
-    output = options.output.resolve()
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
     os.environ["SOURCE_DATE_EPOCH"] = output_of("git", "log", "-1", "--format=%ct")
