@@ -28,6 +28,7 @@ from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.config import HARMONICS_RATE
 from meshsplats.finetuning.gradients import Gradients
+from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.phases.phase import Moment
 from meshsplats.finetuning.reports import Reports
 from meshsplats.finetuning.run import TrainingLoop, run_start
@@ -37,6 +38,7 @@ from meshsplats.finetuning.step import (
     ONE_SAMPLE_SHARE,
     PHOTOGRAPHS_HARMONICS_RATE,
     for_views,
+    make_step,
 )
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
@@ -44,6 +46,7 @@ from meshsplats.images.reading import load_image
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.previews import SIDE
+from meshsplats.scene.camera import Camera
 from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training import growing, starting_fans, train, train_config
 from meshsplats.training import run as run_module
@@ -61,6 +64,7 @@ from meshsplats.training.growth import (
     split_in_halves,
 )
 from meshsplats.training.initial import fans_of
+from meshsplats.training.patches import Patches, flat_splats
 from meshsplats.training.run import COVERAGE, SO_FAR, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
 
@@ -319,7 +323,7 @@ def test_an_error_in_one_view_alone_halves_nothing(ball, state):
 
 def test_fans_that_contribute_nothing_are_dropped(state):
     n = fan_count(state.mesh)
-    useful = Scores(np.ones(n), np.full(n, 5.0), np.zeros(n), np.ones(n, bool))
+    useful = Scores(np.ones(n), np.full(n, 5.0), np.zeros(n), np.ones(n, bool), 64 * 64)
     faint = np.arange(n) < 10
     for worse in (
         useful._replace(most_pixels=np.where(faint, 0.001, 5.0)),
@@ -330,6 +334,35 @@ def test_fans_that_contribute_nothing_are_dropped(state):
     assert fan_count(grow(state, unseen, 0).mesh) == n
     state.colors[:7, 3] = 0  # all of the first fan
     assert fan_count(grow(state, useful, 0).mesh) == n - 1
+
+
+def test_what_only_other_views_show_is_not_dropped(ball, state):
+    """As where the judged views look at the back of a wall, which the view of a step has shown."""
+    n = fan_count(state.mesh)
+    hidden = Scores(np.ones(n), np.zeros(n), np.zeros(n), np.ones(n, bool), 64 * 64)
+    left = np.broadcast_to(np.arange(64) < 32, (64, 64))
+    white = ViewImage(np.ones((64, 64, 3), np.float32), mask=left)  # wrong everywhere, and nowhere too bright
+    view = replace(ball.train[0], source=white)
+    pixels = score(state, [view]).most_pixels
+    assert make_step(state, [view], 0, 0.0, Blended(state.config)) is not None
+    vertices = {tuple(fan[0]) for fan in grow(state, hidden, 0).vertices.reshape(-1, 7, 3)}
+    kept = np.array([tuple(fan[0]) in vertices for fan in state.vertices.reshape(-1, 7, 3)])
+    assert kept[pixels > 1].all()
+    assert not kept[pixels < 0.01].any()
+    assert min(np.count_nonzero(pixels > 1), np.count_nonzero(pixels < 0.01)) > 20
+
+
+def test_a_sign_before_a_street_is_in_no_near_field():
+    """Its fans fill the photographs taken of it. Those of sixty fronts behind it are far more."""
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 8)]), axis=-1).reshape(-1, 2)
+    walls = [(1, 0.45), *((12 + 2 * k, 5) for k in range(60))]
+    points = np.concatenate([np.column_stack([half * grid, np.full(64, z)]) for z, half in walls])
+    facing = np.tile([0.0, 0, -1], (len(points), 1))
+    mesh = fans_of(flat_splats(Patches.squares(points, facing, 0.15, 0.95)), 6)
+    views = [View(Camera(np.eye(4), 40, 40, 20, 20, 40, 40), ViewImage(np.zeros((40, 40, 3), np.float32)))]
+    near = NearFields.around(views, mesh)
+    assert near.depths == pytest.approx([0.3], rel=1e-3)
+    assert not near.contain(mesh).any()
 
 
 def test_halves_have_the_place_and_colours_of_their_fan(state):
@@ -366,7 +399,7 @@ def test_halves_show_what_their_fan_showed_in_their_place():
 
 def test_the_shell_is_never_dropped(state):
     n = fan_count(state.mesh)
-    hidden = Scores(np.ones(n), np.zeros(n), np.zeros(n), np.ones(n, bool))
+    hidden = Scores(np.ones(n), np.zeros(n), np.zeros(n), np.ones(n, bool), 64 * 64)
     shell = np.repeat((np.arange(n) < 5).astype(np.float32), 7)
     state.mesh = replace(state.mesh, attributes={"shell": shell})
     kept = grow(state, hidden, 0)

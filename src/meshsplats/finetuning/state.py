@@ -388,6 +388,14 @@ class State:
         self._change()
         round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
+    def shares(self) -> np.ndarray:
+        """(v,) float32: about what share of an image each vertex was, in the steps that reached it: root of
+        the sum of squares over these steps. By the gradients of its colour: those of a pixel are as large as
+        the loss makes them, and cancel where it is too bright here and too dark there."""
+        self._fetch()
+        squares = self._colors.square[:, :3].max(axis=1) / (1 - self._colors.betas[1])
+        return np.sqrt(squares) * np.float32(3 / (1 - self.config.ssim_weight))
+
     def prune(self, keep: np.ndarray) -> State:
         """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
         if keep.all():

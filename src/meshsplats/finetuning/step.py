@@ -144,7 +144,8 @@ def target_of(
             color = np.random.default_rng([config.seed, step, 1]).random(3)
             background = tuple(color.astype(np.float32).tolist())
     shown = image.over(exposed(np.asarray(background, np.float32), exposure))
-    return Target(shown, image.mask, background)
+    mask = None if image.mask is None else np.ascontiguousarray(image.mask)
+    return Target(shown, mask, background)
 
 
 class RenderedView:

@@ -22,13 +22,18 @@ JUDGED_VIEWS = 20
 SHELL = "shell"
 """Attribute of a mesh in training: 1 for the fans of the shell, which are never dropped, else 0."""
 MIN_PIXELS = 0.02
-"""A fan that contributes fewer pixels than this to each view is dropped, if a view has it in its image."""
+"""A fan that adds fewer pixels than this to each judged view is dropped, if it is in the image of one..."""
+TRAINED_PIXELS = 0.2
+"""...and if all steps so far saw fewer of it than this (``State.shares``): judged views look at the backs of
+walls that others show."""
 CLEAR = 0.5
 """A fan with a greater share of its pixels where photographs are transparent is dropped."""
 MIN_OPACITY = 0.02
 """A fan of less opacity is dropped."""
 NEAR = 0.3
-"""Depth of a near field, as a share of the depth where the scene begins."""
+"""Depth of a near field, as a share of the depth where the scene begins..."""
+FRONT, LARGEST = 0.02, 1e-3
+"""...before which this share of the scene lies, and share of an image that one fan is at most."""
 SMALLEST = 0.7
 """Pixels that a fan must contribute to a view to be halved."""
 
@@ -51,6 +56,8 @@ class Scores(NamedTuple):
     """(n,) share of its pixels that are transparent in the photographs."""
     in_view: np.ndarray
     """(n,) bool: whether the centre lies in the image of any view."""
+    image_pixels: int
+    """Pixels of the largest image."""
 
 
 def score(state: State, views: Sequence[View], turn: int = 0, fraction: float = 1.0) -> Scores:
@@ -61,7 +68,7 @@ def score(state: State, views: Sequence[View], turn: int = 0, fraction: float = 
     n = fan_count(mesh)
     total, most, pixels = np.zeros(n), np.zeros(n), np.zeros(n)
     all_pixels, clear_pixels = np.zeros(n), np.zeros(n)
-    in_view = np.zeros(n, bool)
+    in_view, largest = np.zeros(n, bool), 0
     triangles = mesh.triangles._replace(values=np.zeros((len(mesh.vertices), 3), np.float32))
     drawing = engine(state.device, state.threads)
     step = -(-len(views) // JUDGED_VIEWS)
@@ -88,8 +95,9 @@ def score(state: State, views: Sequence[View], turn: int = 0, fraction: float = 
         all_pixels += count
         clear_pixels += outside
         in_view |= view.camera.sees(mesh.vertices[::corners])
+        largest = max(largest, counts.size)
     clear_share = clear_pixels / np.maximum(all_pixels, 1e-9)
-    return Scores(total - most, pixels, clear_share, in_view)
+    return Scores(total - most, pixels, clear_share, in_view, largest)
 
 
 def corners_of(mesh: SplatMesh) -> int:
@@ -108,7 +116,9 @@ def grow(state: State, found: Scores, target: int) -> State:
     ``target``. A halved fan is never dropped: there may be fewer."""
     corners, n = corners_of(state.mesh), fan_count(state.mesh)
     opacity = state.colors[:, 3].reshape(n, corners).max(axis=1)
-    useless = (found.most_pixels < MIN_PIXELS) | (opacity < MIN_OPACITY) | (found.clear_share > CLEAR)
+    trained = state.shares().reshape(n, corners).sum(axis=1) * found.image_pixels >= TRAINED_PIXELS
+    hidden = (found.most_pixels < MIN_PIXELS) & ~trained
+    useless = hidden | (opacity < MIN_OPACITY) | (found.clear_share > CLEAR)
     keep = ~(found.in_view & useless)
     if SHELL in state.mesh.attributes:  # others see what is behind everything
         keep |= state.mesh.attributes[SHELL][::corners] > 0
@@ -131,14 +141,20 @@ class NearFields(NamedTuple):
     @classmethod
     def around(cls, views: Sequence[View], mesh: SplatMesh) -> NearFields:
         """Those of ``views`` for a scene that ``mesh``, its fans at the start, shows roughly: ``NEAR`` times
-        the depth before which one in fifty of the fans in an image lies."""
-        centers = mesh.vertices[:: corners_of(mesh)]
+        the depth before which a ``FRONT`` of the area that all fans have in an image lies. Fans behind walls
+        are many, but small in the image; one right in front of the lens counts as ``LARGEST`` of it."""
+        fans = mesh.vertices.reshape(fan_count(mesh), -1, 3)
+        centers, areas = fans[:, 0], fans.var(axis=1).sum(axis=1)
         depths = np.zeros(len(views))
         for i, view in enumerate(views):
             positions, depth = view.camera.project(centers)
-            depth = depth[view.camera.in_image(positions)]
-            if len(depth):
-                depths[i] = NEAR * float(np.quantile(depth, 0.02))
+            shown = np.flatnonzero(view.camera.in_image(positions))
+            if len(shown):
+                order = shown[np.argsort(depth[shown], kind="stable")]
+                whole = view.camera.width * view.camera.height / (view.camera.fx * view.camera.fy)
+                shares = areas[order] / np.square(depth[order]) / whole
+                sums = np.cumsum(np.minimum(shares, LARGEST), dtype=np.float64)
+                depths[i] = NEAR * float(depth[order][np.searchsorted(sums, FRONT * sums[-1])])
         return cls(tuple(view.camera for view in views), depths)
 
     def contain(self, mesh: SplatMesh) -> np.ndarray:
