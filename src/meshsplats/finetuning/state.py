@@ -152,9 +152,7 @@ class State:
             colors[:, :3] = np.clip(srgb_to_linear(colors[:, :3]), 0, 1)
             mesh = replace(mesh, colors=colors, blending="linear")
         elif config.blending == "display" and mesh.blending == "linear":
-            raise ValueError(
-                "the mesh is made to be blended in linear light: choose blending 'mesh' or 'linear'"
-            )
+            raise ValueError("the mesh is to be blended in linear light: choose blending 'mesh' or 'linear'")
         exposures = None
         if config.exposure:
             exposures = np.tile(np.array([1, 1, 1, 0, 0, 0], np.float32), (views, 1))
@@ -389,12 +387,11 @@ class State:
         round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
     def shares(self) -> np.ndarray:
-        """(v,) float32: about what share of an image each vertex was, in the steps that reached it: root of
-        the sum of squares over these steps. By the gradients of its colour: those of a pixel are as large as
-        the loss makes them, and cancel where it is too bright here and too dark there."""
+        """(v,) float32: about what share of an image each vertex had in the steps so far (a root of squares),
+        by the gradients of its colour: those of a pixel times its pixels."""
         self._fetch()
         squares = self._colors.square[:, :3].max(axis=1) / (1 - self._colors.betas[1])
-        return np.sqrt(squares) * np.float32(3 / (1 - self.config.ssim_weight))
+        return np.sqrt(squares) * np.float32(3 / max(1 - self.config.ssim_weight, 0.01))
 
     def prune(self, keep: np.ndarray) -> State:
         """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
@@ -426,8 +423,7 @@ class State:
             source[own[used]] = before[rows[used]]
             result._harmonics = self._harmonics.select(result._flat_harmonics, source)
         if self._exposures is not None:
-            every = np.arange(len(self._exposures.mean))
-            result._exposures = self._exposures.select(result.exposures, every)
+            result._exposures = self._exposures.select(result.exposures, np.arange(len(self._exposures.mean)))
         if self.solid is not None:
             result.solid = self.solid[rows]
         if self.frozen is not None:
