@@ -65,7 +65,7 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     assert report == printed
     assert report["methods"]["mesh"]["mean"]["psnr"] == results["mesh"]["PSNR"]
     assert report["methods"]["mesh"]["mean"]["psnr_exposure"] >= results["mesh"]["PSNR"] - 1e-6
-    assert report["lpips_network"] is None
+    assert (report["lpips_network"], report["lpips_convention"]) == (None, None)
     assert len(json.loads((out / "per_view.json").read_text())["mesh"]["PSNR"]) == 3
     assert sorted(p.name for p in (out / "strips").iterdir()) == ["view_0000.png", "view_0002.png"]
     assert sorted(p.name for p in (out / "crops").iterdir()) == ["view_0000.png", "view_0002.png"]
@@ -176,6 +176,7 @@ def test_a_protocol_converts_splats(scene, tmp_path):
         (["mesh.npz", "--splats", "scene.ply", "--downscale", "2"], 2, "--downscale has no effect without"),
         (["mesh.npz", "--splats", "scene.ply", "--test-every", "4"], 2, "--test-every has no effect without"),
         (["mesh.npz", "--data", "d", "--network", "alex"], 2, "--network has no effect without --lpips"),
+        (["mesh.npz", "--lpips-convention", "3dgs"], 2, "--lpips-convention has no effect without --lpips"),
         (["mesh.npz", "--splats", "scene.ply", "--tune", "paper"], 2, "--tune is for --protocol"),
         (["mesh.npz", "--protocol", "mipnerf360"], 2, "--data with the scenes"),
         ([*PROTOCOL, "--test-every", "4"], 2, "--test-every has no effect with --protocol"),

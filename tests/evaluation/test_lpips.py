@@ -15,6 +15,8 @@ from torch import nn  # noqa: E402
 
 from meshsplats.errors import FileFormatError  # noqa: E402
 from meshsplats.evaluation.lpips import load_lpips  # noqa: E402
+from meshsplats.evaluation.report import Report  # noqa: E402
+from meshsplats.evaluation.results import notes  # noqa: E402
 
 NETWORKS = ("vgg", "alex")
 CHANNELS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256)}
@@ -94,13 +96,14 @@ def image_pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return a, np.clip(a + rng.normal(0, 0.2, a.shape), 0, 1).astype(np.float32)
 
 
-def by_formula(network: str, a: np.ndarray, b: np.ndarray) -> float:
+def by_formula(network: str, a: np.ndarray, b: np.ndarray, convention: str) -> float:
     """Layer by layer, in float64."""
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
     layers, weights = backbone(network).double().features, list(heads(network).values())
     maps = []
     for image in (a, b):
-        x = ((image.astype(np.float64) * 2 - 1) - shift) / scale
+        x = image.astype(np.float64)
+        x = ((2 * x - 1 if convention == "lpips" else x) - shift) / scale
         x = torch.from_numpy(x).permute(2, 0, 1)[None]
         taken = []
         with torch.no_grad():
@@ -119,14 +122,33 @@ def by_formula(network: str, a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("size", [(31, 47), (64, 50)])
 @pytest.mark.parametrize("network", NETWORKS)
-def test_it_is_the_formula(folder, network, size):
+@pytest.mark.parametrize("convention", ["3dgs", "lpips"])
+def test_it_is_the_formula(folder, network, size, convention):
     a, b = image_pair(*size)
-    distance = load_lpips(folder, network=network)
-    expected = by_formula(network, a, b)
+    distance = load_lpips(folder, network=network, convention=convention)
+    expected = by_formula(network, a, b, convention)
     assert expected > 0.01
     assert distance(a, b) == pytest.approx(expected, rel=1e-5)
     assert distance(b.astype(np.float64), a) == pytest.approx(expected, rel=1e-5)
     assert distance(a, a) == 0
+
+
+@pytest.mark.parametrize(("network", "convention"), [("vgg", "3dgs"), ("alex", "lpips")])
+def test_the_convention_is_that_of_splatting_papers(folder, network, convention):
+    """metrics.py of 3DGS gives VGG images as they are, gsplat gives AlexNet scaled ones."""
+    distance = load_lpips(folder, network=network)
+    assert (distance.network, distance.convention) == (network, convention)
+    a, b = image_pair(40, 40)
+    assert distance(a, b) == load_lpips(folder, network=network, convention=convention)(a, b)
+    assert distance(a, b) == pytest.approx(by_formula(network, a, b, convention), rel=1e-5)
+
+
+def test_the_table_names_network_and_convention():
+    about = {"held_out": True, "samples": 2, "ground_truth": "photographs", "splats": None}
+    about |= {"views": 1, "background_description": "white", "lpips_network": None, "lpips_convention": None}
+    assert "LPIPS" not in " ".join(notes([Report("", (), about)]))
+    about |= {"lpips_network": "vgg", "lpips_convention": "3dgs"}
+    assert notes([Report("", (), about)])[-1] == "LPIPS: network vgg, convention '3dgs'."
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -151,10 +173,12 @@ def test_it_is_the_package_lpips(folder, network, monkeypatch, tmp_path):
     batch = [torch.from_numpy(p).permute(2, 0, 1)[None] for p in (a, b)]
     with torch.no_grad():
         expected = model(*batch, normalize=True).item()
-    assert load_lpips(folder, network=network)(a, b) == pytest.approx(expected, rel=1e-5)
+    distance = load_lpips(folder, network=network, convention="lpips")
+    assert distance(a, b) == pytest.approx(expected, rel=1e-5)
     # The whole module in one file.
     torch.save(model.state_dict(), tmp_path / "whole.pth")
-    assert load_lpips(tmp_path / "whole.pth", network=network)(a, b) == pytest.approx(expected, rel=1e-5)
+    whole = load_lpips(tmp_path / "whole.pth", network=network, convention="lpips")
+    assert whole(a, b) == pytest.approx(expected, rel=1e-5)
 
 
 def test_files_can_be_named_and_be_safetensors(folder, tmp_path):
@@ -190,6 +214,8 @@ def test_without_weights_there_is_no_distance():
     assert load_lpips(None) is None
     with pytest.raises(ValueError, match="network must be one of vgg, alex, got 'squeeze'"):
         load_lpips(None, network="squeeze")
+    with pytest.raises(ValueError, match="convention must be one of 3dgs, lpips, got 'valid'"):
+        load_lpips(None, convention="valid")
 
 
 def test_wrong_files_are_refused(folder, tmp_path):

@@ -11,6 +11,16 @@ network     features, from torchvision       weights of the channels, from the p
 ==========  ===============================  ================================================================
 
 One file with the state of a whole ``lpips.LPIPS`` module also works. Needs torch (extra ``torch``).
+
+There are two conventions, whose values are not comparable:
+
+===========  =================================  =============================================================
+convention   what the network is given          who reports it
+===========  =================================  =============================================================
+``'3dgs'``   colours from 0 to 1, as they are   ``metrics.py`` of 3DGS, gsplat with VGG, tables in their wake
+``'lpips'``  colours from -1 to 1, for which    the package ``lpips``, torchmetrics with ``normalize=True``,
+             it was trained                     nerfstudio, gsplat with AlexNet
+===========  =================================  =============================================================
 """
 
 from __future__ import annotations
@@ -34,6 +44,9 @@ if TYPE_CHECKING:
     import torch
 
 Network = Literal["vgg", "alex"]
+Convention = Literal["3dgs", "lpips"]
+CONVENTIONS: dict[Network, Convention] = {"vgg": "3dgs", "alex": "lpips"}
+"""In which convention tables of splatting methods have the distances of each network."""
 Paths = str | os.PathLike[str]
 
 SUFFIXES = (".pth", ".pt", ".safetensors")
@@ -108,15 +121,17 @@ class Lpips:
     Created by :func:`load_lpips`. Calling it with two images returns their distance.
     """
 
-    def __init__(self, network: Network, weights: dict[str, torch.Tensor]) -> None:
+    def __init__(self, network: Network, weights: dict[str, torch.Tensor], convention: Convention) -> None:
         self.network = network
+        self.convention = convention
         self._layout = _LAYOUTS[network]
         self._weights = weights
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
         """The distance of two images: 0 for equal images, smaller is closer.
 
-        Published tables of splatting methods use VGG; values of the two networks are not comparable.
+        Published tables of splatting methods use VGG in the convention of 3DGS; values of the two networks,
+        and of the two conventions, are not comparable.
 
         Args:
             a, b: (h, w, 3) float RGB in [0, 1], of one shape.
@@ -141,7 +156,8 @@ class Lpips:
         with torch.inference_mode():
             x = torch.from_numpy(np.ascontiguousarray(images))
             shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
-            return self._distance((2 * x - 1 - shift) / scale)
+            x = x if self.convention == "3dgs" else 2 * x - 1
+            return self._distance((x - shift) / scale)
 
     def _distance(self, x: torch.Tensor) -> float:
         from torch.nn import functional
@@ -159,7 +175,12 @@ class Lpips:
         return total
 
 
-def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "vgg") -> Lpips | None:
+def load_lpips(
+    weights: Paths | Sequence[Paths] | None,
+    *,
+    network: Network = "vgg",
+    convention: Convention | None = None,
+) -> Lpips | None:
     """Loads trained weights from files.
 
     Args:
@@ -168,6 +189,9 @@ def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "v
             network's, ``vgg`` or ``alex``. PyTorch files are read with ``weights_only``: code in them is
             never run.
         network: 'vgg' or 'alex'.
+        convention: '3dgs' gives the network colours from 0 to 1, as the code of 3DGS does, 'lpips' from -1 to
+            1, as the package lpips; the values of the first are smaller. By default that in which tables of
+            splatting methods have this network: '3dgs' for VGG, 'lpips' for AlexNet.
 
     Returns:
         The distance; None if ``weights`` is None.
@@ -175,10 +199,12 @@ def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "v
     Raises:
         FileNotFoundError: a file is missing.
         FileFormatError: a file cannot be read or is of another network.
-        ValueError: an unknown network.
+        ValueError: an unknown network or convention.
         MissingDependencyError: torch is missing.
     """
     need_choice(Network, network=network)
+    if convention is not None:
+        need_choice(Convention, convention=convention)
     if weights is None:
         return None
     layout = _LAYOUTS[network]
@@ -202,7 +228,7 @@ def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "v
             f" {layout.heads} of the package lpips, v0.1"
         )
     checked = {name: _checked(found[name], name, shape, origin[name]) for name, shape in wanted.items()}
-    return Lpips(network, checked)
+    return Lpips(network, checked, convention or CONVENTIONS[network])
 
 
 def _wanted(layout: _Layout) -> dict[str, tuple[int, ...]]:

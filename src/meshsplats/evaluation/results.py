@@ -50,7 +50,7 @@ def save_benchmark(result: BenchmarkResult, folder: Path, protocol: str) -> None
 
 def notes(reports: Sequence[Report]) -> list[str]:
     """Notes under the table: views that are not held out, the ground truth, the samples and the background of
-    each scene."""
+    each scene; how LPIPS was measured."""
     found = []
     for report in reports:
         about, scene = report.about, "" if len(reports) == 1 else f"{report.scene}: "
@@ -67,6 +67,9 @@ def notes(reports: Sequence[Report]) -> list[str]:
             other = f", not at that of their training, {trained} pixels wide" if trained else ""
             found.append(f"{scene}Splats: {GROUND_TRUTHS['splats'].removeprefix('splats ')}{other}.")
         found.append(f"{scene}Background: {about['background_description']}.")
+    about = reports[0].about
+    if about.get("lpips_network"):
+        found.append(f"LPIPS: network {about['lpips_network']}, convention {about['lpips_convention']!r}.")
     return found
 
 

@@ -172,6 +172,9 @@ class ScoringOptions:
     or one file of both (see docs/finetuning.md). Default: no LPIPS."""
     network: Literal["vgg", "alex"] = "vgg"
     """Network of LPIPS; splatting papers use vgg."""
+    lpips_convention: Literal["3dgs", "lpips"] | None = None
+    """Colours that the network is given: from 0 to 1 as in the code of 3DGS, or from -1 to 1 as in the
+    package lpips, with larger values. Default: as splatting papers have it, 3dgs for vgg, lpips for alex."""
     fit_exposure: bool = False
     """Also score with a gain and an offset per channel, fitted to each image."""
     samples: int | None = None
@@ -207,8 +210,9 @@ class ScoringOptions:
         if self.amplify <= 0 or self.strips < 0:
             raise OptionValueError("``amplify`` must be positive and ``strips`` >= 0")
         given = changed(self)
-        if "network" in given and not self.lpips:
-            raise OptionsError("``network`` has no effect without ``lpips``")
+        for name in ("network", "lpips_convention"):
+            if name in given and not self.lpips:
+                raise OptionsError(f"``{name}`` has no effect without ``lpips``")
         if self.protocol is not None:
             if self.data is None or len(meshes) != 1:
                 raise OptionsError(

@@ -250,7 +250,8 @@ class Scoring:
         chosen, dataset = self.options, dataset.over(background.color)
         views = dataset.test or dataset.views
         images = None if chosen.images is None else image_folder(chosen.images, [v.camera for v in views])
-        lpips = load_lpips(list(chosen.lpips) or None, network=chosen.network)
+        weights, convention = list(chosen.lpips) or None, chosen.lpips_convention
+        lpips = load_lpips(weights, network=chosen.network, convention=convention)
         self.folder.mkdir(exist_ok=True)
         shown = iter(self.progress(range(len(views)), len(views)) if self.progress else range(len(views)))
         next(shown, None)
@@ -272,7 +273,9 @@ class Scoring:
             threads=self.threads,
             on_view=keep,
         )
-        about: dict[str, Any] = {**background.to_dict(), "lpips_network": chosen.network if lpips else None}
+        about: dict[str, Any] = dict(background.to_dict())
+        about["lpips_network"] = None if lpips is None else lpips.network
+        about["lpips_convention"] = None if lpips is None else lpips.convention
         if chosen.cameras is not None:
             about["held_out"] = None  # it is unknown what a mesh was trained on
         report = replace(report, about={**report.about, **about, **training})
