@@ -236,13 +236,19 @@ def test_every_option_does_something():
         assert not same, name
 
 
+LIMITS = {"crop", "max_triangles", "max_splats", "color_degree", "footprint_px2", "viewing_distance"}
+CALIBRATED = {"sides", "rim_radius", "center_opacity", "footprint"}
+
+
 def test_presets_state_every_choice():
+    """But for limits, which are the user's, and what the mode and the cameras decide."""
     for name, preset in PRESETS.items():
         resolved = ConversionOptions().resolved(name, has_cameras=False)
-        for field in fields(ConversionOptions):
-            stated = getattr(preset, field.name)
-            if stated is not None:
-                assert getattr(resolved, field.name) == stated
+        values = {field.name: getattr(preset, field.name) for field in fields(ConversionOptions)}
+        decided = CALIBRATED if name == "default" else set()
+        assert {field for field, value in values.items() if value is None} == LIMITS | decided
+        for field, value in values.items():
+            assert value is None or getattr(resolved, field) == value, field
 
 
 def test_what_3dgs_never_draws_is_left_out_by_default():

@@ -320,10 +320,9 @@ def test_a_killed_run_is_resumed(held, whole_run, tmp_path):
     folder = tmp_path / "run"
     process = subprocess.Popen([sys.executable, "-c", program, str(folder)])
     until = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < until:
-        begun = len(list(folder.glob("cells/*/checkpoint.safetensors")))
-        if list(folder.glob("cells/*.npz")) and begun:
-            break
+    while not (list(folder.glob("cells/*.npz")) and list(folder.glob("cells/*/checkpoint.safetensors"))):
+        assert process.poll() is None, "it ended before"
+        assert time.monotonic() < until
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()

@@ -148,7 +148,7 @@ def test_every_splat_is_in_one_leaf_and_every_box_holds_its_tiles(splats, tilese
 def test_leaves_hold_the_triangles_of_the_whole_mesh(splats, tileset):
     """Of each splat those that ``convert`` makes of the whole scene."""
     mesh = convert(load_gaussians(splats))
-    starts = np.searchsorted(mesh.face_splat, np.arange(COUNT + 1))
+    starts, held = np.searchsorted(mesh.face_splat, np.arange(COUNT + 1)), 0
     for tile, _ in Tileset(tileset).tiles():
         if tile.children:
             continue
@@ -156,8 +156,10 @@ def test_leaves_hold_the_triangles_of_the_whole_mesh(splats, tileset):
         own = np.unique(part.face_splat)
         faces = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in own])
         assert len(faces) == len(part.faces)
+        held += len(faces)
         expected = mesh.vertices[mesh.faces[faces]]
         np.testing.assert_allclose(part.vertices[part.faces], expected, rtol=0, atol=2e-5)
+    assert held == len(mesh.faces)
 
 
 def test_the_coarsest_tile_looks_like_the_scene_from_afar(splats, tileset):

@@ -56,7 +56,9 @@ def test_it_has_no_jump_and_no_corner_where_it_closes_neither(seed):
 
 
 def test_it_is_level():
-    for frame in walk(views(), 50, UP):
+    frames = walk(views(), 50, UP)
+    assert len(frames) == 50
+    for frame in frames:
         assert abs(frame.world_to_camera[0, :3] @ UP) < 1e-9
         assert frame.up @ UP > 0
 
@@ -71,7 +73,9 @@ def test_views_of_a_turn_are_passed_in_order_of_their_direction():
 
 def test_one_view_stays_and_two_are_gone_between():
     (only,) = views(1)
-    assert all(np.allclose(pose(frame), pose(only)) for frame in walk([only], 5, UP))
+    still = walk([only], 5, UP)
+    assert len(still) == 5
+    assert all(np.allclose(pose(frame), pose(only)) for frame in still)
     there = np.array([pose(frame) for frame in walk(views(2), 10, UP)])
     assert np.allclose(there[0], pose(views(2)[0]))
     assert np.allclose(there[5], pose(views(2)[1]))
