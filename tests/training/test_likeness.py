@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshsplats.training.likeness import ALIKE, ALL_UP_TO, NEXT, alike_pairs
+from meshsplats.training.likeness import ALIKE, ALL_UP_TO, NEXT, alike_pairs, in_sequence
 
 COUNT, LANDMARKS, WINDOW, STEP = 90, 900, 60, 10
 
@@ -50,6 +50,34 @@ def test_photographs_that_follow_each_other_are_matched_though_unlike():
     chosen = {tuple(pair) for pair in alike_pairs(features).tolist()}
     for k in range(COUNT - NEXT):
         assert {(k, k + step) for step in range(1, NEXT + 1)} <= chosen
+
+
+def test_photographs_follow_each_other_as_they_are_counted():
+    names = [
+        "a10.jpg",
+        "1.jpg",
+        "10.jpg",
+        "a2_b12.jpg",
+        "a2.jpg",
+        "2.jpg",
+        "a2_b3.jpg",
+        "B7.jpg",
+        "002.jpg",
+        "٣.jpg",
+    ]
+    expected = [
+        "1.jpg",
+        "2.jpg",
+        "002.jpg",
+        "10.jpg",
+        "B7.jpg",
+        "a2.jpg",
+        "a2_b3.jpg",
+        "a2_b12.jpg",
+        "a10.jpg",
+    ]
+    assert in_sequence(names) == [*expected, "٣.jpg"]
+    assert in_sequence([f"{i}.jpg" for i in range(120)][::-1]) == [f"{i}.jpg" for i in range(120)]
 
 
 @pytest.mark.parametrize("count", [0, 1])

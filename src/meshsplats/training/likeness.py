@@ -7,6 +7,7 @@ is made of the photographs themselves (Sivic and Zisserman 2003: Video Google).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,7 +19,7 @@ ALL_UP_TO = 60
 ALIKE = 16
 """Photographs that look most like each..."""
 NEXT = 4
-"""... and that follow it by name, which it is matched with."""
+"""... and that follow it in the sequence of their names, which it is matched with."""
 WORDS = 1024
 """Size of the vocabulary."""
 FEATURES = 600
@@ -29,12 +30,22 @@ ROUNDS = 6
 """Rounds of k-means."""
 BLOCK = 4096
 """Features that are compared with the words together."""
+_NUMBERS = re.compile("([0-9]+)")
+
+
+def in_sequence(names: Sequence[str]) -> list[str]:
+    """``names`` as they are counted: 2.jpg before 10.jpg."""
+
+    def key(name: str) -> list[str | int]:
+        return [int(part) if i % 2 else part for i, part in enumerate(_NUMBERS.split(name))]
+
+    return sorted(names, key=key)
 
 
 def alike_pairs(descriptors: Sequence[np.ndarray]) -> np.ndarray:
     """(n, 2) int64 pairs i < j of photographs to match, sorted: of all where there are few.
 
-    ``descriptors``: (features, 128) of each photograph, in the order of their names.
+    ``descriptors``: (features, 128) of each photograph, ``in_sequence``.
     """
     count = len(descriptors)
     if count <= ALL_UP_TO:

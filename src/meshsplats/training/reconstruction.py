@@ -29,7 +29,7 @@ from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyErr
 from meshsplats.formats.outputs import PREVIEW
 from meshsplats.images.reading import Shot
 from meshsplats.training.feature_masks import FeatureMasks
-from meshsplats.training.likeness import ALL_UP_TO, alike_pairs
+from meshsplats.training.likeness import ALL_UP_TO, alike_pairs, in_sequence
 from meshsplats.training.poses import find_poses
 from meshsplats.training.pycolmap_input import by_lens, for_pycolmap, needs_copy, read_shots
 from meshsplats.training.suspects import shortened
@@ -349,6 +349,7 @@ def _match(
         say(f"finding the cameras: {count * (count - 1) // 2:,} pairs")
         pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu, **given)
         return
+    names = in_sequence(names)
     pairs = alike_pairs(_descriptors(database, names))
     say(f"finding the cameras: {len(pairs):,} pairs of photographs that look alike")
     chosen = database.parent / "pairs.txt"
