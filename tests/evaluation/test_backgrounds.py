@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from _datasets import simple_colmap
 from _photographs import write_photographs
+from PIL import Image
 
 from meshsplats._common import toml
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
+from meshsplats.datasets.silhouettes import outline_brightness
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
@@ -106,6 +108,32 @@ def test_a_training_says_whose_choice_its_background_is(tmp_path):
     for name, expected in (("mixed", "black, which fans cover"), ("white", "white, as given")):
         _, found = PhotographOptions().load(folder, TrainConfig(background=name))
         assert found.describe() == expected
+
+
+def test_a_bright_subject_is_trained_over_black(tmp_path):
+    """Masked out of photographs, as its brightness along its outline is, whatever that of its middle. Those with
+    alpha of their own are for white."""
+    inside = np.zeros((24, 32), bool)
+    inside[4:20, 6:26] = True
+    rim = inside.copy()
+    rim[5:19, 7:25] = False
+    for at_rim, name, words in (
+        (200, "black", "black, as the subject is bright"),
+        (60, "white", "white, as usual"),
+    ):
+        folder = simple_colmap(tmp_path / name, 3, (32, 24))
+        (folder / "masks").mkdir()
+        for path in sorted((folder / "images").iterdir()):
+            pixels = np.full((24, 32, 3), 255 - at_rim, np.uint8)
+            pixels[rim] = at_rim
+            Image.fromarray(pixels).save(path)
+            Image.fromarray(inside).save(folder / "masks" / f"{path.name}.png")
+        dataset, found = PhotographOptions(masks="subject").load(folder, TrainConfig())
+        assert found.describe() == words
+        assert dataset.train[0].background == found.color
+        assert outline_brightness(dataset.train) == pytest.approx(at_rim / 255, abs=0.02)
+        own = tuple(View(v.camera, v.load()) for v in dataset.train)
+        assert find_background(Dataset(own), {}).name == "white"
 
 
 def test_alpha_goes_over_white_unless_something_else_is_said(cloud):

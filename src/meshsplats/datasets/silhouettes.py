@@ -58,6 +58,30 @@ def has_silhouettes(views: Sequence[View]) -> bool:
     return sum(map(_is_cut_out, some)) * len(candidates) >= MOST * len(views) * len(some)
 
 
+def outline_brightness(views: Sequence[View]) -> float:
+    """Mean display brightness, 0 to 1, of the subject along its outline in ``views``, which are cut out; 0.5
+    where there is none."""
+    total, count = 0.0, 0
+    for view in subsample(views, LOOKED_AT):
+        image = view.load()
+        if image.alpha is None:
+            continue
+        inside = image.alpha >= OPAQUE * _unit(image)
+        beside = np.zeros_like(inside)  # pixels with a clear one beside them
+        beside[1:] |= ~inside[:-1]
+        beside[:-1] |= ~inside[1:]
+        beside[:, 1:] |= ~inside[:, :-1]
+        beside[:, :-1] |= ~inside[:, 1:]
+        rim = inside & beside
+        if image.mask is not None:
+            rim &= image.mask
+        shares = image.alpha[rim].astype(np.float64)
+        colors = image.color[rim].astype(np.float64)  # premultiplied
+        total += float((colors.mean(axis=1) / shares).sum())
+        count += len(shares)
+    return total / count if count else 0.5
+
+
 def with_clear_pixels_masked(dataset: Dataset) -> Dataset:
     """``dataset``; where its training views have no silhouettes but clear pixels, these do not count in the
     views of the result, which have no alpha. Warns with a DataWarning that names the photographs."""

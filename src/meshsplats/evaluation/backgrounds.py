@@ -44,12 +44,13 @@ _BLOCKS = 24
 _MAX_POINTS = 20_000
 """Points of a scene that are looked for in the images."""
 
-Reason = Literal["given", "model folder", "usual", "covered", "best for"]
+Reason = Literal["given", "model folder", "usual", "covered", "contrast", "best for"]
 _IN_WORDS = {
     "given": "as given",
     "model folder": "as the model folder says",
     "usual": "as usual",
     "covered": "which fans cover",
+    "contrast": "as the subject is bright",
 }
 
 
@@ -73,8 +74,8 @@ class Background:
     """Display RGB in [0, 1]."""
     reason: Reason
     """given: by the caller. model folder: named by it. usual: white, for images with alpha. covered: it
-    hardly matters, as a training covers it by its fans. best for: that of black and white over which
-    ``judge`` is closer to the photographs."""
+    hardly matters, as a training covers it by its fans. contrast: black, from which a bright subject stands
+    out. best for: that of black and white over which ``judge`` is closer to the photographs."""
     judge: str = ""
     """Name of the scene that was scored first."""
     psnr: Mapping[str, Mapping[str, float]] = field(default_factory=dict)

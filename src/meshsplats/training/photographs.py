@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from meshsplats.finetuning.setup import Display
 
 Say = Callable[[str], None]
+BRIGHT = 0.5
+"""Brightness of a masked subject along its outline above which it is trained over black, not white: dtu65 at
+half size, 300 steps, scores 29.5 dB over black so, and 28.4 otherwise."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,11 @@ class PhotographOptions:
         """The photographs in ``folder``, over the background of the training, and that background. ValueError
         if there are fewer than two to train on."""
         from meshsplats.datasets.folder import load_dataset
-        from meshsplats.datasets.silhouettes import has_silhouettes, with_clear_pixels_masked
+        from meshsplats.datasets.silhouettes import (
+            has_silhouettes,
+            outline_brightness,
+            with_clear_pixels_masked,
+        )
         from meshsplats.datasets.views import check_counting
         from meshsplats.evaluation.backgrounds import BLACK, Background
 
@@ -104,7 +111,9 @@ class PhotographOptions:
         if config.background in BACKGROUNDS:
             found = Background(BACKGROUNDS[config.background], "given")
         elif has_silhouettes(dataset.train):
-            found = Background((1.0, 1.0, 1.0), "usual")
+            # A bright subject over white has no outline that the loss can see.
+            bright = self.masks == "subject" and outline_brightness(dataset.train) > BRIGHT
+            found = Background(BLACK, "contrast") if bright else Background((1.0, 1.0, 1.0), "usual")
         else:
             found = Background(BLACK, "covered")
         return dataset.over(found.color), found
