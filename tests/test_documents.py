@@ -36,7 +36,7 @@ OF_OTHERS = {
     *("--memory-limit", "--nthreads", "--nworkers"),  # Dask
     *("--editable", "--index-url", "--no-deps", "--no-install-recommends", "--platform"),  # pip, apt
     *("--algorithm", "--eval", "--no_points", "--scale_min"),  # the code of MeshSplats' paper and of 3DGS
-    *("--backend", "--directory", "--keep-crs", "--method"),  # nerfbaselines, Python, OpenSplat
+    *("--backend", "--cpus", "--directory", "--keep-crs", "--method"),  # nerfbaselines, Docker, OpenSplat
 }
 FILES_OF_A_RUN = {
     *(journal.CHECKPOINT, journal.METRICS, journal.CONFIGURATION, journal.PREVIEWS),

@@ -111,8 +111,8 @@ def test_a_training_says_whose_choice_its_background_is(tmp_path):
 
 
 def test_a_bright_subject_is_trained_over_black(tmp_path):
-    """Masked out of photographs, as its brightness along its outline is, whatever that of its middle. Those with
-    alpha of their own are for white."""
+    """A masked one, as its brightness along its outline is, whatever its middle. Photographs with alpha
+    of their own are for white."""
     inside = np.zeros((24, 32), bool)
     inside[4:20, 6:26] = True
     rim = inside.copy()
