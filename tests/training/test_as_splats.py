@@ -12,9 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from meshsplats.datasets.views import Dataset
+from meshsplats.finetuning.checkpoint import load_checkpoint
 from meshsplats.finetuning.gradients import Gradients
+from meshsplats.finetuning.journal import CHECKPOINT
+from meshsplats.finetuning.run import TrainingLoop
+from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.rendering import render_splats
-from meshsplats.training import train, train_config
+from meshsplats.training import as_splats, train, train_config
 from meshsplats.training.as_splats import (
     FITTED_SHARE,
     FITTED_SIDES,
@@ -53,6 +57,30 @@ def psnr_of(cloud, views) -> float:
     images = (render_splats(cloud, view.camera, background=view.background).color for view in views)
     squares = (np.square(image - view.image).mean() for image, view in zip(images, views, strict=True))
     return -10 * np.log10(np.mean(list(squares)))
+
+
+@pytest.mark.parametrize("exposure", [True, False])
+def test_exposures_are_those_of_the_training(ball, tmp_path, monkeypatch, exposure):
+    """Whether they are fitted is not judged anew, and they are not found anew."""
+    config = replace(CONFIG, steps=16, growth_events=0, exposure=exposure)
+    run = RunOptions(tmp_path / "run")
+    mesh = train(ball, config, run=run)
+    begun = []
+
+    class Loop(TrainingLoop):
+        def __init__(self, start, *args, **more):
+            begun.append(None if start.state.exposures is None else start.state.exposures.copy())
+            super().__init__(start, *args, **more)
+
+    monkeypatch.setattr(as_splats, "TrainingLoop", Loop)
+    monkeypatch.setattr(as_splats, "exposures_differ", None)
+    fit_splats(mesh, ball, replace(config, exposure=None), run=run)
+    if not exposure:
+        assert begun == [None]
+        return
+    found = load_checkpoint(tmp_path / "run" / CHECKPOINT).arrays["exposure.values"]
+    assert np.abs(found - [1, 1, 1, 0, 0, 0]).max() > 0.01
+    assert np.array_equal(begun[0], found)
 
 
 def test_fitted_splats_are_nearer_to_photographs_that_were_held_out(ball, trained, fitted):

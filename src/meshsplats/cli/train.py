@@ -96,7 +96,7 @@ class Train(TrainingCommand):
 
         if self.as_splats is None:
             return
-        run = RunOptions(threads=self.threads, device=self.device, report_every=0, preview_every=0)
+        run = RunOptions(files.folder, threads=self.threads, device=self.device, report_every=0)
         with progress_display() as show:
             show.phase(f"fitting splats, for {self.as_splats}")
             splats = fit_splats(trained.saved, plan.dataset, self.configured(), run=run, on_progress=show)

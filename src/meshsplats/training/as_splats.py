@@ -6,14 +6,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.arrays import checked_array
 from meshsplats._common.geometry import quaternions_of
 from meshsplats.conversion.profiles import fit_profile
 from meshsplats.conversion.recovery import THICKNESS
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.finetuning.checkpoint import load_checkpoint
 from meshsplats.finetuning.gradients import Gradients
+from meshsplats.finetuning.journal import CHECKPOINT
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.run import Progress, TrainingLoop, run_start
 from meshsplats.finetuning.run_options import RunOptions
@@ -103,21 +107,35 @@ def fit_splats(
         mesh: the result of ``train`` with ``config``.
         dataset: that of the training.
         config: the fit takes ``FITTED_SHARE`` of its length.
-        run: resources; nothing is written.
+        run: resources; nothing is written. A folder is that of the training: exposures are fitted if they
+            were there, and begin with those.
         on_progress: called after every step.
 
     Raises ValueError as ``splats_of_fans``, else as ``finetune``.
     """
     check_fans(mesh)
-    run = replace(run or RunOptions(), folder=None, resume=False)
+    run = run or RunOptions()
+    exposures = None
+    if run.folder is not None:
+        exposures = _fitted_exposures(run.folder / CHECKPOINT, len(dataset.train))
+        config = replace(config, exposure=exposures is not None)
+    run = replace(run, folder=None, resume=False)
     config = for_views(_fitting(config, mesh, dataset, run.threads), dataset.train)
     halved = _halved(mesh, dataset.train, config)
     fans = fans_of(splats_of_fans(halved), FITTED_SIDES)
     fans = replace(fans, harmonics=halved.harmonics, order="splat", filter_px2=DILATION)
     fans = replace(fans, up=mesh.up, origin=mesh.origin)
     start = run_start(fans, dataset, config, run, None, kind=_FansOfSplats)
+    if exposures is not None and start.state.exposures is not None:
+        start.state.exposures[:] = exposures
     loop = TrainingLoop(start, start.clock(run), Blended(config), run, on_progress, plain=False)
     return splats_of_fans(loop.run())
+
+
+def _fitted_exposures(checkpoint: Path, views: int) -> np.ndarray | None:
+    """(views, 6) exposures of the training that ended with ``checkpoint``; None if it fitted none."""
+    found = load_checkpoint(checkpoint).arrays.get("exposure.values")
+    return None if found is None else checked_array("exposures", found, np.float32, (views, 6))
 
 
 class _FansOfSplats(State):
