@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from meshsplats.formats.surfaces.tangents import corner_frames
 from meshsplats.scene.base_mesh import BaseMesh
 from meshsplats.surfaces import make_surface
-from meshsplats.surfaces.normal_maps import normal_map, relief_of
+from meshsplats.surfaces.normal_maps import _continued, _texels, normal_map, relief_of
 
 needs_scipy = pytest.mark.skipif(importlib.util.find_spec("scipy") is None, reason="install meshsplats[base]")
 SIDE = 64
@@ -60,6 +60,24 @@ def test_the_map_of_a_flat_square_holds_the_normals_of_waves(angle, mirrored):
     np.testing.assert_allclose(pixels[inside] / 127.5 - 1, expected[inside], atol=0.03)
     # Where the texture shows nothing, it goes on.
     assert (pixels[..., 2] > 200).all()
+
+
+@needs_scipy
+def test_the_border_of_a_chart_reads_no_other_one():
+    """Two charts, three texels apart: interpolation at the border of one takes its own texels."""
+    corners = np.array([[(4, 5), (24, 7), (4, 27)], [(28, 7), (28, 27), (8, 27)]]) + 0.3
+    face, weights = _continued(*_texels((corners / 32).astype(np.float32), 32), corners / 32)
+    share = np.linspace(0, 1, 50)[:, None]
+    for number, triangle in enumerate(corners):
+        border = np.concatenate(
+            [share * p + (1 - share) * q for p, q in zip(triangle, triangle[[1, 2, 0]], strict=True)]
+        )
+        column, row = np.floor(border - 0.5).astype(int).T
+        read = face[[row, row, row + 1, row + 1], [column, column + 1, column, column + 1]]
+        assert (read == number).mean() > 0.97, "all but at sharp corners"
+        assert (read != 1 - number).all()
+    assert weights.min() >= 0
+    np.testing.assert_allclose(weights[face >= 0].sum(axis=1), 1, atol=1e-5)
 
 
 def test_tangents_follow_a_curved_surface_and_join_across_its_triangles():

@@ -21,6 +21,9 @@ _SAME_SIDE = 0.0
 """Cosine between the normals of a texel and a point from which both belong to one side of a thin part."""
 _ROWS = 1 << 18
 """Texels at a time."""
+_BESIDE = 1.5
+"""Distance from the texels of a chart, up to which texels beside it continue it: bilinear interpolation at
+its border reads those, and other charts have other tangents."""
 _FLAT = np.array([0.0, 0.0, 1.0])
 """The smooth normal in tangent space."""
 
@@ -55,7 +58,7 @@ def normal_map(
     """
     from scipy.spatial import cKDTree
 
-    face, weights = _texels(uv, side)
+    face, weights = _continued(*_texels(uv, side), uv)
     shown = face >= 0
     frames = corner_frames(vertices, faces, uv)
     result = np.zeros((side, side, 3), np.float32)
@@ -88,6 +91,27 @@ def _texels(uv: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     face = indices_of(image.attributes[..., :2], image.alpha > 0.5)
     first, second = image.attributes[..., 2], image.attributes[..., 3]
     return face, np.stack([first, second, 1 - first - second], axis=2)
+
+
+def _continued(face: np.ndarray, weights: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``_texels`` with those beside a chart, too: in the triangle of the nearest texel in it, near the place
+    on its border."""
+    from scipy.ndimage import distance_transform_edt
+
+    away, nearest = distance_transform_edt(face < 0, return_indices=True)
+    rows, columns = np.nonzero((away > 0) & (away < _BESIDE))
+    own = face[tuple(nearest[:, rows, columns])]
+    a, b, c = np.moveaxis(uv[own].astype(np.float64) * len(face), 1, 0)
+    b, c, place = b - a, c - a, np.stack([columns, rows], axis=1) + 0.5 - a
+    area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
+    area[area == 0] = 1
+    second = (place[:, 0] * c[:, 1] - place[:, 1] * c[:, 0]) / area
+    third = (b[:, 0] * place[:, 1] - b[:, 1] * place[:, 0]) / area
+    clamped = np.clip(np.stack([1 - second - third, second, third], axis=1), 0, 1)
+    face, weights = face.copy(), weights.copy()
+    face[rows, columns] = own
+    weights[rows, columns] = clamped / clamped.sum(axis=1, keepdims=True)
+    return face, weights
 
 
 def _normals_at(tree: Any, relief: Relief, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
