@@ -45,8 +45,9 @@ class Growing:
     ) -> None:
         self.config = config
         self._steps = Blended(config, order_of(start, config))
-        self._store = ImageCache(cache_bytes // REDUCED_PART)
-        self._reduced: dict[float, Sequence[View]] = {}
+        self._cache_bytes = cache_bytes // REDUCED_PART
+        self._factor = 0.0
+        self._reduced: Sequence[View] = ()
         self._first_fans = fan_count(start)
         self._near = NearFields.around(views, start)
         self._events = events_passed(config, fraction)
@@ -57,10 +58,11 @@ class Growing:
 
     def views(self, views: Sequence[View], fraction: float) -> Sequence[View]:
         factor = image_factor(self.config, fraction)
-        if factor not in self._reduced:
+        if factor != self._factor:
+            store = ImageCache(self._cache_bytes)  # smaller images than these are not needed any more
             # With alpha, some steps have a random background: what is opaque must be covered.
-            self._reduced[factor] = reduced_views(opaque_views(views), factor, self._store)
-        return self._reduced[factor]
+            self._factor, self._reduced = factor, reduced_views(opaque_views(views), factor, store)
+        return self._reduced
 
     def before_step(self, state: State, fraction: float) -> State:
         return self._steps.before_step(state, fraction)
