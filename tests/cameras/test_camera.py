@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -250,6 +251,22 @@ def test_a_mesh_prior_is_framed_by_its_triangles():
     corners = np.array([[-1.0, -2, 0], [1, -2, 0], [1, 0, 0], [-1, 0, 0]])
     prior = bind(BaseMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), triangles=200).mesh
     np.testing.assert_allclose(scene_bounds(prior).center, (0, -1, 0), atol=0.05)
+
+
+def test_up_that_is_told_counts_within_45_degrees_of_that_of_cameras():
+    told = replace(make_cloud(ball(10)), up=np.array([0, 0, 1.0]))
+    for degrees, up in ((40, (0, 0, 1)), (50, (0, np.sin(np.radians(50)), np.cos(np.radians(50))))):
+        held = (0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees)))
+        np.testing.assert_allclose(guess_up(told, orbit(ball(), 12, elevation=0, up=held)), up, atol=1e-6)
+
+
+def test_a_scatter_of_small_parts_is_framed_whole():
+    """Though one of them is large: it has a fifth of all points."""
+    large = ball(200) * 0.2
+    small = np.array([[x, y, z] for x in (-2, -1, 1, 2) for y in range(-2, 3) for z in range(-2, 3)], float)
+    rng = np.random.default_rng(0)
+    parts = (small[:, None] + 0.01 * rng.normal(size=(len(small), 8, 3))).reshape(-1, 3)
+    assert len(scene_bounds(np.concatenate([large, parts])).points) == len(large) + len(parts)
 
 
 def test_one_splat_is_framed_by_its_size():

@@ -2,6 +2,8 @@
 
 import json
 import warnings
+from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +41,16 @@ def test_only_gaps_that_a_splat_viewer_closes_count():
     assert gap_share(wall(0.3)) > 0.5
     assert gap_share(wall(0.02)) == 0  # a splat viewer shows a sieve, too
     assert gap_share(wall(0.3).take([])) == 0
+
+
+def test_a_few_gaps_are_no_sieve():
+    """Of a wall, so many in a hundred columns are thin."""
+    for percent, look in ((2, None), (15, "splats")):
+        cloud = wall(0.6, 100)
+        thin = cloud.means[:, 0] < percent
+        cloud = replace(cloud, scales=np.where(thin[:, None], np.float32(0.3), cloud.scales))
+        with nullcontext() if look is None else pytest.warns(DataWarning):
+            assert with_usual_look(cloud).look == look
 
 
 def test_the_look_is_widened_with_a_word_and_only_where_nobody_chose_it():

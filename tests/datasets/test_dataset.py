@@ -22,7 +22,7 @@ from meshsplats.cameras.placing import has_surroundings, inside_cameras, outside
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.splat_targets import splat_dataset, splat_views
+from meshsplats.datasets.splat_targets import TRAINING_SAMPLES, splat_dataset, splat_views
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError
@@ -290,6 +290,16 @@ def test_held_out_views_in_which_nothing_counts_are_not_scored(tmp_path):
     assert left.scorable() is left
 
 
+def test_where_masks_are_clear_they_do_not_count(tmp_path):
+    """White ones with a hole, as programs that cut out write them."""
+    folder = simple_colmap(tmp_path, 2)
+    mask = np.full((8, 12, 4), 255, np.uint8)
+    mask[:3, :5, 3] = 0
+    for name in ("p00", "p01"):
+        save(folder / f"masks/{name}.png", mask)
+    assert np.array_equal(load_dataset(folder).views[0].mask, mask[..., 3] > 0)
+
+
 def test_a_subject_needs_masks(tmp_path):
     folder = simple_colmap(tmp_path, 2)
     with pytest.raises(ms.FileFormatError, match="no masks, so none of a subject"):
@@ -436,6 +446,15 @@ def test_splat_views_are_the_images_of_their_look(cloud, look):
         want = draw_splats(cloud, camera, look, sh_degree=1, background=(1, 0, 0), samples=1)
         np.testing.assert_allclose(points.over((1, 0, 0)), want.color, atol=1e-3)
         assert view.source.nbytes == {"area": 2, "splats": 1}[look] * view.load().nbytes
+
+
+def test_training_views_take_fewer_samples_than_those_held_out(cloud):
+    data = splat_dataset(cloud, train=1, test=1, width=24, zooms=(1,))
+    for views, samples in ((data.train, TRAINING_SAMPLES), (data.test, None)):
+        (expected,) = splat_views(cloud, [views[0].camera], samples=samples)
+        np.testing.assert_array_equal(views[0].image, expected.image)
+    (exact,) = splat_views(cloud, [data.train[0].camera])
+    assert (exact.image != data.train[0].image).any()
 
 
 def test_means_over_areas_come_from_points(cloud):

@@ -111,6 +111,14 @@ def test_validation_views_stand_in_for_missing_test_views(tmp_path):
         assert load_dataset(tmp_path).test == ()
 
 
+def test_test_views_are_held_out_where_there_are_validation_views_too(tmp_path):
+    """As in every NeRF-synthetic scene: published scores are of the test views."""
+    nerf(tmp_path)
+    write_json(tmp_path / "transforms_val.json", {"camera_angle_x": 0.8, "frames": [frame("./val/r_0")]})
+    save(tmp_path / "val/r_0.png", np.zeros((8, 12, 4), np.uint8))
+    assert [view.name for view in load_dataset(tmp_path).test] == ["test/r_0", "test/r_1"]
+
+
 def test_images_to_train_with_are_not_held_out(tmp_path):
     """As where transforms_train.json was copied for programs that want a file of test views."""
     nerf(tmp_path, train=2, test=1)

@@ -64,6 +64,15 @@ def test_psnr_by_hand_and_on_the_views_background():
     assert (scores.lpips, scores.psnr_exposure) == (None, None)
 
 
+class Differing:
+    """In place of LPIPS: the largest difference of two images."""
+
+    network, convention = "vgg", "3dgs"
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.round(np.abs(a - b).max(), 5))
+
+
 def test_masked_pixels_do_not_count():
     mask = np.ones((16, 24), bool)
     mask[:, :12] = False
@@ -74,6 +83,8 @@ def test_masked_pixels_do_not_count():
     scores = evaluate(perfect, Dataset((), (target,))).method("mesh").views[0]
     assert scores.psnr > 100
     assert scores.ssim == pytest.approx(1, abs=1e-6)
+    measured = evaluate(perfect, Dataset((), (target,)), lpips=Differing())
+    assert measured.method("mesh").views[0].lpips == 0
     nothing = View(CAMERA, ViewImage(wrong, None, ~mask & mask))
     with pytest.warns(DataWarning, match="1 of 2 held-out photographs are not scored"):
         both = evaluate(perfect, Dataset((), (nothing, target)))
@@ -98,6 +109,9 @@ def test_floaters_are_counted_away_from_the_subject():
     target = view([0.0, 0, 0], alpha)
     found = evaluate(quad([0, 0, 0, 0.5]), Dataset((), (target,))).method("mesh").views[0].floaters
     assert found == 10 * (len(range(7, 10)) + len(range(15, 17)))
+    masked = view([0.0, 0, 0], alpha, np.arange(24) + np.zeros((16, 1)) < 12)
+    left = evaluate(quad([0, 0, 0, 0.5]), Dataset((), (masked,))).method("mesh").views[0].floaters
+    assert left == 10 * len(range(7, 10))
     faint = evaluate(quad([0, 0, 0, 0.04]), Dataset((), (target,))).method("mesh").views[0].floaters
     assert faint == 0
 

@@ -441,7 +441,8 @@ def test_what_a_kill_leaves_goes_with_the_next_file(tmp_path, monkeypatch):
         assert process.stdout.readline() == "writing\n"
         living = temporary_beside(tmp_path / "other.npz")  # of this process
         living.write_bytes(b"")
-        (tmp_path / ".mesh.0-00000000.0123456789abcdef.glb").write_bytes(b"")  # of another machine
+        elsewhere = tmp_path / f".mesh.{process.pid:x}-00000000.0123456789abcdef.glb"
+        elsewhere.touch()  # a process of another machine on this disk has the same number
         monkeypatch.setattr(atomic, "_swept", set())
         with atomic_path(tmp_path / "first.npz"):
             pass
@@ -450,7 +451,7 @@ def test_what_a_kill_leaves_goes_with_the_next_file(tmp_path, monkeypatch):
     monkeypatch.setattr(atomic, "_swept", set())
     with atomic_path(tmp_path / "mesh.npz"):
         pass
-    left = [living.name, ".mesh.0-00000000.0123456789abcdef.glb"]
+    left = [living.name, elsewhere.name]
     assert sorted(_temporaries(tmp_path)) == sorted(left)
 
 

@@ -105,6 +105,19 @@ def test_quantised_formats_keep_up_origin_and_kernel(tmp_path, suffix):
     assert back.kernel == "antialiased"
 
 
+def test_dot_splat_has_the_largest_first_and_bytes_as_others_write_them(tmp_path):
+    """Viewers show what they have loaded so far."""
+    size, opacity = np.array([0.1, 0.4, 0.2, 0.4]), np.array([0.9, 0.2, 0.9, 0.8])
+    cloud = ms.GaussianCloud(
+        np.arange(12).reshape(4, 3), np.full((4, 4), 0.5), np.tile(size[:, None], 3), opacity,
+        np.zeros((4, 1, 3)),
+    )  # fmt: skip
+    ms.save_gaussians(cloud, tmp_path / "a.splat")
+    records = np.fromfile(tmp_path / "a.splat", [("x", "<f4"), ("more", "V24"), ("rotation", "u1", 4)])
+    assert records["x"].tolist() == [9, 3, 6, 0]
+    assert (records["rotation"] == 128 + 64).all()
+
+
 @pytest.mark.parametrize(
     ("suffix", "lost"), [(".splat", "degree 0.*origin.*up.*kernel"), (".spz", "origin.*up")]
 )

@@ -11,9 +11,11 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from _datasets import simple_colmap
 from _glb import edit_glb
 from _priors import bumpy
 from _splats import few_splats
+from PIL import Image
 
 import meshsplats as ms
 from meshsplats._common.options import Help, settings
@@ -260,6 +262,16 @@ def test_a_page_shows_a_file(files):
     ):
         with pytest.raises(OptionsError, match=message):
             shown_file(files / "s.ply", options)
+
+
+def test_a_page_shows_photographs_stored_on_their_side_upright(files):
+    folder = simple_colmap(files / "photos", 2)
+    exif = Image.Exif()
+    exif[0x112] = 6
+    for path in (folder / "images").iterdir():
+        Image.open(path).save(path, exif=exif)
+    shown = shown_file(files / "m.npz", ViewingOptions(data=folder))
+    assert [(camera.width, camera.height) for camera in shown.cameras] == [(8, 12)] * 2
 
 
 def test_floaters_are_taken_out_of_a_file(files):

@@ -104,6 +104,16 @@ def test_only_what_is_missing_below_and_between_the_views_is_added():
     assert len(missing_ground(points, faces, walkers(0.5), np.array([0, 0, 1.0]), VOXEL)[1]) == 0
 
 
+def test_the_rim_of_new_ground_lies_below_the_old():
+    """Where both lie at one height, they would flicker."""
+    more, _ = missing_ground(*sheet(((-1.0, -1.0, 1.0, 1.0),)), walkers(), np.array([0, 0, 1.0]), VOXEL)
+    below = ground(more[:, 0], more[:, 1]) - more[:, 2]
+    rim = np.abs(more[:, :2]).max(axis=1) > 1 + CELL * VOXEL
+    assert 0 < rim.sum() < len(more)
+    np.testing.assert_allclose(below[rim], TUCKED * VOXEL, atol=1e-6)
+    np.testing.assert_allclose(below[np.abs(more[:, :2]).max(axis=1) < 1], 0, atol=1e-6)
+
+
 def test_a_far_background_costs_nothing():
     """Mountains within the plan of the ground would have 10^11 cells."""
     points, faces = sheet(((-1.0, -1.0, 1.0, 1.0),))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from _balls import cameras_around
@@ -52,6 +53,21 @@ def test_more_minutes_and_threads_make_larger_images(photographs, monkeypatch, m
 def test_no_time_is_enough_for_the_largest_photographs(photographs, monkeypatch):
     monkeypatch.setattr(image_sizes, "MOST_PIXELS", SIDE**2 / 9)
     assert worthwhile_downscale(photographs, None, None) == 3
+
+
+@pytest.mark.parametrize(
+    ("size", "minutes", "factor"),
+    [
+        *[((1080, 1920), 2, 4), ((1080, 1920), 5, 2), ((1080, 1920), None, 1)],
+        *[((1600, 1200), None, 1), ((4000, 3000), None, 2)],
+    ],
+)
+def test_measured_sizes_are_kept(monkeypatch, size, minutes, factor):
+    """Of a phone's photographs on two processors, and those that 3DGS has."""
+    camera = SimpleNamespace(width=size[0], height=size[1])
+    data = SimpleNamespace(views=[SimpleNamespace(camera=camera)])
+    monkeypatch.setattr(image_sizes, "load_dataset", lambda *_, **__: data)
+    assert worthwhile_downscale(Path("photos"), minutes, 2) == factor
 
 
 def test_one_large_photograph_does_not_make_all_others_small(photographs, monkeypatch):

@@ -64,6 +64,21 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
         find_cameras(photographs(tmp_path, 3))
 
 
+def test_a_found_camera_is_written_with_its_place_and_lens():
+    world_to_camera = np.array([[1.0, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3]])
+    image = SimpleNamespace(
+        name="a", camera_id=7, has_pose=True, cam_from_world=SimpleNamespace(matrix=lambda: world_to_camera)
+    )
+    camera = SimpleNamespace(params=[50.0, 31.0, 19.0, -0.1], width=60, height=40)
+    model = SimpleNamespace(images={1: image}, cameras={7: camera})
+    (frame,) = reconstruction._transforms(model, "images/", {"a": "b.png"})["frames"]
+    pose = np.array(frame.pop("transform_matrix"))
+    np.testing.assert_allclose(pose[:3, 3], -world_to_camera[:, :3].T @ [1, 2, 3])
+    np.testing.assert_allclose(pose[:3, :3].T, world_to_camera[:, :3] * [[1], [-1], [-1]])
+    lens = {"fl_x": 50, "fl_y": 50, "cx": 31, "cy": 19, "k1": -0.1}
+    assert frame == {"file_path": "images/b.png", **lens, "w": 60, "h": 40}
+
+
 @pytest.mark.parametrize(
     ("limit", "value"),
     [("DOUBLED_BELOW", 60), ("DOUBLED_UP_TO", 4)],  # their longest side; fewer than there are

@@ -14,7 +14,7 @@ from PIL import Image
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.training import train, train_config
-from meshsplats.training.suspects import REACH, Suspects, alike, find_suspects, steepness
+from meshsplats.training.suspects import REACH, Suspects, _are_low, alike, find_suspects, steepness
 
 SIZE = {"start_splats": 1500, "max_splats": 1500, "growth_events": 0, "sh_degree": 0}
 
@@ -89,6 +89,13 @@ def test_clear_pixels_do_not_make_neighbours_the_same(photographs):
     assert find_suspects([*views, copy]) == Suspects(doubles=(("004", "copy"),))
     neighbour = with_color(copy, np.where(alpha[..., None] > 0, color + 7, color).astype(np.uint8))
     assert find_suspects([*views, neighbour]) == Suspects()
+
+
+def test_photographs_of_unlike_things_are_not_blurred_beside_each_other():
+    """A quarter lies far below the median where all are spread as widely."""
+    spread = np.linspace(0.2, 1.8, 20)[:, None]
+    assert not _are_low(spread).any()
+    assert _are_low(np.append(np.full(19, 1.0), 0.3)[:, None]).tolist() == [False] * 19 + [True]
 
 
 def test_few_photographs_do_not_tell_what_is_usual(photographs):
