@@ -72,7 +72,7 @@ def rows(name: str, folder: Path, options: argparse.Namespace) -> list[tuple[str
     return [
         (
             *("OpenSplat", f"{steps:,}", f"{spent:.0f}", f"{len(foreign):,}"),
-            *max(scores(drawn(foreign, color), data) for color in BACKGROUNDS),
+            *max((scores(drawn(foreign, color), data) for color in BACKGROUNDS), key=psnr_of),
         ),
         (
             "`train`, its mesh",
@@ -96,9 +96,14 @@ Drawn = Callable[[ms.Camera], np.ndarray]
 
 def scores(drawn: Drawn, data: ms.Dataset) -> tuple[str, str]:
     """PSNR, with its median, and SSIM of the held-out photographs."""
-    pairs = [(drawn(view.camera), view.image) for view in data.test]
+    pairs = [(drawn(view.camera).clip(0, 1), view.image) for view in data.test]
     psnr = [ms.psnr(*pair) for pair in pairs]
     return f"{np.mean(psnr):.2f} ({np.median(psnr):.2f})", f"{np.mean([ms.ssim(*p) for p in pairs]):.3f}"
+
+
+def psnr_of(scored: tuple[str, str]) -> float:
+    """The mean PSNR among ``scores``."""
+    return float(scored[0].split()[0])
 
 
 def as_nerfstudio(data: ms.Dataset, photographs: Path, project: Path) -> Path:

@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 from _local import script
 
@@ -124,6 +125,15 @@ def test_works_take_turns_after_a_warm_up():
     times = common.in_turns([lambda: done.append("a"), lambda: done.append("b")], 2)
     assert "".join(done) == "ababab"
     assert [len(each.wall) for each in times] == [len(each.processor) for each in times] == [2, 2]
+
+
+def test_splats_of_other_trainers_are_scored_as_evaluate_does(monkeypatch):
+    """Clipped, and the better one of two backgrounds is that of the higher number."""
+    monkeypatch.syspath_prepend(FOLDER)
+    trainers = script("benchmarks/trainers.py")
+    data = argparse.Namespace(test=[argparse.Namespace(camera=None, image=np.ones((16, 16, 3)))])
+    assert trainers.scores(lambda _: np.full((16, 16, 3), 1.5), data) == ("inf (inf)", "1.000")
+    assert max([("9.87 (9.50)", "0.9"), ("14.49 (14.58)", "0.8")], key=trainers.psnr_of)[1] == "0.8"
 
 
 def test_recorded_files_belong_to_scripts_and_are_linked_from_the_first_screen():
