@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import subprocess
 import sys
+
+from _needs import lacking
 
 from meshsplats.blender import BlenderError, draw
 
@@ -21,7 +24,11 @@ os._exit(0)  # Blender 4.2 crashes when it ends
 
 
 def draw_by_eevee(*arguments, **options) -> None:
-    """``draw``, once more after a crash."""
+    """``draw``, once more after a crash; skips without EGL."""
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError as error:
+        lacking("egl", str(error))
     for attempt in range(ATTEMPTS):
         try:
             return draw(*arguments, **options)

@@ -14,6 +14,8 @@ REMEDIES = {
     "gpu": "a Vulkan driver: apt install mesa-vulkan-drivers libvulkan1 (on the processor), or that of a GPU",
     "dawn": "Dawn for node: make dawn, which needs npm (apt install nodejs npm)",
     "node": "packages of npm: make node-packages, or MESHSPLATS_NODE_FOLDER=folder/that/has/them",
+    "egl": "EGL, by which EEVEE draws: apt install libegl1",
+    "extras": "all extras of the package: pip install 'meshsplats[dev,torch]'",
     "qemu": "an emulator of other processors: apt install qemu-user",
 }
 VARIABLE = "MESHSPLATS_REQUIRE"

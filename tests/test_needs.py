@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
 import pytest
 from _needs import VARIABLE, lacking, skipped_lines
 
@@ -19,6 +23,18 @@ def test_it_fails_where_a_browser_is_required(monkeypatch):
     monkeypatch.setenv(VARIABLE, "gpu")
     with pytest.raises(pytest.skip.Exception):
         lacking("browser", "it is gone")
+
+
+NOT_OF_EXTRAS = {"bpy", "gsply", "lpips", "mitsuba", "resource", "tomllib"}
+"""Of environments of their own, of programs that tests compare with, and of systems."""
+
+
+def test_every_package_that_tests_skip_without_is_here():
+    texts = [path.read_text(encoding="utf-8") for path in Path(__file__).parent.rglob("*.py")]
+    names = {name for text in texts for name in re.findall(r'importorskip\(\s*"(\w+)', text)}
+    missing = sorted(name for name in names - NOT_OF_EXTRAS if find_spec(name) is None)
+    if missing:
+        lacking("extras", f"there is no {', '.join(missing)}")
 
 
 def test_each_reason_has_a_line_with_its_count_the_most_frequent_first():

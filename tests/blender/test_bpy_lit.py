@@ -155,7 +155,6 @@ def test_a_small_object_throws_its_shadow_on_what_is_near(tmp_path):
 @pytest.mark.nightly
 def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
     """Slow without a graphics card: one small scene for both. All light on the ground is the sun's."""
-    pytest.importorskip("ctypes").CDLL("libEGL.so.1")
     cloud, _ = ball_splats(400)
     mesh = convert(cloud, mode="flat")
     view = orbit(mesh, 1, elevation=35, azimuth=20, width=64, height=48, distance=2.2)[0]

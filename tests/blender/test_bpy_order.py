@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 
 import numpy as np
@@ -254,10 +253,6 @@ def test_meshes_without_splats_are_sorted_by_the_triangle(scene):
 def test_eevee_draws_by_the_splat_from_all_sides(tmp_path):
     """The command line, and the saved file, whose cameras are markers of the timeline: more than 60 dB.
     Without a graphics card each image takes seconds, however small it is."""
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        pytest.skip("EEVEE needs libEGL")
     mesh = convert(ball_splats(200)[0])
     views = [view.with_near_plane(mesh.vertices) for view in orbit(mesh, 3, width=40, height=40)]
     paths, saved = [tmp_path / f"{i}.exr" for i in range(2)], tmp_path / "s.blend"

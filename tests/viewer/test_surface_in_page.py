@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _needs import lacking
 from _pages import cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa: F401 - fixtures
 from test_controls import open_page
 from test_page import block
@@ -159,7 +160,7 @@ def test_the_exact_mesh_stands_beside_a_surface(browser, url):
     page.still(400)
     if page.run("document.body.dataset.renderer") != "exact":
         page.close()
-        pytest.skip("Chromium draws without WebGPU here")
+        lacking("browser", "Chromium draws without WebGPU here")
     beside(page, PAIRS)
     assert page.run("document.querySelector('#exact').style.visibility") == "hidden"
     assert page.problems() == []

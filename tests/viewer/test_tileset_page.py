@@ -6,7 +6,6 @@ import contextlib
 import functools
 import http.server
 import json
-import os
 import re
 import threading
 import time
@@ -29,8 +28,6 @@ PLACE, MODEL, FRAME = re.search(  # type: ignore[union-attr]
     r"```js\n(const place .*?\n)(tileset\.modelMatrix .*?\n)(const frame .*?\n)```", DOCS
 ).groups()
 ONLINE = re.compile(r"https://cesium\.com/downloads/cesiumjs/releases/[\d.]+/Build/Cesium")
-# 79 MB that nothing else needs: not among the packages that make node-packages installs.
-CESIUM = Path(os.environ.get("MESHSPLATS_NODE_FOLDER", "")) / "node_modules" / "cesium" / "Build" / "Cesium"
 SIDE = 240
 
 
@@ -68,15 +65,14 @@ def drawn(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return image.color, image.alpha > 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("place", [False, True])
-def test_the_page_shows_a_tileset(tmp_path, browser, place):
-    if not CESIUM.exists():
-        pytest.skip("CesiumJS is not here (npm install cesium, and MESHSPLATS_NODE_FOLDER=that/folder)")
+def test_the_page_shows_a_tileset(tmp_path, browser, node_package, place):
+    cesium = node_package("cesium") / "node_modules" / "cesium" / "Build" / "Cesium"
     ms.save_gaussians(make_scene(2000), tmp_path / "scene.ply")
     folder = tmp_path / "tileset"
     build_tiles(ms.stream_gaussians(tmp_path / "scene.ply"), folder, TileOptions(alpha="mask"))
-    (folder / "cesium").symlink_to(CESIUM.resolve())
+    (folder / "cesium").symlink_to(cesium.resolve())
     text = ONLINE.sub("cesium", on_globe(PAGE) if place else PAGE)
     assert "https://" not in text
     (folder / "index.html").write_text(text)
