@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -245,6 +246,16 @@ class TestTwins:
         apart = ((placed[:, None] - placed[None]) ** 2).sum(axis=2)
         np.fill_diagonal(apart, np.inf)
         np.testing.assert_array_equal(found, np.argsort(apart, axis=1, kind="stable")[:, :count])
+
+    def test_nearest_of_equal_points(self):
+        """Which once took a time that grew with the square of their number."""
+        points = np.repeat([[0.0, 1, 2], [0, 1, 3]], 20_000, axis=0)
+        start = time.process_time()
+        order, found = nearest(points, 3, threads=1)
+        assert time.process_time() - start < 2
+        np.testing.assert_array_equal(points[order], points)
+        assert (found[[0, 1, 2, 9, 19_999]] == [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2], [0, 1, 2]]).all()
+        assert (found[20_003:] == [20_000, 20_001, 20_002]).all()
 
     def test_nearest_of_many(self):
         points = make_scene(20_000).means.astype(np.float64)

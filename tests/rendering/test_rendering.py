@@ -18,13 +18,14 @@ from _rendering import (
     layers,
     seen_by,
     soup,
+    splats,
     turned,
 )
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, convert, load_cameras, load_gaussians
-from meshsplats.rendering import api, reference, render
+from meshsplats.rendering import api, reference, render, render_splats
 from meshsplats.rendering.backward import TapedRendering, TapeOptions
 
 BLACK = (0, 0, 0)
@@ -55,6 +56,18 @@ def test_triangles_across_and_behind_the_near_plane(seed, near):
 def test_samples_and_odd_images(samples, size):
     mesh = soup(5, 20, spread=(0.5, 0.5, 1.5))
     assert_mesh_is_exact(mesh, camera(*size), samples=samples, **(EXTRAS if samples < 16 else {}))
+
+
+@pytest.mark.parametrize("samples", range(1, 17))
+def test_pixels_that_nothing_covers_are_empty_with_any_number_of_samples(samples):
+    """The mean of equal samples is any of them: their sum times 1 / 121 is less."""
+    image = render(soup(5, 20, spread=(0.2, 0.2, 0.2)), camera(13, 11), samples=samples, depth=True)
+    assert image.alpha[0, 0] == 0
+    assert image.mean_depth()[0, 0] == np.inf
+    assert (image.color[0, 0] == 1).all()
+    splats_alone = render_splats(splats(1, 5, sizes=(0.01, 0.02)), camera(13, 11), samples=samples)
+    assert splats_alone.alpha[0, 0] == 0
+    assert (splats_alone.color[0, 0] == 1).all()
 
 
 @pytest.mark.parametrize("max_layers", [1, 2, 7, 10**6])

@@ -26,6 +26,8 @@ from _stereo_twin import (
     witnesses,
 )
 
+from meshsplats._core import library
+from meshsplats._core import stereo as core_stereo
 from meshsplats._core.library import available_variants
 from meshsplats._core.stereo import (
     Layout,
@@ -490,14 +492,23 @@ def test_the_core_refuses_photographs_that_are_not_there():
         confirmed(layout, planes, np.ones(layout.pixels, bool), judges, 1)
 
 
-def test_fusion_of_few_points():
+def test_fusion_of_few_points(monkeypatch):
     def surface(n):
         points = np.zeros((n, 3), np.float32)
         return SurfaceArrays(
             points, points, np.ones(n, np.float32), np.zeros((n, 3), np.uint8), np.ones(n, np.uint8)
         )
 
+    counts = []
+
+    def runs(name, struct):
+        library.run(name, struct)
+        counts.append(struct.found)
+
+    monkeypatch.setattr(core_stereo, "run", runs)
     assert len(fuse_points(surface(0), 5, 8.0).points) == 0
+    assert len(fuse_points(surface(100), 0, 8.0).points) == 0  # nor is anything written
+    assert counts == [0, 0]
     for n in (1, 2, 100):  # points in one place have no plane
         found = fuse_points(surface(n), 5, 8.0)
         assert found.counts.sum() == n

@@ -14,6 +14,7 @@ import numpy as np
 
 from meshsplats._core.layout import check_layout
 from meshsplats._core.quota import processor_quota
+from meshsplats._core.stopping import stoppable
 from meshsplats._core.structures import (
     CameraStruct,
     ImageGradientsStruct,
@@ -30,7 +31,15 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 16
+INTERFACE_VERSION = 17
+
+QUICK_FRAGMENTS = 1e9
+"""Images that cannot have more of them are soon drawn: in seconds, if each triangle were as large as they."""
+LONG = frozenset(
+    {"ms_nearest", "ms_merge_pairs", "ms_order_triangles", "ms_viewer_images", "ms_match_photos"}
+    | {"ms_count_witnesses", "ms_fill_depths", "ms_count_views", "ms_fuse_points"}
+)
+"""Functions other than those of images that may run for seconds."""
 
 
 def pointer(array: np.ndarray | None) -> int | None:
@@ -116,16 +125,32 @@ def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
         function = getattr(library, name)
         function.restype = c_int
         function.argtypes = arguments + message
-    library.ms_free_tape.restype = None
-    library.ms_free_tape.argtypes = [c_void_p]
+    for name in ("ms_free_tape", "ms_stop_with"):
+        getattr(library, name).restype = None
+        getattr(library, name).argtypes = [c_void_p]
     return library
 
 
-def call(name: str, *arguments: object) -> None:
-    """Runs a function of the core. Raises MemoryError, RuntimeError or, for splats that share vertices and
-    cannot be filtered, ValueError, with the core's message."""
+def call(
+    name: str,
+    scene: MeshStruct | SplatsStruct,
+    camera: CameraStruct,
+    options: OptionsStruct,
+    *arguments: object,
+) -> None:
+    """Runs a function of the core that draws, or the backward pass of one. Raises MemoryError, RuntimeError
+    or, for splats that share vertices and cannot be filtered, ValueError, with the core's message; if what
+    answers a signal raises, as KeyboardInterrupt, that."""
     message = ctypes.create_string_buffer(256)
-    status = getattr(load_core(), name)(*arguments, message, len(message))
+    core = load_core()
+    count = scene.count if isinstance(scene, SplatsStruct) else scene.face_count
+    most = count * camera.width * camera.height * options.samples**2
+
+    def work() -> int:
+        status: int = getattr(core, name)(scene, camera, options, *arguments, message, len(message))
+        return status
+
+    status = stoppable(core, work) if most > QUICK_FRAGMENTS else work()
     if status == 1:
         raise MemoryError(
             f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time"
@@ -141,7 +166,7 @@ def call(name: str, *arguments: object) -> None:
 
 def run(name: str, argument: ctypes.Structure) -> None:
     """Runs a function of the core that takes one structure. Raises MemoryError, or ValueError with the core's
-    message; ImportError if the core does not have it."""
+    message; ImportError if the core does not have it; one of ``LONG`` also as ``call`` does."""
     message = ctypes.create_string_buffer(256)
     core = load_core()
     if not hasattr(core, name) and "baseline" in available_variants():
@@ -150,7 +175,12 @@ def run(name: str, argument: ctypes.Structure) -> None:
         raise ImportError(
             f"the compiled core has no {name}: it is older than the Python code, install the package again"
         )
-    status = getattr(core, name)(ctypes.byref(argument), message, len(message))
+
+    def work() -> int:
+        status: int = getattr(core, name)(ctypes.byref(argument), message, len(message))
+        return status
+
+    status = stoppable(core, work) if name in LONG else work()
     text = message.value.decode()
     if status == 1:
         raise MemoryError(f"{name}: {text}")

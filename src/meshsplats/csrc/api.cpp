@@ -51,8 +51,10 @@ int64_t render_tiles(const ms::Grid &grid, const std::vector<ms::BinItem> &items
         std::atomic<int64_t> next{lists.begin()};
         ms::on_threads(threads, [&](int thread) {
             if (!workers[thread]) workers[thread] = make_worker();
-            for (int64_t tile; (tile = next.fetch_add(1)) < lists.end();)
+            for (int64_t tile; (tile = next.fetch_add(1)) < lists.end();) {
+                ms::stop_point();
                 render(*workers[thread], tile, lists.list(tile), lists.length(tile));
+            }
         });
     }
     int64_t fragments = 0;
@@ -167,6 +169,7 @@ class BackwardPass {
                                             {},
                                             {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
+                    ms::stop_point();
                     const int64_t tile = begin + i;
                     const ms::PackedTape *tape = tape_.find(tile);
                     if (!tape) tape = &render_again(*worker, tile, *lists);
@@ -229,7 +232,7 @@ class BackwardPass {
     std::vector<std::unique_ptr<Worker>> workers_;
 };
 
-enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2, SHARED_VERTICES = 3 };
+enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2, SHARED_VERTICES = 3, STOPPED = 4 };
 
 // Turns exceptions into a status and a message.
 template <class Body>
@@ -243,6 +246,9 @@ int guarded(char *message, int size, Body body) {
     } catch (const ms::SharedVertices &e) {
         std::snprintf(message, size, "%s", e.what());
         return SHARED_VERTICES;
+    } catch (const ms::Stopped &e) {
+        std::snprintf(message, size, "%s", e.what());
+        return STOPPED;
     } catch (const std::exception &e) {
         std::snprintf(message, size, "%s", e.what());
         return FAILED;
@@ -254,7 +260,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 16; }
+MS_EXPORT int ms_interface_version() { return 17; }
 
 // The fields of all structures of this library, and how many they are.
 MS_EXPORT const MsField *ms_layout(int32_t *count) {
@@ -272,6 +278,9 @@ MS_EXPORT const char *ms_best_variant() {
 #endif
     return "baseline";
 }
+
+// Calls that this thread makes from now on end soon after `flag` is not 0 any more, with results of no use.
+MS_EXPORT void ms_stop_with(const int32_t *flag) { ms::stop_flag = flag; }
 
 // All functions below return a Status and, unless it is OK, write a message of at most message_size bytes.
 

@@ -53,7 +53,7 @@ class Fusion {
     }
 
     int run() {
-        if (points_.empty()) return 0;
+        if (points_.empty() || input_.wanted < 1) return 0;
         std::vector<Part> parts;
         parts.reserve(input_.wanted);
         auto later = [&](int a, int b) {
@@ -63,6 +63,7 @@ class Fusion {
         parts.push_back(measured(0, (int64_t)points_.size()));
         queue.push(0);
         while ((int)parts.size() < input_.wanted && !queue.empty()) {
+            stop_point();
             const int chosen = queue.top();
             queue.pop();
             const Part part = parts[chosen];

@@ -160,7 +160,7 @@ class ImageTile {
     void resolve() {
         if (!image_.color) return;
         int s = grid_.samples;
-        float share = 1.0f / (s * s);
+        const float count = s * s;  // not times its inverse: 121 / 121 is 1, 121 * (1.0f / 121) is less
         for (int y = 0; y < area_.rows; y += s) {
             for (int x = 0; x < area_.columns; x += s) {
                 int64_t pixel = (int64_t)((area_.y0 + y) / s) * camera_.width + (area_.x0 + x) / s;
@@ -171,11 +171,11 @@ class ImageTile {
                         for (int c = 0; c < 3; ++c) color[c] += color_[c][sample];
                         transmittance += transmittance_[sample];
                     }
-                transmittance *= share;
+                transmittance /= count;
                 const float *background =
                     options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
                 for (int c = 0; c < 3; ++c)
-                    image_.color[3 * pixel + c] = color[c] * share + transmittance * background[c];
+                    image_.color[3 * pixel + c] = color[c] / count + transmittance * background[c];
                 image_.alpha[pixel] = 1 - transmittance;
                 if (extras_.depth >= 0) resolve_extra(image_.depth, extras_.depth, 1, x, y, pixel);
                 if (extras_.normals >= 0) resolve_extra(image_.normals, extras_.normals, 3, x, y, pixel);
@@ -338,14 +338,13 @@ class ImageTile {
     // Averages the samples of the pixel at the tile's sample (x, y) for the channels of one output.
     void resolve_extra(float *out, int first, int channels, int x, int y, int64_t pixel) const {
         const int s = grid_.samples;
-        const float share = 1.0f / (s * s);
         for (int c = 0; c < channels; ++c) {
             float sum = 0;
             for (int j = 0; j < s; ++j)
                 for (int i = 0; i < s; ++i)
                     sum +=
                         extra_sums_[(size_t)TileArea::sample_index(x + i, y + j) * extras_.count + first + c];
-            out[pixel * channels + c] = sum * share;
+            out[pixel * channels + c] = sum / (s * s);
         }
     }
 

@@ -73,6 +73,7 @@ class KdTree {
     };
     struct Cell {
         int axis;
+        bool point;  // all its points lie in one place, at the border
         double border;
     };
     struct Search {
@@ -83,22 +84,24 @@ class KdTree {
         double *distances;
         int count;
 
-        // Inserts a point by insertion sort, if it is among the nearest.
-        void insert(int32_t index, double distance) {
+        // Inserts a point by insertion sort, if it is among the nearest; whether it is.
+        bool insert(int32_t index, double distance) {
             auto comes_before = [&](int i) {
                 return distance < distances[i] || (distance == distances[i] && index < nearest[i]);
             };
             int i = count - 1;
-            if (!comes_before(i)) return;
+            if (!comes_before(i)) return false;
             for (; i > 0 && comes_before(i - 1); --i)
                 distances[i] = distances[i - 1], nearest[i] = nearest[i - 1];
             distances[i] = distance;
             nearest[i] = index;
+            return true;
         }
     };
 
     void split(const double *points, int64_t begin, int64_t end, std::size_t cell, int level) {
         if (level == levels_) return;
+        stop_point();
         double low[3], high[3];
         for (int k = 0; k < 3; ++k) low[k] = std::numeric_limits<double>::infinity(), high[k] = -low[k];
         for (int64_t i = begin; i < end; ++i)
@@ -115,9 +118,15 @@ class KdTree {
             const double x = points[3 * (int64_t)a + axis], y = points[3 * (int64_t)b + axis];
             return x < y || (x == y && a < b);
         });
-        cells_[cell] = {axis, points[3 * (int64_t)order_[middle] + axis]};
+        const bool point = !(high[axis] > low[axis]);
+        cells_[cell] = {axis, point, points[3 * (int64_t)order_[middle] + axis]};
         split(points, begin, middle, 2 * cell, level + 1);
         split(points, middle, end, 2 * cell + 1, level + 1);
+    }
+
+    static double square_distance(const Point &a, const Point &b) {
+        const double x = a.at[0] - b.at[0], y = a.at[1] - b.at[1], z = a.at[2] - b.at[2];
+        return x * x + y * y + z * z;
     }
 
     // Visits a cell whose squared distance to the query is `distance`: first the half that holds the query,
@@ -127,12 +136,14 @@ class KdTree {
                Search &search) const {
         const Point &query = search.query;
         if (level == levels_) {
-            for (int64_t i = begin; i < end; ++i) {
-                if (i == search.self) continue;
-                const double x = sorted_[i].at[0] - query.at[0], y = sorted_[i].at[1] - query.at[1],
-                             z = sorted_[i].at[2] - query.at[2];
-                search.insert((int32_t)i, x * x + y * y + z * z);
-            }
+            for (int64_t i = begin; i < end; ++i)
+                if (i != search.self) search.insert((int32_t)i, square_distance(sorted_[i], query));
+            return;
+        }
+        if (cells_[cell].point) {  // which has no nearer half
+            const double same = square_distance(sorted_[begin], query);
+            for (int64_t i = begin; i < end; ++i)
+                if (i != search.self && !search.insert((int32_t)i, same)) return;
             return;
         }
         const int64_t middle = (begin + end) / 2;
@@ -213,6 +224,7 @@ class Merging {
         std::make_heap(heap_.begin(), heap_.end());
         int64_t remaining = n;
         while (remaining > input_.wanted && !heap_.empty()) {
+            stop_point();
             std::pop_heap(heap_.begin(), heap_.end());
             const HeapEntry entry = heap_.back();
             heap_.pop_back();

@@ -50,15 +50,18 @@ struct UnitPair {
     float weight;
 };
 
-// The sums of all pairs whose lower unit is in a range.
+// The sums of a part of all pairs, which part_of() tells.
 class PairTable {
   public:
-    // Adds `pair`. Of more than `most` pairs, the lighter half is forgotten.
+    // Of all pairs, each of `parts` has about as many.
+    static size_t part_of(uint32_t low, uint32_t high, int parts) {
+        return (size_t)((hash(low, high) >> 32) * parts >> 32);
+    }
+
+    // Adds `pair`. Of `most` pairs, the lighter half is forgotten before.
     void add(const UnitPair &pair, size_t most) {
-        if (slots_.empty() || 3 * (count_ + 1) > 2 * slots_.size()) {
-            if (count_ >= most) forget(most / 2);
-            rebuild(std::max<size_t>(4 * count_, 1024));
-        }
+        if (count_ >= most) forget(most / 2);
+        if (3 * (count_ + 1) > 2 * slots_.size()) grow(most);
         UnitPair &slot = find(pair.low, pair.high);
         if (slot.low == slot.high) {
             slot = pair;
@@ -95,9 +98,10 @@ class PairTable {
     std::vector<UnitPair> slots_;  // low == high: empty
     size_t count_ = 0;
 
-    void rebuild(size_t least) {
+    // To four slots for each pair, but no more than `most` pairs need.
+    void grow(size_t most) {
         size_t size = 1024;
-        while (size < least) size *= 2;
+        while (size < 4 * count_ && 2 * size < 3 * most) size *= 2;
         fill(pairs(), size);
     }
     void fill(const std::vector<UnitPair> &pairs, size_t size) {
@@ -105,9 +109,12 @@ class PairTable {
         count_ = pairs.size();
         for (const UnitPair &pair : pairs) find(pair.low, pair.high) = pair;
     }
+    static uint64_t hash(uint32_t low, uint32_t high) {
+        return (low * 0x9E3779B97F4A7C15ull ^ high) * 0xD1B54A32D192ED03ull;
+    }
     UnitPair &find(uint32_t low, uint32_t high) {
         const size_t mask = slots_.size() - 1;
-        size_t i = (size_t)((low * 0x9E3779B97F4A7C15ull ^ high) * 0xD1B54A32D192ED03ull >> 20) & mask;
+        size_t i = (size_t)(hash(low, high) >> 20) & mask;
         while (slots_[i].low != slots_[i].high && (slots_[i].low != low || slots_[i].high != high))
             i = (i + 1) & mask;
         return slots_[i];
@@ -120,9 +127,9 @@ class PairTable {
 // layers of a pixel would not fit into the cache.
 class ViewPairs {
   public:
-    ViewPairs(const MsOrdering &ordering, int ranges) : in_(ordering), ranges_(ranges), cache_(CACHE) {}
+    ViewPairs(const MsOrdering &ordering, int parts) : in_(ordering), parts_(parts), cache_(CACHE) {}
 
-    // Appends the pairs of a view to `out`, a list for each range of units.
+    // Appends the pairs of a view to `out`, a list for each part of them.
     void collect(int view, std::vector<UnitPair> *out) {
         const MsCamera &camera = in_.cameras[view];
         width_ = camera.width, height_ = camera.height;
@@ -143,11 +150,13 @@ class ViewPairs {
             order_.push_back({(float)(m[0] * c[0] + m[1] * c[1] + m[2] * c[2] + m[3]), (int32_t)i});
         }
         std::sort(order_.begin(), order_.end());
-        for (const auto &[depth, piece] : order_)
+        for (const auto &[depth, piece] : order_) {
+            stop_point();
             for (int64_t face = in_.piece_start[piece]; face < in_.piece_start[piece + 1]; ++face)
                 draw(piece, face);
+        }
         for (const UnitPair &pair : cache_)
-            if (pair.low != pair.high) out_[range_of(pair.low)].push_back(pair);
+            if (pair.low != pair.high) put(pair);
     }
 
   private:
@@ -173,7 +182,7 @@ class ViewPairs {
     };
 
     const MsOrdering &in_;
-    const int ranges_;
+    const int parts_;
     int width_ = 0, height_ = 0;
     std::vector<UnitPair> *out_ = nullptr;
     uint64_t random_ = 0;
@@ -186,7 +195,7 @@ class ViewPairs {
         random_ ^= random_ << 13, random_ ^= random_ >> 7, random_ ^= random_ << 17;
         return (float)(random_ >> 40) * 0x1p-24f;
     }
-    size_t range_of(uint32_t unit) const { return (size_t)unit * ranges_ / (2 * in_.piece_count); }
+    void put(const UnitPair &pair) { out_[PairTable::part_of(pair.low, pair.high, parts_)].push_back(pair); }
 
     void draw(int32_t piece, int64_t face) {
         const int32_t *f = in_.faces + 3 * face;
@@ -257,7 +266,7 @@ class ViewPairs {
         const uint32_t low = later ? far.unit : near.unit, high = later ? near.unit : far.unit;
         UnitPair &known = cache_[(low * 0x9E3779B1u ^ high * 0x85EBCA77u) >> 18];
         if (known.low != low || known.high != high) {
-            if (known.low != known.high) out_[range_of(known.low)].push_back(known);
+            if (known.low != known.high) put(known);
             known = {low, high, 0};
         }
         known.weight += later ? weight : -weight;
@@ -285,8 +294,8 @@ class Ordering {
     }
 
   private:
-    static constexpr int RANGES = 256, VIEWS = 8;  // views whose pairs wait to be added
-    static constexpr int ROUNDS = 8;               // of a sweep: units of one move at once
+    static constexpr int PARTS = 256, VIEWS = 8;  // views whose pairs wait to be added
+    static constexpr int ROUNDS = 8;              // of a sweep: units of one move at once
     static constexpr int64_t MOST_UNITS = (int64_t)1 << 29, BLOCK = 4096;
 
     struct Edge {
@@ -297,32 +306,32 @@ class Ordering {
     MsOrdering &io_;
     const int64_t units_;
     int32_t spacing_ = 1;
-    PairTable tables_[RANGES];
+    PairTable tables_[PARTS];
     PooledVector<int64_t> start_;
     PooledVector<Edge> edges_;
     PooledVector<int32_t> key_, moved_;
     PooledVector<int64_t> order_;
 
     void collect() {
-        std::vector<std::vector<UnitPair>> waiting((size_t)VIEWS * RANGES);
+        std::vector<std::vector<UnitPair>> waiting((size_t)VIEWS * PARTS);
         std::vector<std::unique_ptr<ViewPairs>> workers(io_.threads);
-        const size_t most = (size_t)io_.max_pairs / RANGES + 1;
+        const size_t most = (size_t)io_.max_pairs / PARTS + 1;
         for (int first = 0; first < io_.camera_count; first += VIEWS) {
             const int count = std::min(VIEWS, io_.camera_count - first);
             parallel_blocks(io_.threads, count, 1, [&](int64_t begin, int64_t, int thread) {
-                if (!workers[thread]) workers[thread] = std::make_unique<ViewPairs>(io_, RANGES);
-                workers[thread]->collect(first + (int)begin, &waiting[begin * RANGES]);
+                if (!workers[thread]) workers[thread] = std::make_unique<ViewPairs>(io_, PARTS);
+                workers[thread]->collect(first + (int)begin, &waiting[begin * PARTS]);
             });
-            parallel_blocks(io_.threads, RANGES, 1, [&](int64_t range, int64_t, int) {
+            parallel_blocks(io_.threads, PARTS, 1, [&](int64_t part, int64_t, int) {
                 for (int view = 0; view < count; ++view) {
-                    std::vector<UnitPair> &list = waiting[(size_t)view * RANGES + range];
-                    for (const UnitPair &pair : list) tables_[range].add(pair, 2 * most);
+                    std::vector<UnitPair> &list = waiting[(size_t)view * PARTS + part];
+                    for (const UnitPair &pair : list) tables_[part].add(pair, 2 * most);
                     list.clear();
                 }
             });
         }
-        parallel_blocks(io_.threads, RANGES, 1,
-                        [&](int64_t range, int64_t, int) { tables_[range].forget(most); });
+        parallel_blocks(io_.threads, PARTS, 1,
+                        [&](int64_t part, int64_t, int) { tables_[part].forget(most); });
     }
 
     // The pairs as a list of neighbours of every unit.

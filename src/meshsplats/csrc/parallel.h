@@ -14,6 +14,18 @@
 
 namespace ms {
 
+// Of the call that a thread works for: not 0 once it is to end. Null: nobody asks it to.
+inline thread_local const int32_t *stop_flag = nullptr;
+
+struct Stopped : std::exception {
+    const char *what() const noexcept override { return "stopped"; }
+};
+
+// Between pieces of work of less than a second: ends the call if it is to end.
+inline void stop_point() {
+    if (stop_flag && __atomic_load_n(stop_flag, __ATOMIC_RELAXED)) throw Stopped();
+}
+
 // Calls work(thread) once for each thread index in [0, threads), in parallel. Joins all threads, then
 // rethrows the first exception.
 inline void on_threads(int threads, const std::function<void(int)> &work) {
@@ -21,7 +33,8 @@ inline void on_threads(int threads, const std::function<void(int)> &work) {
     if (threads <= 1) return work(0);
     std::exception_ptr failure;
     std::mutex failure_mutex;
-    auto run = [&](int thread) {
+    auto run = [&, flag = stop_flag](int thread) {
+        stop_flag = flag;
         try {
             work(thread);
         } catch (...) {
@@ -53,6 +66,7 @@ void parallel_blocks(int threads, int64_t count, int64_t block, Body body) {
         for (;;) {
             int64_t begin = next.fetch_add(block);
             if (begin >= count) return;
+            stop_point();
             body(begin, std::min(count, begin + block), thread);
         }
     });

@@ -2,6 +2,7 @@
 // photographs correlate best.
 #pragma once
 
+#include "parallel.h"
 #include "photos.h"
 
 namespace ms {
@@ -34,6 +35,7 @@ class PlaneSweep {
         for (auto *values : {&best_, &before_, &after_, &last_, &at_})
             std::fill(values->begin(), values->end(), -1.0f);
         for (int plane = 0; plane < planes; ++plane) {
+            stop_point();
             for (auto *values : {&first_, &second_})
                 std::fill(values->begin(), values->end(), BestTwo::UNSEEN);
             for (size_t i = 0; i < warps.size(); ++i)

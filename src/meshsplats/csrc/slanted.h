@@ -2,6 +2,7 @@
 // the image, which is improved by the planes of others nearby and by small random changes.
 #pragma once
 
+#include "parallel.h"
 #include "photos.h"
 
 namespace ms {
@@ -68,8 +69,10 @@ class SlantedWindows {
     void run(int rounds) {
         for (int round = -1; round < rounds; ++round)
             for (int color = 0; color < 2; ++color)
-                for (int y = 0; y < height_; ++y)
+                for (int y = 0; y < height_; ++y) {
+                    stop_point();
                     for (int x = (y + color) % 2; x < width_; x += 2 * W) improve(x, y, round);
+                }
     }
 
   private:

@@ -210,23 +210,22 @@ class SplatTile {
     // Averages the samples of each pixel and writes the pixels.
     void resolve(int x0, int y0, int columns, int rows) {
         int s = grid_.samples;
-        float share = 1.0f / (s * s);
         for (int y = 0; y < rows; y += s)
             for (int x = 0; x < columns; x += s) {
                 int64_t pixel = (int64_t)((y0 + y) / s) * camera_.width + (x0 + x) / s;
-                float sum[4] = {0, 0, 0, 0};
+                float mean[4] = {0, 0, 0, 0};
                 for (int j = y; j < y + s; ++j)
                     for (int i = x; i < x + s; ++i) {
-                        sum[0] += sums_.red[j][i];
-                        sum[1] += sums_.green[j][i];
-                        sum[2] += sums_.blue[j][i];
-                        sum[3] += sums_.transmittance[j][i];
+                        mean[0] += sums_.red[j][i];
+                        mean[1] += sums_.green[j][i];
+                        mean[2] += sums_.blue[j][i];
+                        mean[3] += sums_.transmittance[j][i];
                     }
+                for (float &value : mean) value /= s * s;
                 const float *background =
                     options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
-                for (int c = 0; c < 3; ++c)
-                    image_.color[3 * pixel + c] = sum[c] * share + sum[3] * share * background[c];
-                image_.alpha[pixel] = 1 - sum[3] * share;
+                for (int c = 0; c < 3; ++c) image_.color[3 * pixel + c] = mean[c] + mean[3] * background[c];
+                image_.alpha[pixel] = 1 - mean[3];
             }
     }
 };
