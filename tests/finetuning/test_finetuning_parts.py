@@ -8,6 +8,7 @@ import math
 import signal
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,7 +31,9 @@ from meshsplats.finetuning.initial import (
 )
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
-from meshsplats.rendering import render_splats
+from meshsplats.finetuning.on_splats import tuned_as_configured
+from meshsplats.finetuning.run_options import RunOptions
+from meshsplats.rendering import ordering, render_splats
 from meshsplats.scene.camera import Camera
 from meshsplats.scene.gaussians import DILATION
 from meshsplats.scene.mesh import SplatMesh
@@ -269,6 +272,17 @@ def test_memory_is_refused_with_advice(monkeypatch):
         memory.check_memory(mesh, data)
     monkeypatch.setattr(memory, "available_memory", lambda: None)
     memory.check_memory(mesh, data)
+
+
+def test_memory_for_the_order_of_a_file_is_refused_with_advice(monkeypatch):
+    mesh = convert(make_scene(200))
+    needed = ordering.ordering_bytes(mesh)
+    assert 0 < needed < ordering.ordering_bytes(convert(make_scene(400))) < 1.5e9
+    monkeypatch.setattr(memory, "available_memory", lambda: needed)
+    memory.check_order_memory(mesh)
+    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
+    with pytest.raises(MemoryError, match=r"ordering .* triangles needs about .*``max_splats``.*``order``"):
+        tuned_as_configured(mesh, dataset(2), make_config(order="file"), RunOptions(), Mock())
 
 
 def test_splats_that_targets_are_drawn_from_count():

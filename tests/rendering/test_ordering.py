@@ -102,6 +102,19 @@ def test_few_pairs_are_kept_alike_by_all_threads(mesh, monkeypatch):
     assert orders[0].copies.tobytes() == orders[1].copies.tobytes() != whole.copies.tobytes()
 
 
+def test_the_heaviest_pairs_are_kept(mesh, monkeypatch):
+    pieces, views = pieces_of(mesh), default_views(mesh)[::4]
+    node = np.zeros(len(pieces.splat), np.int64)
+    start = np.arange(2 * len(node), dtype=np.int32)
+    whole = solve(mesh, pieces, node, start, views)
+    for share, weight in (2, 1), (0.5, 0.95):
+        monkeypatch.setattr(ordering, "MAX_PAIRS", int(share * whole.pairs))
+        found = solve(mesh, pieces, node, start, views)
+        assert found.pairs == pytest.approx(min(share, 1) * whole.pairs, rel=0.15)
+        assert found.pairs <= min(share, 1) * whole.pairs + 256
+        assert weight * whole.weight <= found.weight <= whole.weight
+
+
 def test_solved_is_better_than_quick_and_quick_than_the_index(mesh):
     views = orbit(mesh, 3, elevation=25, azimuth=7, width=96, height=96)
 

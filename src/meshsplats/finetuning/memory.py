@@ -7,6 +7,7 @@ from pathlib import Path
 from meshsplats.cluster import memory_of_task
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
+from meshsplats.rendering.ordering import ordering_bytes
 from meshsplats.scene.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4
@@ -92,6 +93,17 @@ def check_memory(mesh: SplatMesh, dataset: Dataset, *, cache_bytes: int = CACHE_
     what = f"fine-tuning {len(mesh.vertices):,} vertices on {len(dataset.views):,} images"
     check_bytes(needed, what, "convert fewer splats (``max_splats``)")
     return needed
+
+
+def check_order_memory(mesh: SplatMesh) -> None:
+    """Raises MemoryError with advice if finding the order of ``mesh`` for a file exceeds
+    ``available_memory``."""
+    needed, available = ordering_bytes(mesh), available_memory()
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"ordering {len(mesh.faces):,} triangles needs about {readable(needed)}, {readable(available)}"
+            " are free: convert fewer splats (``max_splats``), or take another ``order`` than 'file'"
+        )
 
 
 def check_bytes(needed: int, what: str, advice: str) -> None:

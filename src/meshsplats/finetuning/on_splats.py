@@ -30,7 +30,7 @@ from meshsplats.finetuning.baseline import (
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import starting_mesh
 from meshsplats.finetuning.journal import Journal
-from meshsplats.finetuning.memory import available_memory
+from meshsplats.finetuning.memory import available_memory, check_order_memory
 from meshsplats.finetuning.ordered import finetune_ordered
 from meshsplats.finetuning.pace import (
     BRIEF_RATES,
@@ -120,6 +120,7 @@ def tuned_as_configured(
         return Tuned(finetune(mesh, dataset, config, run=run, on_progress=show))
     show.phase("ordering triangles")
     check_for_file_order(mesh, config)
+    check_order_memory(mesh)
     order = drawing_order(mesh, [view.camera for view in dataset.train], threads=run.threads)
     return Tuned(*finetune_ordered(mesh, order, dataset, config, run=run, on_progress=show))
 
@@ -155,6 +156,7 @@ class SplatTuning:
             setup.phase("ordering triangles")
             conversion = conversion.plain  # as files have it
             check_for_file_order(conversion, self.config)
+            check_order_memory(conversion)
             # Views from all sides, too: around an object in its surroundings, none trains from below.
             around = subsample(default_views(conversion), VIEWS // 2)
             views = [*subsample(cameras, VIEWS // 2), *around]

@@ -27,8 +27,12 @@ SIDE = 200
 """Largest side of their images, pixels."""
 SWEEPS = 6
 """How often every piece may move."""
-MAX_PAIRS = 24_000_000
+MAX_PAIRS = 22_000_000
 """Pairs of pieces that are kept at most, the heaviest ones: about 1.5 GB at work."""
+PAIR_BYTES = 68
+"""Memory at work for each of them."""
+PAIRS_EACH = 300
+"""Pairs of a splat: 150 in a still life, 600 in fog."""
 NODES = 8
 """Parts of a mesh by default."""
 MAX_NODES = 256
@@ -167,6 +171,11 @@ def drawing_order(
     best = ordered(NODES)
     least = score(best) - NODE_LOSS
     return next((order for order in map(ordered, FEW_NODES) if score(order) >= least), best)
+
+
+def ordering_bytes(mesh: SplatMesh) -> int:
+    """Memory that ``drawing_order(mesh)`` takes beside the mesh, estimated."""
+    return min(PAIRS_EACH * len(mesh.splats), MAX_PAIRS) * PAIR_BYTES
 
 
 def _order(
