@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._common.arrays import spread_indices
 from meshsplats._common.geometry import level_axes
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.datasets.views import View
@@ -17,9 +16,10 @@ from meshsplats.scene.camera import Camera
 from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training.growth import SHELL, corners_of
 from meshsplats.training.initial import ranges_of_cameras
+from meshsplats.training.references import references
 
 COUNTED = 64
-"""Views, at most and evenly spread, that are counted."""
+"""Views, at most, that are counted: ``references`` of the fans."""
 COUNT_SIDE = 160
 """Longer side of their images, in pixels."""
 HIDDEN = 0.05
@@ -76,8 +76,8 @@ def counts_of_fans(mesh: SplatMesh, views: Sequence[View], threads: int | None =
     """(n,) int64: how many of up to ``COUNTED`` of ``views`` show the centre of each fan."""
     centers = mesh.vertices[:: corners_of(mesh)]
     counts = np.zeros(len(centers), np.int64)
-    for index in spread_indices(len(views), COUNTED):
-        camera = views[index].camera.within(COUNT_SIDE)
+    cameras = [view.camera.within(COUNT_SIDE) for view in views]
+    for camera in (cameras[i] for i in references(cameras, centers, COUNTED)):
         depths = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=0.5)
         shown, x, y, depth = camera.pixels_of(centers)
         counts[shown] += depth <= (1 + HIDDEN) * depths[y, x]

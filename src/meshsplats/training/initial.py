@@ -22,6 +22,7 @@ from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
 from meshsplats.training.hull import carve, in_silhouettes
 from meshsplats.training.patches import Patches, flat_splats, fused
+from meshsplats.training.references import references
 from meshsplats.training.stereo import REFERENCES, SIDE, find_depths
 
 COLOR_VIEWS = 40
@@ -205,8 +206,8 @@ def pixel_sizes(views: Sequence[View], points: np.ndarray) -> np.ndarray:
     """(n,) least size of a pixel at ``points`` (n, 3) in the images of ``views`` for matching, scene
     units; the median where no view sees a point."""
     least = np.full(len(points), np.inf)
-    for view in subsample(views, REFERENCES):
-        camera = view.camera.within(SIDE)
+    cameras = [view.camera.within(SIDE) for view in views]
+    for camera in (cameras[i] for i in references(cameras, points, REFERENCES)):
         positions, depth = camera.project(points)
         size = np.where(camera.in_image(positions), depth / camera.fx, np.inf)
         np.minimum(least, size, out=least)

@@ -27,11 +27,12 @@ from meshsplats.datasets.reduced import reduced_image
 from meshsplats.datasets.views import View
 from meshsplats.rendering.core_arguments import camera_struct
 from meshsplats.scene.camera import Camera
+from meshsplats.training.references import references
 
 SIDE = 400
 """Longer side of the images that are matched, in pixels."""
 REFERENCES = 64
-"""Maximum number of views, evenly spread, whose depths are found. They are matched with any others."""
+"""Maximum number of views whose depths are found (``references``). They are matched with any others."""
 PLANES = 128
 """Depths that are tried at half the size, evenly spaced in inverse depth."""
 ROUNDS = 1
@@ -135,10 +136,10 @@ def find_depths(
 
     Args:
         near, far: (views,) least and greatest depth that is tried in each view.
-        points: (n, 3) where the scene is, roughly, for the angles between views.
+        points: (n, 3) where the scene is, roughly, for the angles between views, and for which views.
     """
     cameras = [view.camera.within(SIDE) for view in views]
-    chosen = subsample(range(len(views)), REFERENCES)
+    chosen = references(cameras, points, REFERENCES)
     suited = suited_views(cameras, points, chosen)
     sources = [_spread(cameras, i, *found) for i, found in zip(chosen, suited, strict=True)]
     place = {view: i for i, view in enumerate(chosen)}
