@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import meshsplats as ms
-from meshsplats.conversion.merging import simplify
+from meshsplats.conversion.merging import MERGED_OPAQUE, simplify
 from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.scene.camera import Camera
 
@@ -123,6 +123,13 @@ def test_merging_again_makes_no_solid_surface_of_others(opacity):
         chained, direct = simplify(chained, len(cloud) // share), simplify(cloud, len(cloud) // share)
         areas = [np.prod(np.sort(c.scales, axis=1)[:, 1:], axis=1).sum() for c in (chained, direct)]
         assert areas[0] == pytest.approx(areas[1], rel=0.3)
+
+
+def test_a_file_tells_merged_splats_from_opaque_ones(tmp_path):
+    merged = simplify(sheet(1), 100)
+    assert (merged.opacities == MERGED_OPAQUE).mean() > 0.5
+    ms.save_gaussians(merged, tmp_path / "merged.ply")
+    np.testing.assert_array_equal(ms.load_gaussians(tmp_path / "merged.ply").opacities, merged.opacities)
 
 
 def test_faint_splats_keep_covariance_and_mass():

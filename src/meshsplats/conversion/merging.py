@@ -22,7 +22,8 @@ from meshsplats._common.arrays import subsample
 from meshsplats._common.geometry import quaternions_of
 from meshsplats._common.kinds import need, need_all
 from meshsplats._core.library import check_threads, processors
-from meshsplats.conversion.footprint import usual_pixels, widen
+from meshsplats.conversion.chunks import chunks
+from meshsplats.conversion.footprint import CameraCoverage, usual_pixels, widen
 from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of
 from meshsplats.conversion.merging_weights import pixels_of
@@ -36,6 +37,9 @@ BLOCK = 1 << 16
 LARGE = 1_000_000
 """Splats from which on they are merged in blocks for cameras: 12 million took 7.5 GB together."""
 
+CHUNK = 1 << 14
+"""Splats whose masses are computed together: so many stay in the cache."""
+
 DENSE = 0.9
 """Integrated optical depth of a merged splat, over that of its two standard deviations, from which its parts
 may cover more than it does: their opacities add up to less than this."""
@@ -43,9 +47,9 @@ may cover more than it does: their opacities add up to less than this."""
 SOLID, SOLID_SHARE = 0.98, 0.95
 """Splats of at least the first opacity that have at least the second share of all mass are a surface sampled
 by opaque splats..."""
-MERGED_OPAQUE = np.nextafter(np.float32(1), np.float32(0))
-"""...unless they have this one, which merged ones get that are so opaque: no cloud becomes such a surface by
-merging. Such surfaces..."""
+MERGED_OPAQUE = np.float32(1 - 2**-20)
+"""...unless they have this one, which merged ones get that are so opaque, and keep as logits in files: no
+cloud becomes such a surface by merging. Such surfaces..."""
 SOLID_COVER = 1.4
 """...cover this multiple of their area when they are merged: through gaps between merged ones shows what is
 behind all."""
@@ -100,11 +104,12 @@ def simplify(
     check_threads(threads)
     if count >= len(cloud):
         return cloud
+    coverage = CameraCoverage(cloud.means, cameras) if cameras else None
     if low_pass is None:
-        low_pass = _usual_low_pass(cloud, cameras)
+        low_pass = _usual_low_pass(cloud, cameras, coverage)
     width = _checked_width(low_pass, len(cloud))
     masses = _masses(cloud, width)
-    counted = pixels_of(cloud, masses, cameras, threads) if cameras else masses
+    counted = pixels_of(cloud, masses, coverage, threads) if coverage else masses
     return _merge(cloud, count, width, masses, counted, threads).cloud
 
 
@@ -134,9 +139,10 @@ def simplify_in_blocks(
     """
     if len(cloud) <= block or count >= len(cloud):
         return simplify(cloud, count, cameras=cameras, threads=threads)
-    low_pass = _usual_low_pass(cloud, cameras)
+    coverage = CameraCoverage(cloud.means, cameras) if cameras else None
+    low_pass = _usual_low_pass(cloud, cameras, coverage)
     masses = _masses(cloud, low_pass)
-    counted = pixels_of(cloud, masses, cameras, threads) if cameras else masses
+    counted = pixels_of(cloud, masses, coverage, threads) if coverage else masses
     blocks = _blocks(cloud.means, np.arange(len(cloud)), block)
     visible = np.array([(cloud.opacities[rows] >= LEAST_OPACITY).sum() for rows in blocks])
     wanted = np.array([counted[rows].sum() for rows in blocks]) if cameras else visible
@@ -223,8 +229,12 @@ def _checked_width(low_pass: float | np.ndarray, n: int) -> np.ndarray:
 
 def _masses(cloud: GaussianCloud, low_pass: np.ndarray) -> np.ndarray:
     """(n,) float64 masses of splats, 0 for those that are never drawn."""
-    area = mean_shadow(disc_areas(_drawn(cloud.scales, low_pass, cloud.kernel)))
-    return np.where(cloud.opacities < LEAST_OPACITY, 0, optical_depth(cloud.opacities) * area)
+    masses = np.empty(len(cloud))
+    for part in chunks(len(cloud), CHUNK):
+        opacities = cloud.opacities[part]
+        area = mean_shadow(disc_areas(_drawn(cloud.scales[part], low_pass[part], cloud.kernel)))
+        masses[part] = np.where(opacities < LEAST_OPACITY, 0, optical_depth(opacities) * area)
+    return masses
 
 
 def optical_depth(opacity: np.ndarray) -> np.ndarray:
@@ -259,8 +269,10 @@ def low_pass_of(kernel: Kernel, pixels: np.ndarray) -> np.ndarray:
     return np.sqrt(LOW_PASS_PX2[kernel]) * pixels.astype(np.float64)
 
 
-def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
-    return low_pass_of(cloud.kernel, usual_pixels(cloud, cameras))
+def _usual_low_pass(
+    cloud: GaussianCloud, cameras: Sequence[Camera] | None, coverage: CameraCoverage | None = None
+) -> np.ndarray:
+    return low_pass_of(cloud.kernel, usual_pixels(cloud, cameras, coverage))
 
 
 def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:
