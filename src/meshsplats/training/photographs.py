@@ -140,7 +140,7 @@ class PhotographOptions:
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 
         def optimise(run: RunOptions, show: Display) -> Trained:
-            mesh = train(dataset, config, points=points, run=run, on_progress=show)
+            mesh = train(dataset, config, points=points, run=run, on_progress=show, on_phase=show.phase)
             counts: dict[str, int] = {"fans": mesh.splat_count or 0, "triangles": len(mesh.faces)}
             made = f"{counts['triangles']:,} triangles of {counts['fans']:,} fans"
             return Trained(mesh, mesh, counts, made)

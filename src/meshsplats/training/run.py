@@ -59,6 +59,7 @@ def train(
     points: ScenePoints | None = None,
     run: RunOptions | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    on_phase: Callable[[str], None] | None = None,
     **changes: Any,
 ) -> SplatMesh:
     """Makes a mesh from the training views of ``dataset`` alone.
@@ -77,6 +78,7 @@ def train(
             ``load_points(path, origin=dataset.origin)``.
         run: output folder, resumption from a checkpoint, logging and resources.
         on_progress: called after every step.
+        on_phase: called before the first step, with each thing that begins, in words.
         changes: fields of ``TrainConfig`` in place of those of ``config``.
 
     Returns:
@@ -100,7 +102,7 @@ def train(
     need(TrainConfig, config=config, optional=True)
     need(ScenePoints, points=points, optional=True)
     need(RunOptions, run=run, optional=True)
-    began = time.perf_counter()
+    began, say = time.perf_counter(), on_phase or (lambda text: None)
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
@@ -122,10 +124,13 @@ def train(
                     DataWarning,
                     stacklevel=2,
                 )
+            say("matching photographs")
             mesh = starting_fans(dataset, config, points, run.threads)
+            say("looking for blurred photographs")
             for message in find_suspects(dataset.views).messages():
                 warnings.warn(message, DataWarning, stacklevel=2)
         if config.exposure is None:
+            say("comparing exposures")
             config = replace(config, exposure=exposures_differ(mesh, dataset.train, run.threads))
             if config.exposure:
                 warnings.warn(
@@ -136,6 +141,7 @@ def train(
                 )
         picture = None
         if journal is not None and not run.resume:
+            say("counting the photographs of each place")
             picture = coverage_picture(mesh, dataset.train, run.threads)
         before, run = run.spent, replace(run, spent=run.spent + time.perf_counter() - began)
         if not run.resume and config.minutes is not None and run.spent > LATE * 60 * config.minutes:
