@@ -350,6 +350,13 @@ def test_what_only_other_views_show_is_not_dropped(ball, state):
     assert kept[pixels > 1].all()
     assert not kept[pixels < 0.01].any()
     assert min(np.count_nonzero(pixels > 1), np.count_nonzero(pixels < 0.01)) > 20
+    # At the next event it is what later steps have shown that counts: here none.
+    again = grow(state, hidden._replace(most_pixels=np.ones(n)), 0)
+    n = fan_count(again.mesh)
+    shell = np.repeat((np.arange(n) < 5).astype(np.float32), 7)
+    again.mesh = replace(again.mesh, attributes=again.mesh.attributes | {"shell": shell})
+    later = Scores(np.ones(n), np.zeros(n), np.zeros(n), np.ones(n, bool), 64 * 64)
+    assert fan_count(grow(again, later, 0).mesh) == 5
 
 
 def test_a_sign_before_a_street_is_in_no_near_field():

@@ -386,12 +386,11 @@ class State:
         self._change()
         round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
-    def shares(self) -> np.ndarray:
-        """(v,) float32: about what share of an image each vertex had in the steps so far (a root of squares),
-        by the gradients of its colour: those of a pixel times its pixels."""
+    def squares(self) -> np.ndarray:
+        """(v,) float32: about the sum over the steps so far of the squared gradient of a vertex's colour."""
         self._fetch()
-        squares = self._colors.square[:, :3].max(axis=1) / (1 - self._colors.betas[1])
-        return np.sqrt(squares) * np.float32(3 / max(1 - self.config.ssim_weight, 0.01))
+        found: np.ndarray = self._colors.square[:, :3].max(axis=1) / np.float32(1 - self._colors.betas[1])
+        return found
 
     def prune(self, keep: np.ndarray) -> State:
         """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""

@@ -24,8 +24,10 @@ SHELL = "shell"
 MIN_PIXELS = 0.02
 """A fan that adds fewer pixels than this to each judged view is dropped, if it is in the image of one..."""
 TRAINED_PIXELS = 0.2
-"""...and if all steps so far saw fewer of it than this (``State.shares``): judged views look at the backs of
+"""...and if the steps since the last event have seen fewer of it than this: judged views look at the backs of
 walls that others show."""
+SEEN = "seen"
+"""Attribute of a mesh in training: ``State.squares`` at the last event."""
 CLEAR = 0.5
 """A fan with a greater share of its pixels where photographs are transparent is dropped."""
 MIN_OPACITY = 0.02
@@ -116,8 +118,7 @@ def grow(state: State, found: Scores, target: int) -> State:
     ``target``. A halved fan is never dropped: there may be fewer."""
     corners, n = corners_of(state.mesh), fan_count(state.mesh)
     opacity = state.colors[:, 3].reshape(n, corners).max(axis=1)
-    trained = state.shares().reshape(n, corners).sum(axis=1) * found.image_pixels >= TRAINED_PIXELS
-    hidden = (found.most_pixels < MIN_PIXELS) & ~trained
+    hidden = (found.most_pixels < MIN_PIXELS) & (trained_pixels(state, found) < TRAINED_PIXELS)
     useless = hidden | (opacity < MIN_OPACITY) | (found.clear_share > CLEAR)
     keep = ~(found.in_view & useless)
     if SHELL in state.mesh.attributes:  # others see what is behind everything
@@ -128,7 +129,20 @@ def grow(state: State, found: Scores, target: int) -> State:
     able = kept[(found.most_pixels[kept] >= SMALLEST) & (found.error[kept] > 0)]
     wanted = min(max(target - len(kept), 0), len(able))
     halved = np.sort(able[np.argsort(-found.error[able], kind="stable")][:wanted])
-    return select_fans(state, kept, halved)
+    grown = select_fans(state, kept, halved)
+    grown.mesh = replace(grown.mesh, attributes={**grown.mesh.attributes, SEEN: grown.squares()})
+    return grown
+
+
+def trained_pixels(state: State, found: Scores) -> np.ndarray:
+    """(n,) about how many pixels the steps since the last event have seen of each fan, a root of squares: by
+    the gradients of its colours, which are those of a pixel times its pixels."""
+    squares, before = state.squares(), state.mesh.attributes.get(SEEN)
+    if before is not None:
+        squares = np.maximum(squares - before, 0)
+    of_pixel = max(1 - state.config.ssim_weight, 0.01) / (3 * found.image_pixels)
+    found_pixels: np.ndarray = np.sqrt(squares).reshape(fan_count(state.mesh), -1).sum(axis=1) / of_pixel
+    return found_pixels
 
 
 class NearFields(NamedTuple):
