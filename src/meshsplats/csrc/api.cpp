@@ -17,6 +17,7 @@
 #include "fusion.h"
 #include "listing.h"
 #include "merging.h"
+#include "nearest.h"
 #include "ordering.h"
 #include "resampling.h"
 #include "texture.h"
