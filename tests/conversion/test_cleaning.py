@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -149,9 +150,10 @@ def test_parts_by_hand():
     line = np.array([[x, 0.0, 0.0] for x in (0.5, 1.5, 2.9, 5.1, 6.0, 9.5)])
     np.testing.assert_array_equal(Cells(line, 1.0).parts(), [0, 0, 0, 1, 1, 2])
     np.testing.assert_array_equal(Cells(line, 1.0).near(), [2, 3, 2, 2, 2, 1])
-    # Points of one group are connected, however far apart.
-    group = np.array([0, 1, 2, 2, 3, 4])
-    np.testing.assert_array_equal(Cells(line, 1.0).parts(group), [0, 0, 0, 0, 0, 1])
+    # A point and its ends are connected, however far apart.
+    ends = np.zeros((6, 1, 3))
+    ends[2, 0, 0] = 2.2
+    np.testing.assert_array_equal(Cells(line, 1.0, ends).parts(), [0, 0, 0, 0, 0, 1])
 
 
 @settings(max_examples=30, deadline=None)
@@ -262,3 +264,25 @@ def test_mistakes(file, tmp_path, capsys, monkeypatch, options, code, words):
     assert main(["clean", "scene.ply", *options]) == code
     assert words in " ".join(capsys.readouterr().err.split())
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_memory_is_a_third_of_a_kilobyte_a_splat():
+    rng = np.random.default_rng(4)
+    count = 100_000
+    cloud = splats(rng.random((count, 3)), rng.uniform(0.001, 0.02, count))
+    tracemalloc.start()
+    find(cloud)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 400 * count
+
+
+def test_coarser_cells_are_those_of_twice_the_side():
+    points = np.random.default_rng(5).normal(size=(500, 3))
+    far = np.concatenate([points, [[1e9, 0, 0], [1e9, 1, 0]]])
+    for some in (points, far):
+        cells = Cells(some, 0.05)
+        for doublings in (0, 1, 3, 6):
+            coarse = Cells(some, 0.05 * 2**doublings)
+            np.testing.assert_array_equal(cells.coarser(doublings).near(), coarse.near())
+            np.testing.assert_array_equal(cells.coarser(doublings).parts(), coarse.parts())

@@ -14,6 +14,7 @@ from meshsplats._common.cells import Cells
 from meshsplats._common.geometry import spacing
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
@@ -27,6 +28,8 @@ CELL = 2.5
 """Side of the cells for counting neighbours and connecting parts, in spacings of the splats."""
 REACH = 1.5
 """Standard deviations at which a splat ends where its neighbours are counted."""
+CHUNK = 1 << 14
+"""Splats whose lengths are computed together."""
 
 
 _WORDS = {
@@ -114,7 +117,9 @@ def find(
         gone["min_opacity"] = opacities < rules.min_opacity
     if any(name not in ("crop", "min_opacity") for name in given):
         bounds = scene_bounds(scene)
-        lengths = np.linalg.norm(reach, axis=2).max(axis=1)
+        lengths = np.empty(len(centers))
+        for part in chunks(len(centers), CHUNK):
+            lengths[part] = np.linalg.norm(reach[part].astype(np.float64), axis=2).max(axis=1)
     if rules.max_distance is not None:
         away = np.linalg.norm(centers - bounds.center, axis=1)
         gone["max_distance"] = away > rules.max_distance * bounds.radius
@@ -127,11 +132,9 @@ def find(
             near = _neighbours(centers, lengths, cell)
             gone["sparse"] = near < rules.sparse * float(np.median(near))
         if rules.min_part is not None:
-            points = centers[:, None] + np.concatenate([0 * reach[:, :1], reach / 2, reach], axis=1)
-            per = points.shape[1]
-            part = Cells(points.reshape(-1, 3), cell).parts(np.repeat(np.arange(len(centers)), per))[::per]
-            held = np.bincount(part, opacities)
-            gone["min_part"] = (held < rules.min_part * held.sum())[part]
+            of_part = Cells(centers, cell, reach).parts()
+            held = np.bincount(of_part, opacities)
+            gone["min_part"] = (held < rules.min_part * held.sum())[of_part]
     found = Findings(gone, opacities, owner)
     for name, count in found.counts().items():
         if most is not None and name in gone and count["opacity"] > most:
@@ -172,21 +175,22 @@ def _neighbours(centers: np.ndarray, size: np.ndarray, cell: float) -> np.ndarra
     """
     level = np.clip(np.ceil(np.log2(np.maximum(size / cell, 1))), 0, 8).astype(int)
     near = np.empty(len(centers), np.int64)
-    for step in np.unique(level):
-        at = level == step
-        near[at] = Cells(centers, cell * 2.0 ** (step + 1)).near()[at]
+    cells = Cells(centers, 2 * cell)
+    for doublings in np.unique(level).tolist():
+        at = level == doublings
+        near[at] = cells.coarser(doublings).near()[at]
     return near
 
 
 def _splats(
     scene: GaussianCloud | SplatMesh,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """(n, 3) float64 centres, (n, 4, 3) float64 offsets to the ends of each splat, (n,) opacities, and for a
+    """(n, 3) float64 centres, (n, 4, 3) float offsets to the ends of each splat, (n,) opacities, and for a
     mesh the (f,) index of each triangle's splat."""
     if isinstance(scene, GaussianCloud):
         order = np.argsort(scene.scales, axis=1)[:, 1:]
         sigma = np.take_along_axis(scene.scales, order, axis=1)
-        half = REACH * semi_axes(scene.quaternions, order, sigma).transpose(2, 0, 1).astype(np.float64)
+        half = REACH * semi_axes(scene.quaternions, order, sigma).transpose(2, 0, 1)
         return scene.means.astype(np.float64), np.concatenate([half, -half], axis=1), scene.opacities, None
     if not len(scene.faces):
         raise ValueError("the mesh has no triangles: there is nothing to clean")
