@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from _datasets import simple_colmap
 from _photographs import write_photographs
-from PIL import Image
+from _profiles import profile
+from PIL import Image, ImageCms
 
 from meshsplats._common import toml
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
+from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.silhouettes import outline_brightness
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
@@ -183,6 +185,28 @@ def test_model_folders_name_their_background(tmp_path):
         assert model_background(splats) == color
     (model / "cfg_args").write_bytes(b"\xff\x00white_background=True")
     assert model_background(model) == COLORS["white"]
+
+
+@pytest.mark.parametrize("ignored", [True, False])
+def test_splats_of_a_training_that_ignored_colour_profiles_are_named(cloud, tmp_path, ignored):
+    """As for iPhone photographs in Display P3."""
+    cameras = orbit(cloud, 4, width=32, height=32)
+    images = [render_splats(cloud, c, background=(0, 0, 0)).color for c in cameras]
+    folder = write_photographs(tmp_path / "photos", cameras, images)
+    kept = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes() if not ignored else profile()
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            image.load()
+            image.save(path, icc_profile=kept)
+    dataset = load_dataset(folder)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        find_background(dataset, {"splats": cloud}, named=(0, 0, 0))
+    told = [str(warning.message) for warning in found if "profile" in str(warning.message)]
+    assert len(told) == ignored
+    if ignored:
+        assert "converted from another colour profile to sRGB" in told[0]
+        assert "its scores are too low" in told[0]
 
 
 # ---- Commands

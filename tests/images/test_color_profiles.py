@@ -2,39 +2,16 @@
 
 from __future__ import annotations
 
-import struct
 import warnings
 
 import numpy as np
 import pytest
+from _profiles import profile
 from PIL import Image, ImageCms
 
 from meshsplats.errors import DataWarning
 from meshsplats.images import reading
-from meshsplats.images.reading import load_image
-
-ADOBE_RGB = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
-"""XYZ (D50) of its primaries."""
-
-
-def tag(kind: bytes, *values: float) -> bytes:
-    numbers = [round(value * 65536) for value in values]
-    return kind + bytes(4) + struct.pack(f">{len(values)}i", *numbers)
-
-
-def profile(primaries=ADOBE_RGB, gamma=2.19921875) -> bytes:
-    """An ICC profile of three primaries and a gamma."""
-    curve = b"curv" + bytes(4) + struct.pack(">IHH", 1, round(gamma * 256), 0)
-    tags = {b"wtpt": tag(b"XYZ ", 0.9642, 1.0, 0.8249)}
-    for name, primary in zip((b"r", b"g", b"b"), primaries, strict=True):
-        tags |= {name + b"XYZ": tag(b"XYZ ", *primary), name + b"TRC": curve}
-    start, table, data = 132 + 12 * len(tags), struct.pack(">I", len(tags)), b""
-    for name, content in tags.items():
-        table += name + struct.pack(">II", start + len(data), len(content))
-        data += content
-    head = struct.pack(">I4sI4s4s4s", start + len(data), bytes(4), 0x02400000, b"mntr", b"RGB ", b"XYZ ")
-    head += bytes(12) + b"acsp" + bytes(28) + tag(b"", 0.9642, 1.0, 0.8249)[4:] + bytes(48)
-    return head[:128] + table + data
+from meshsplats.images.reading import converted_profile, load_image
 
 
 def colored(path, color, mode="RGB", **options):
@@ -80,3 +57,12 @@ def test_profiles_that_are_too_large_are_ignored(tmp_path, monkeypatch):
 def test_grey_photographs_with_a_profile_of_colours(tmp_path):
     path = colored(tmp_path / "a.png", 100, "L", icc_profile=profile())
     assert load_image(path, to_srgb=True)[0, 0].tolist() == pytest.approx([99, 99, 99], abs=3)
+
+
+def test_profiles_that_change_colours_have_a_name(tmp_path):
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    cases = {"other": profile(), "srgb": srgb, "broken": b"no profile"}
+    paths = {name: colored(tmp_path / f"{name}.png", (9, 9, 9), icc_profile=p) for name, p in cases.items()}
+    assert converted_profile(paths["other"]) == "another colour profile"  # it has no name
+    assert converted_profile(paths["srgb"]) == converted_profile(paths["broken"]) == ""
+    assert converted_profile(colored(tmp_path / "plain.png", (9, 9, 9))) == ""

@@ -36,6 +36,8 @@ class PhotoFile:
     """``Header.turn`` of the photograph."""
     mask_turn: int = 0
     """Quarter turns counter-clockwise after which the mask lies on the photograph as it is stored."""
+    as_stored: bool = False
+    """Whether its colour profile is ignored, as most programs that train splats do."""
 
     def load(self) -> ViewImage:
         image = self.store.find(self)
@@ -50,7 +52,7 @@ class PhotoFile:
         return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
 
     def _read(self) -> ViewImage:
-        pixels = load_image(self.path, to_srgb=True)
+        pixels = load_image(self.path, to_srgb=not self.as_stored)
         color = pixels[..., :3]
         share = pixels[..., 3].astype(np.float32) / 255 if pixels.shape[2] == 4 else None
         light = None if self.mask is None else light_of_mask(self.mask, self.mask_turn)

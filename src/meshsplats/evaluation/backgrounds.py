@@ -6,7 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,9 +14,11 @@ import numpy as np
 
 from meshsplats._common.arrays import subsample
 from meshsplats._common.kinds import described, need, require
-from meshsplats.datasets.views import WHITE, Dataset, View
+from meshsplats.datasets.photo_file import PhotoFile
+from meshsplats.datasets.views import WHITE, Dataset, ImageCache, View
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.images.reading import converted_profile
 from meshsplats.scene.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
@@ -173,7 +175,37 @@ def find_background(
                 DataWarning,
                 stacklevel=2,
             )
+    splats = {name: scene for name, scene in scenes.items() if isinstance(scene, GaussianCloud)}
+    if splats:
+        _warn_of_profiles(splats, views, found, threads)
     return found
+
+
+def _warn_of_profiles(
+    splats: Mapping[str, GaussianCloud], views: Sequence[View], found: Background, threads: int | None
+) -> None:
+    """Issues a DataWarning for ``splats`` that fit the photographs of ``views`` better as these are stored,
+    without their colour profile: most programs that train splats ignore it."""
+    files = [view.source for view in views if isinstance(view.source, PhotoFile)]
+    profile = next(filter(None, (converted_profile(file.path) for file in files)), "")
+    if not profile or len(files) < len(views):
+        return
+    stored = [
+        replace(view, source=replace(file, as_stored=True, store=ImageCache(0)))
+        for view, file in zip(views, files, strict=True)
+    ]
+    for name, cloud in splats.items():
+        before = found.psnr[name][found.name]
+        raw = _scores(cloud, stored, {found.name: found.color}, threads)[0][found.name]
+        if raw > before + WARNING_GAIN:
+            warnings.warn(
+                f"the colours of the photographs are converted from {profile} to sRGB: over these the {name}"
+                f" scores {before:.2f} dB on some of them, over the colours as they are stored {raw:.2f}. It"
+                " seems to have been trained without regard to the profile, and its scores are too low: give"
+                " photographs without it, or splats that were trained on photographs in sRGB",
+                DataWarning,
+                stacklevel=3,
+            )
 
 
 def warn_of_other_worlds(found: Background) -> None:

@@ -127,6 +127,27 @@ def _in_srgb(image: Any, plain: Any, path: str | os.PathLike[str]) -> Any:
     return colors
 
 
+def converted_profile(path: Path) -> str:
+    """The name of the colour profile that ``to_srgb`` of ``load_image`` converts from; empty if it changes
+    nothing."""
+    with _opened(path) as image:
+        profile = image.info.get("icc_profile")
+    if not profile:
+        return ""
+    try:
+        if _srgb_transform(profile)[1] is None:
+            return ""
+    except (OSError, ValueError, TypeError, ImportError, MemoryError):
+        return ""  # it is ignored, with a warning
+    from PIL import ImageCms
+
+    try:
+        name = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile)))
+    except ImageCms.PyCMSError:
+        name = ""
+    return name.strip()[:60] or "another colour profile"
+
+
 @lru_cache(maxsize=16)
 def _srgb_transform(profile: bytes) -> tuple[str, Any]:
     """The mode of images that an ICC ``profile`` is for, and Pillow's transform of them to sRGB; None if it
