@@ -18,6 +18,7 @@ from meshsplats._core.structures import MergingStruct
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.conversion import ConversionOptions, merging, merging_groups, merging_weights
 from meshsplats.conversion.budget import within_limits
+from meshsplats.conversion.footprint import CameraCoverage
 from meshsplats.conversion.merging import (
     FEWEST_OF_BLOCK,
     MERGED_OPAQUE,
@@ -515,6 +516,14 @@ def test_blocks_are_joined_to_merge_to_few_splats_around_the_same_centre():
     assert np.allclose(found, mean, atol=0.15)
 
 
+def test_masses_are_the_same_in_chunks():
+    cloud = random_cloud(250)
+    width = np.linspace(0, 0.1, 250)
+    whole = merging._masses(cloud, width)
+    with patch.object(merging, "CHUNK", 100):
+        np.testing.assert_array_equal(merging._masses(cloud, width), whole)
+
+
 def test_a_cloud_of_one_block_is_simplified_as_a_whole():
     cloud = random_cloud(300)
     for block in (300, 1000):
@@ -578,7 +587,7 @@ class TestCameras:
         )
         cloud = GaussianCloud.joined([pairs, wall])
         camera = look_at([0, 0, 0], [0, 0, 1], width=128, height=128, fov=50)
-        counted = pixels_of(cloud, masses(cloud), [camera])
+        counted = pixels_of(cloud, masses(cloud), CameraCoverage(cloud.means, [camera]))
         own, count, thin = masses(cloud), len(cloud) - 6, np.zeros(len(cloud))
         blind, seen = (merging._merge(cloud, count, thin, own, c, None).group for c in (own, counted))
         together = [[i for i in range(0, 24, 2) if group[i] == group[i + 1]] for group in (blind, seen)]
@@ -607,7 +616,7 @@ class TestCameras:
         camera = look_at([0, 0, 0], [0, 0, 1], width=200, height=200, fov=90)
         mass = np.array([1.0, 2, 3, 4])
         with patch.object(merging_weights, "AROUND", 0):
-            pixels = pixels_of(cloud, mass, [camera])
+            pixels = pixels_of(cloud, mass, CameraCoverage(cloud.means, [camera]))
         focal, distance = 100.0, np.array([4.0, 4, 20, 16])
         elsewhere = ELSEWHERE * focal**2 / distance * mass
         np.testing.assert_allclose(pixels[1:3], elsewhere[1:3], rtol=1e-5)
@@ -617,9 +626,16 @@ class TestCameras:
         assert 0.3 < shown / (np.pi * (focal * 0.6 / 2) ** 2) < 2
         # Of too many splats no images are rendered.
         with patch.object(merging_weights, "MOST", 3):
-            many = pixels_of(cloud, mass, [camera])
+            many = pixels_of(cloud, mass, CameraCoverage(cloud.means, [camera]))
         covered = np.where([True, False, False, True], focal**2 / distance, 0) * mass
         np.testing.assert_allclose(many, elsewhere + covered, rtol=1e-5)
+
+    def test_each_camera_looks_at_the_splats_once(self):
+        cloud = random_cloud(300)
+        camera = look_at([0, 0, -9], [0, 0, 0], width=100, height=100, fov=60, near=0.1)
+        with patch.object(CameraCoverage, "_each", autospec=True, side_effect=CameraCoverage._each) as each:
+            simplify(cloud, 100, cameras=[camera])
+        assert each.call_count == 1
 
     @pytest.mark.parametrize("simplified", [simplify, simplify_in_blocks])
     def test_a_room_from_within(self, simplified):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -111,14 +112,15 @@ class CameraCoverage:
         Concretely, d / f with (f / d)^2 averaged over the cameras that see the splat: close views, in which
         it covers more pixels, count for more.
         """
-        count, total = self._sums()
+        count, total = self._sums
         return np.sqrt(np.divide(count, total, out=np.zeros_like(total), where=count > 0))
 
     def densities(self) -> np.ndarray:
         """(n,) float32 pixels that a unit of area at each splat covers, on average over all cameras: 0 in
         those that do not see it."""
-        return self._sums()[1] / np.float32(len(self.cameras))
+        return self._sums[1] / np.float32(len(self.cameras))
 
+    @cached_property
     def _sums(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) float32 number of cameras that see each splat, and the sum of their weights."""
         count, total = np.zeros((2, len(self.means)), np.float32)
@@ -251,15 +253,15 @@ class SceneViews:
         """Whether splats may be outside all images."""
         return self._options.footprint in ("framing", "cameras")
 
-    def pixel_sizes(self, means: np.ndarray) -> np.ndarray | None:
+    def pixel_sizes(self, means: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray | None:
         """(n,) float32 size of a pixel at each of ``means`` (n, 3) in scene units; None for 'none' and
-        'filter'."""
+        'filter'. ``seen``: those of ``seen(means)``, where they are known."""
         if self.is_none:
             return None
         if not self.has_unseen:
             pixel = self._options.viewing_distance / self._options.focal  # type: ignore[operator]
             return np.full(len(means), pixel, np.float32)
-        sizes = self.seen(means)
+        sizes = self.seen(means) if seen is None else seen
         unseen = self._median(sizes) if self.unseen is None else self.unseen
         sizes = np.where(sizes > 0, sizes, unseen)
         return np.minimum(sizes, self._largest, out=sizes)
@@ -290,12 +292,16 @@ class SceneViews:
         return np.float32(np.median(seen))
 
 
-def usual_pixels(cloud: GaussianCloud, cameras: Sequence[Camera] | None = None) -> np.ndarray:
-    """(n,) float32 size of a pixel at each splat of ``cloud`` in scene units: in images of ``cameras``, else
-    in those of 'framing'."""
+def usual_pixels(
+    cloud: GaussianCloud, cameras: Sequence[Camera] | None = None, coverage: CameraCoverage | None = None
+) -> np.ndarray:
+    """(n,) float32 size of a pixel at each splat of ``cloud`` in scene units: in images of ``cameras``, whose
+    ``coverage`` may be there already, else in those of 'framing'."""
     source = ConversionOptions(footprint="cameras" if cameras else "framing")
     views = SceneViews(SceneSample.of(cloud), source, cameras, guess_up(cloud, cameras), whole=True)
-    pixel = views.pixel_sizes(cloud.means)
+    # Near planes that cameras do not have are those in front of a sample here, of the whole scene there.
+    same = coverage is not None and all(camera.near is not None for camera in coverage.cameras)
+    pixel = views.pixel_sizes(cloud.means, coverage.pixel_sizes() if coverage and same else None)
     assert pixel is not None
     return pixel
 

@@ -49,14 +49,14 @@ SIDE = 400
 
 
 def pixels_of(
-    cloud: GaussianCloud, masses: np.ndarray, cameras: Sequence[Camera], threads: int | None = None
+    cloud: GaussianCloud, masses: np.ndarray, coverage: CameraCoverage, threads: int | None = None
 ) -> np.ndarray:
-    """(n,) float64 pixels of the mean image of ``cameras`` that splats with these ``masses`` (n,) count for:
-    those that show them, and a little more for those that do not.
+    """(n,) float64 pixels of the mean image of the cameras of ``coverage``, which is that of ``cloud``, that
+    splats with these ``masses`` (n,) count for: those that show them, and a little more for those that do
+    not.
 
     Of more than ``MOST`` splats, the pixels that their masses cover are taken instead.
     """
-    coverage = CameraCoverage(cloud.means, cameras)
     covered = coverage.densities() * masses
     square = _nearest_squares(cloud.means, coverage.cameras)
     least = max(float(np.quantile(square, NEAREST)), float(np.finfo(np.float32).tiny))
