@@ -62,3 +62,11 @@ def test_a_mesh_has_them():
     assert mesh.splat_count == len(mesh.splats) == 3
     kept = mesh.take(mesh.splats.of_face != 1)
     assert kept.splats.numbers.tolist() == [3, 9]
+
+
+def test_splats_whose_vertices_follow_each_other_need_no_search(monkeypatch):
+    mixed = FACES.copy()
+    mixed[1, 2], mixed[2, 0] = 5, 3
+    assert not FaceSplats(mixed, SPLATS.face_splat, 13).share_vertices
+    monkeypatch.delattr(FaceSplats, "of_vertex")
+    assert not SPLATS.share_vertices

@@ -97,6 +97,13 @@ class FaceSplats:
     @property
     def share_vertices(self) -> bool:
         """Whether two splats use the same vertex."""
+        if not len(self):
+            return False
+        a, b, c = self.faces.T
+        low = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), self.starts)
+        high = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), self.starts)
+        if (high[:-1] < low[1:]).all():
+            return False  # as in what ``convert`` makes: found in a fifth of the time
         return bool((self.of_vertex[self.faces] != self.of_face[:, None]).any())
 
     def part(self, splats: slice) -> FaceSplats:

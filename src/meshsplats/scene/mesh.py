@@ -333,8 +333,9 @@ class SplatMesh:
         used[faces.ravel()] = True
         renumber = np.cumsum(used, dtype=np.int32) - 1
         rows = {"vertex": np.flatnonzero(used), "face": source}
-        if any(f.per == "splat" for f in self.FIELDS):
-            rows["splat"] = np.unique(self.splats.of_face[source])
+        if self.harmonics is not None:
+            splats = self.splats.of_face[source]  # ascending, or refused
+            rows["splat"] = splats[np.diff(splats, prepend=-1) > 0]
         return replace(self, **self.rows(**rows), faces=np.take(renumber, faces))
 
     def vertices_of(self, faces: np.ndarray) -> np.ndarray:
