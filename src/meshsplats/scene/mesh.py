@@ -333,7 +333,7 @@ class SplatMesh:
         used[faces.ravel()] = True
         renumber = np.cumsum(used, dtype=np.int32) - 1
         rows = {"vertex": np.flatnonzero(used), "face": source}
-        if self.harmonics is not None:
+        if any(f.per == "splat" and getattr(self, f.name) is not None for f in self.FIELDS):
             splats = self.splats.of_face[source]  # ascending, or refused
             rows["splat"] = splats[np.diff(splats, prepend=-1) > 0]
         return replace(self, **self.rows(**rows), faces=np.take(renumber, faces))
