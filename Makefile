@@ -53,7 +53,8 @@ SANITIZER_FLAGS := -std=gnu++17 -O1 -g1 -fno-omit-frame-pointer -fno-sanitize-re
 	-ffp-contract=off -fno-math-errno -fno-trapping-math -fvisibility=hidden -Wno-psabi -Wno-uninitialized \
 	-Wno-maybe-uninitialized $(if $(filter x86_64,$(shell uname -m)),-march=x86-64-v3) -DMS_CHECKS -D_GLIBCXX_ASSERTIONS
 CORE_TESTS := $(foreach name,rendering rendering_variants rendering_splats splat_order rasterize cutoff ramp fan_filter \
-	viewers losses adam merging cell_neighbours core_fuzz,$(or $(shell find tests -name test_$(name).py),tests/test_$(name).py))
+	viewers losses adam merging cell_neighbours stereo textures listing ordering shading median_depth \
+	core_fuzz,$(or $(shell find tests -name test_$(name).py),tests/test_$(name).py))
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 

@@ -25,9 +25,23 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from meshsplats import Camera, GaussianCloud, SplatMesh, draw_splats, render, render_splats, simplify
-from meshsplats._core.kernels import AdamStep, adam_rows, compare_images, round_fans
+from meshsplats._core import stereo
+from meshsplats._core.cells import VertexGrid, nearest_vertices, sums_around
+from meshsplats._core.kernels import AdamStep, adam_rows, compare_images, listed_triangles, round_fans
 from meshsplats._core.neighbours import nearest
+from meshsplats._core.resampling import resample
+from meshsplats._core.structures import CameraStruct
+from meshsplats._core.surfaces import (
+    Grid,
+    Samples,
+    coordinate_gradients,
+    fuse_depth,
+    relax_texels,
+    texel_sums,
+    texture_samples,
+)
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, TapeOptions
+from meshsplats.rendering.core_arguments import camera_struct
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.ordering import drawing_order
 from meshsplats.rendering.viewers import viewer_images
@@ -135,6 +149,10 @@ class Maker:
         return self.shares(*((camera.height, camera.width) if self.chance(0.3) else ()), 3)
 
 
+def near_struct(camera: Camera) -> CameraStruct:
+    return camera_struct(replace(camera, near=camera.near or 0.01))
+
+
 def call_render(make: Maker) -> None:
     mesh, camera = make.mesh(), make.camera()
     cut = mesh.order == "fragment" and mesh.filter_px2 == 0 and make.chance(0.3)
@@ -238,8 +256,99 @@ def call_viewer(make: Maker) -> None:
 
 
 def call_order(make: Maker) -> None:
-    cameras = [make.camera() for _ in range(1 + make.count(2))]
-    drawing_order(make.mesh(), cameras, nodes=1 + make.count(3), threads=THREADS)
+    mesh, cameras = make.mesh(), [make.camera() for _ in range(1 + make.count(2))]
+    order = drawing_order(mesh, cameras, nodes=1 + make.count(3), threads=THREADS)
+    triangles = (mesh.vertices, mesh.faces, mesh.face_splat if make.chance(0.7) else None)
+    listed_triangles(triangles, (order.copies, order.starts), near_struct(cameras[0]), THREADS)
+
+
+def call_cells(make: Maker) -> None:
+    n, size = 1 + make.count(30), [1 + make.count(5) for _ in range(3)]
+    normals = make.rng.normal(size=(n, 3))
+    ids = make.rng.integers(-1, n, size).astype(np.int32)
+    grid = VertexGrid(ids, make.points(1)[0].astype(float), 0.5, make.points(n), normals)
+    places, reach = make.points(make.count(30)), make.count(3)
+    nearest_vertices(
+        places, make.rng.normal(size=(len(places), 3)), grid, reach=reach, facing_away=4.0, threads=THREADS
+    )
+    points, middles = make.points(make.count(40)).astype(float), make.points(n).astype(float)
+    cells = make.rng.integers(0, n, len(points)).astype(np.int32)
+    beside = make.rng.integers(-1, n, (n, 1 + make.count(27))).astype(np.int32)
+    sums_around(points, cells, beside, middles, make.rng.random((n, 3)), deviation=0.3, threads=THREADS)
+
+
+def call_resample(make: Maker) -> None:
+    image = make.shares(1 + make.count(12), 1 + make.count(12), 1 + make.count(3))
+    points = (20 * make.values(make.count(60), 2)).astype(np.float32)
+    points[make.rng.random(points.shape) < 0.1] = make.one_of(np.nan, np.inf, -np.inf)
+    image = (255 * image).astype(np.uint8) if make.chance(0.5) else image
+    resample(image, points, wraps=make.chance(0.5), threads=THREADS)
+
+
+def call_texture(make: Maker) -> None:
+    height, width, side = 1 + make.count(8), 1 + make.count(8), 1 + make.count(2)
+    shape = (height * side, width * side)
+    uv = make.values(*shape, 2)
+    uv[make.rng.random(uv.shape) < 0.05] = make.one_of(np.nan, np.inf, -np.inf)
+    samples = Samples(uv, make.rng.random(shape) < 0.7, side)
+    texels, values = make.shares(1 + make.count(8), 1 + make.count(8), 3), make.values(height, width, 4)
+    texture_samples(samples, texels, make.shares(3), threads=THREADS)
+    coordinate_gradients(samples, texels, values, threads=THREADS)
+    sums = texel_sums(samples, texels, values, threads=THREADS)
+    relax_texels(samples, texels, values, sums, share=0.5, doubt=0.25, threads=THREADS)
+
+
+def call_depth(make: Maker) -> None:
+    """Depth images fused on a grid."""
+    camera, size = make.camera(), tuple(1 + make.count(9) for _ in range(3))
+    total, weight = np.zeros((2, *size), np.float32)
+    depth = np.abs(make.values(camera.height, camera.width))
+    depth[make.rng.random(depth.shape) < 0.3] = np.inf
+    radius = float(make.one_of(0.0, 1.0))
+    grid = Grid(
+        make.points(1)[0].astype(float), 10.0 ** make.rng.uniform(-2, 1), size, (0.0, 0.0, 2.0), radius
+    )
+    how = {"truncation": float(make.one_of(0.01, 1.0)), "behind": float(make.shares())}
+    fuse_depth(total, weight, depth, near_struct(camera), grid, **how, threads=THREADS)
+
+
+def call_stereo(make: Maker) -> None:
+    """Photographs, and what their depths say of each other."""
+    structs = [near_struct(make.camera()) for _ in range(1 + make.count(3))]
+    n, chosen = len(structs), np.flatnonzero(make.rng.random(len(structs)) < 0.7).astype(np.int32)
+    photos, matched = stereo.Layout(structs), stereo.Layout([structs[i] for i in chosen])
+    color = make.rng.integers(0, 256, (photos.pixels, 3)).astype(np.uint8)
+    least = make.rng.uniform(0.01, 1, (len(chosen), 1))
+    range_ = np.concatenate([least, least + make.rng.uniform(0, 2)], axis=1).astype(np.float32)
+    sources = make.rng.integers(-1, n, (len(chosen), 1 + make.count(3))).astype(np.int32)
+    pairs = stereo.Pairs(chosen, sources, range_)
+    how = {"planes": 2 + make.count(10), "rounds": make.count(2) - 1}
+    planes = stereo.match_photos(photos, color, matched, pairs, **how, threads=THREADS)
+    own = np.concatenate(
+        [np.zeros((0, 3), np.uint8), *(photos.image(color, i).reshape(-1, 3) for i in chosen)]
+    )
+    known = (make.rng.random(matched.pixels) < float(make.one_of(0.0, 0.3, 1.0))) & (planes.inverse > 0)
+    inverse = stereo.fill_depths(matched, own, planes, known, per_pixel=1.0, threads=THREADS)
+    judges = make.rng.integers(-1, max(1, len(chosen)), (len(chosen), 1 + make.count(3))).astype(np.int32)
+    tolerances = (0.02, 0.05)
+    stereo.count_witnesses(matched, planes.inverse, inverse, judges, tolerances, THREADS)
+    stereo.count_views(matched, inverse, make.points(make.count(40)).astype(float), tolerances, THREADS)
+
+
+def call_points(make: Maker) -> None:
+    """Points of photographs that become patches."""
+    n = make.count(80)
+    normals = make.rng.normal(size=(n, 3))
+    normals *= (make.rng.random((n, 1)) < 0.8) / np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = make.rng.integers(0, 256, (n, 3)).astype(np.uint8)
+    surface = stereo.SurfaceArrays(
+        make.points(n),
+        normals.astype(np.float32),
+        make.shares(n) + np.float32(1e-6),
+        colors,
+        colors[:, 0] % 2,
+    )
+    stereo.fuse_points(surface, make.count(n), float(make.one_of(1.0, 30.0)), THREADS)
 
 
 CALLS: dict[str, Callable[[Maker], None]] = {
