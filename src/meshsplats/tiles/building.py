@@ -134,8 +134,9 @@ def build_tiles(
     Raises:
         FileExistsError: the folder or a partial one exists, or with ``replace_old`` one of another program.
         FileNotFoundError: there is nothing to resume.
-        ValueError: the splats are those of the tileset that it would replace; options out of range, or other ones than the interrupted run had; no splat to convert;
-            a file that is given twice; files that are too far apart for one origin.
+        ValueError: the splats are those of the tileset that it would replace; options out of range, or other
+            ones than the interrupted run had; no splat to convert; a file that is given twice; files that are
+            too far apart for one origin.
         FileFormatError: the interrupted run has lost some of what it had done.
         OSError: a full disk; what is done stays, for ``resume``.
         ClusterError: the workers are lost; what is done stays.
