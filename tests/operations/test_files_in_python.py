@@ -20,6 +20,7 @@ from PIL import Image
 import meshsplats as ms
 from meshsplats._common.options import Help, settings
 from meshsplats.blender.files import PictureOptions
+from meshsplats.cli import main
 from meshsplats.cluster import Workers
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
@@ -92,6 +93,27 @@ def test_large_splats_are_named_before_they_are_read(tmp_path, monkeypatch):
     with pytest.raises(ms.FileFormatError):
         SceneReading().load(broken)
     assert told[1:] == ["reading 603 bytes"]
+
+
+def test_long_work_is_told_of_before_it_begins(files, monkeypatch, capsys):
+    told = []
+    monkeypatch.setattr(SceneReading, "tell", lambda self, text: told.append(text))
+    clean_file(files / "s.ply", files / "few.ply", CleaningRules(min_opacity=0.01))
+    assert not told
+    monkeypatch.setattr("meshsplats.datasets.scene_files.LARGE_COUNT", 40)
+    clean_file(files / "s.ply", files / "clean.ply", CleaningRules(min_opacity=0.01))
+    simplify_file(files / "s.ply", files / "few.ply", SimplifyOptions(count=20), force=True)
+    shown_file(files / "s.ply", ViewingOptions())
+    assert told == [
+        "looking for floaters among 40 splats",
+        "merging 40 splats to 20",
+        "looking for views of 40 splats",
+        "converting 40 splats",
+    ]
+    assert main(["convert", str(files / "s.ply"), "-o", str(files / "new.npz"), "--no-preview"]) == 0
+    assert "meshsplats: converting 40 splats" in capsys.readouterr().err
+    main(["cameras", str(files / "s.ply"), "-o", str(files / "c.json"), "--width", "20"])
+    assert "meshsplats: looking for views of 40 splats" in capsys.readouterr().err
 
 
 def test_errors_name_options_as_python_and_as_commands_do():

@@ -71,10 +71,9 @@ class Cameras(Command):
             folder = model_folder(self.input)
             say(f"{folder} has {len(given)} cameras of its own, which --cameras {folder} takes")
             up = guess_up(scene, given) if up is None else up
-        found = find_cameras(
-            scene, self.count, up=up, width=self.width, height=self.height, threads=self.threads
-        )
         side = self.width, self.width if self.height is None else self.height
+        self.reading.tell_of("looking for views of", len(scene))
+        found = find_cameras(scene, self.count, up=up, width=side[0], height=side[1], threads=self.threads)
         cameras = opened_with(found.cameras, self.input, scene.origin, side)
         with together():
             save_cameras(cameras, self.output, origin=scene.origin)

@@ -210,6 +210,7 @@ class Convert(Command):
             record=self._record,
             preview=partial(draw_preview, threads=self.threads),
             opening=self._opening,
+            tell_of=self.reading.tell_of,
         )
         return Converter(self.product, callbacks, self.threads).made(job, cameras)
 

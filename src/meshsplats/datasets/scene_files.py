@@ -32,6 +32,8 @@ _AXES = Help(
 
 LARGE_BYTES = 50_000_000
 """Bytes of splats from which on reading takes seconds, and the rest minutes."""
+LARGE_COUNT = 500_000
+"""Splats from which on what is done with them takes many seconds."""
 
 
 def _bytes_of(path: Path) -> int:
@@ -57,7 +59,12 @@ class SceneReading:
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
     def tell(self, text: str) -> None:
-        """Gets what headers say that changes the scene."""
+        """Gets what headers say that changes the scene, and what takes long when it begins."""
+
+    def tell_of(self, work: str, count: int, more: str = "") -> None:
+        """Tells that ``work`` on ``count`` splats begins, if there are many."""
+        if count >= LARGE_COUNT:
+            self.tell(f"{work} {count:,} splats{more}")
 
     def load(
         self,

@@ -63,6 +63,8 @@ class ConversionCallbacks:
     """Draws a scene to a file, from a camera or None."""
     opening: Callable[[GaussianCloud, Path, Sequence[Camera] | None], Camera | None]
     """The camera of the preview of splats from a file, and given cameras; None: ``opening_camera``."""
+    tell_of: Callable[[str, int], object] = lambda work, count: None
+    """Is told of work on so many splats as it begins."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ class Converter:
         options = product.conversion
         if product.preset == "default" and not seen and not product.merges:
             options = with_usual_look(cloud, options, threads=self.threads, named=True)
+        self.callbacks.tell_of("merging and converting" if product.merges else "converting", len(cloud))
         mesh = convert_within_limits(
             cloud,
             options,

@@ -94,13 +94,16 @@ def clean_file(
     source, output = as_path("source", source), as_path("output", output)
     preview = beside(output, PREVIEW)
     check_outputs([preview] if preview_only else [output, preview], force, inputs=[source])
+    reading = reading or SceneReading()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StraysWarning)  # which names this command
-        scene = (reading or SceneReading()).load_scene(source, threads=threads)
+        scene = reading.load_scene(source, threads=threads)
     if isinstance(scene, GaussianCloud):
         check_splat_endings(written_ending(output.name))
     else:
         check_mesh_suffix(output)
+    many = len(scene) if isinstance(scene, GaussianCloud) else scene.splat_count or 0
+    reading.tell_of("looking for floaters among", many)
     if rules is None or all(value is None for value in vars(rules).values()):
         rules, found = FLOATERS, floaters(scene, source, threads=threads)
     else:
@@ -169,12 +172,14 @@ def simplify_file(
     check_outputs([output, config, *([] if options.no_preview else [preview])], force, inputs=[source])
     if identify(source) != "splats":
         raise FileFormatError(f"{source}: not splats; simplify needs a splat file or a model folder")
-    cloud = (reading or SceneReading()).load(source, threads=threads)
+    reading = reading or SceneReading()
+    cloud = reading.load(source, threads=threads)
     cameras = cameras_named(options.cameras, options.data, options.missing, cloud.origin)
     if cameras is None:
         cameras = cameras_beside(source, cloud.origin)
-    start = time.perf_counter()
-    kept = simplify_for_views(cloud, options.wanted(len(cloud)), cameras, threads=threads)
+    start, wanted = time.perf_counter(), options.wanted(len(cloud))
+    reading.tell_of("merging", len(cloud), f" to {wanted:,}")
+    kept = simplify_for_views(cloud, wanted, cameras, threads=threads)
     seconds = time.perf_counter() - start
     placed = own.place(kept)
     shown = None if options.no_preview else default_views(cloud, source, 1, given=cameras, threads=threads)

@@ -334,8 +334,7 @@ class SplatMesh:
         renumber = np.cumsum(used, dtype=np.int32) - 1
         rows = {"vertex": np.flatnonzero(used), "face": source}
         if any(f.per == "splat" and getattr(self, f.name) is not None for f in self.FIELDS):
-            splats = self.splats.of_face[source]  # ascending, or refused
-            rows["splat"] = splats[np.diff(splats, prepend=-1) > 0]
+            rows["splat"] = (own := self.splats.of_face[source])[np.diff(own, prepend=-1) > 0]
         return replace(self, **self.rows(**rows), faces=np.take(renumber, faces))
 
     def vertices_of(self, faces: np.ndarray) -> np.ndarray:

@@ -178,6 +178,7 @@ def _content(
             most = None if options.whole else options.max_triangles or content.TRIANGLES
             how: dict[str, Any] = {"shown": not options.without_splats, "threads": threads}
             up = optional_up(options.up)
+            options.reading.tell_of("converting", len(scene))
             made = content_of_splats(scene, cameras, max_triangles=most, up=up, **how)
             return replace(made, surface=beside)
         advice = "fine-tune it with ``max_triangles``, or make 'meshsplats tiles'"
@@ -212,6 +213,8 @@ def _cameras(
         return [*first, *beside]
     # As many as splats are merged for: looking for them once is enough.
     count, up = max(FOUND_VIEWS, VIEWS), optional_up(options.up)
+    if isinstance(scene, GaussianCloud):
+        options.reading.tell_of("looking for views of", len(scene))
     found = default_views(scene, source, count, up=up, threads=threads)
     if found is None:
         return first
