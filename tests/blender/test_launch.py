@@ -53,7 +53,7 @@ def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
         draw(random_mesh(3), cameras()[:1], images=["a.png"])
 
 
-def test_executable_that_is_not_blender(program, tmp_path, monkeypatch):
+def test_executable_that_is_not_blender(program, tmp_path):
     with pytest.raises(FileNotFoundError, match="no such program"):
         launch.command(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"3\.6 is too old; 4\.2 or newer"):
@@ -64,11 +64,18 @@ def test_executable_that_is_not_blender(program, tmp_path, monkeypatch):
     broken.write_text("#!/bin/sh\necho 'cannot open libX11.so.6' >&2\nexit 127\n")
     with pytest.raises(ValueError, match=r"not Blender.*cannot open libX11\.so\.6"):
         launch.command(broken)
+
+
+def test_executable_is_run_from_another_folder(program, tmp_path, monkeypatch):
+    own = program("Blender 4.2.1 LTS")
+    monkeypatch.setenv("PATH", "")
     monkeypatch.chdir(tmp_path.parent)
-    command = launch.command(program("Blender 4.2.1 LTS").relative_to(tmp_path.parent))
-    assert command[0] == str(tmp_path / "blender")  # it is run from another folder
+    command = launch.command(own.relative_to(tmp_path.parent))
+    assert command[0] == str(own)
     assert command[1:3] == ["--background", "--factory-startup"]
     assert command[-2].endswith("worker.py")
+    monkeypatch.chdir(tmp_path)
+    assert launch.command(Path("./blender"))[0] == str(own)
 
 
 def test_nothing_is_imported_from_the_current_folder(tmp_path, monkeypatch):

@@ -81,7 +81,8 @@ def command(executable: Path | None) -> list[str]:
         if importlib.util.find_spec("bpy") is None:
             raise MissingDependencyError(MISSING)
         return [sys.executable, "-m", worker.__name__]
-    found = shutil.which(executable)
+    # A path is without its "./", so that a file here is second to a program of that name.
+    found = shutil.which(executable) or shutil.which(os.path.abspath(executable))
     if found is None:
         raise FileNotFoundError(f"{executable}: there is no such program; --executable names Blender's own")
     try:
