@@ -359,6 +359,23 @@ def test_what_only_other_views_show_is_not_dropped(ball, state):
     assert fan_count(grow(again, later, 0).mesh) == 5
 
 
+def test_what_steps_show_at_every_event_is_kept_at_every_event(ball, state):
+    """However strong its gradients were before: the moments of a step forget soon."""
+    n = fan_count(state.mesh)
+    hidden = Scores(np.ones(n), np.zeros(n), np.zeros(n), np.ones(n, bool), 64 * 64)
+    white = replace(ball.train[0], source=ViewImage(np.ones((64, 64, 3), np.float32)))
+    steps = Blended(state.config)
+    counts = []
+    for _ in range(4):
+        for _ in range(12):
+            assert make_step(state, [white], 0, 0.0, steps) is not None
+        state = grow(state, hidden, 0)
+        n = fan_count(state.mesh)
+        hidden = Scores(*(part[:n] for part in hidden[:4]), hidden.image_pixels)
+        counts.append(n)
+    assert min(counts) > 0.9 * counts[0]
+
+
 def test_a_sign_before_a_street_is_in_no_near_field():
     """Its fans fill the photographs taken of it. Those of sixty fronts behind it are far more."""
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 8)]), axis=-1).reshape(-1, 2)

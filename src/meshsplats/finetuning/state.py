@@ -387,7 +387,8 @@ class State:
         round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
     def squares(self) -> np.ndarray:
-        """(v,) float32: about the sum over the steps so far of the squared gradient of a vertex's colour."""
+        """(v,) float32: about the sum of the squared gradient of a vertex's colour over the last
+        1 / (1 - beta2) steps that reached it."""
         self._fetch()
         found: np.ndarray = self._colors.square[:, :3].max(axis=1) / np.float32(1 - self._colors.betas[1])
         return found

@@ -136,10 +136,11 @@ def grow(state: State, found: Scores, target: int) -> State:
 
 def trained_pixels(state: State, found: Scores) -> np.ndarray:
     """(n,) about how many pixels the steps since the last event have seen of each fan, a root of squares: by
-    the gradients of its colours, which are those of a pixel times its pixels."""
+    the gradients of its colours, which are those of a pixel times its pixels. Squares are never subtracted,
+    as they forget: they only tell the fans that no step has reached."""
     squares, before = state.squares(), state.mesh.attributes.get(SEEN)
     if before is not None:
-        squares = np.maximum(squares - before, 0)
+        squares[squares == before] = 0
     of_pixel = max(1 - state.config.ssim_weight, 0.01) / (3 * found.image_pixels)
     found_pixels: np.ndarray = np.sqrt(squares).reshape(fan_count(state.mesh), -1).sum(axis=1) / of_pixel
     return found_pixels
