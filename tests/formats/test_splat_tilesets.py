@@ -225,6 +225,13 @@ def test_axes_that_are_none(tmp_path, axes, message):
     refused(put(tmp_path, tile("0.glb"), extras={"meshsplats": note}), message, 96 << 20)
 
 
+def test_tiles_may_be_links_to_one_file(tmp_path):
+    """Caches of downloads keep files that are alike once."""
+    path = put(tmp_path, tile(None, [tile("0.glb"), tile("copy.glb", transform=moved(5))]))
+    make_link(tmp_path / "copy.glb", tmp_path / "0.glb")
+    same_places(ms.load_gaussians(path, axes="y-down"), np.concatenate([at(0, 0, 0, 0), at(0, 5, 0, 0)]))
+
+
 def test_links_make_no_other_tiles(tmp_path):
     make_link(tmp_path / "again", tmp_path)
     refused(put(tmp_path, tile("again/tileset.json")), "names 'tileset.json' twice", 96 << 20)

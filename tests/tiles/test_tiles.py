@@ -642,6 +642,22 @@ def test_a_tileset_inside_itself_ends(tileset, tmp_path):
             list(found.tiles())
 
 
+def test_a_tileset_file_that_was_missing_may_come(tileset, tmp_path):
+    def split(document):
+        inner = document["root"]["children"][0]
+        (tmp_path / "inner.json").write_text(json.dumps(document | {"root": inner}))
+        document["root"]["children"][0] = {
+            key: inner[key] for key in ("boundingVolume", "geometricError")
+        } | {"content": {"uri": "inner.json"}}
+
+    copy = broken(tileset, tmp_path, split)
+    found = Tileset(copy)
+    with pytest.raises(FileNotFoundError):
+        list(found.tiles())
+    (tmp_path / "inner.json").rename(copy / "inner.json")
+    assert len(list(found.tiles())) == len(list(Tileset(tileset).tiles()))
+
+
 def test_files_of_a_tileset_share_its_limits(tileset, tmp_path, monkeypatch):
     copy = broken(tileset, tmp_path, lambda document: None)
     levels = max(level for _, level in Tileset(copy).tiles())

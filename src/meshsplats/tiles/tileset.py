@@ -8,7 +8,6 @@ in a folder of its own, so that no file grows with the scene.
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -29,6 +28,7 @@ from meshsplats.formats.gltf.splat_tilesets import axes_of
 from meshsplats.formats.gltf.tileset_file import (
     LARGEST,
     check_tree,
+    entry_of,
     file_below,
     is_number,
     numbers,
@@ -297,7 +297,7 @@ class Tileset:
         _error(document, self.path)
         self._to_world = tile_frame(self.up).T
         self._count = 0
-        self._read = {os.path.realpath(self.path)}
+        self._read = {entry_of(self.path)}
         self._coarsest: np.ndarray | None = None
         self.root = self._tile(self._root_entry(document), self.path, 0)
 
@@ -326,15 +326,15 @@ class Tileset:
     def _opened(self, tile: Tile) -> Tile:
         if not tile.is_file:
             return tile
-        real = os.path.realpath(tile.content)
-        if real in self._read:
+        entry = entry_of(tile.content)
+        if entry in self._read:
             name = tile.content.name
             raise FileFormatError(f"{self.path}: its tree names {name!r} twice; a tileset file is read once")
-        self._read.add(real)
         document = _load(tile.content)
         root = self._tile(_object(document, "root", tile.content), tile.content, tile.depth)
         if root.is_file:
             raise FileFormatError(f"{tile.content}: its root must have a mesh, not another tileset")
+        self._read.add(entry)
         return root
 
     def _root_entry(self, document: dict[str, Any]) -> dict[str, Any]:

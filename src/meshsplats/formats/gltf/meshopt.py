@@ -9,11 +9,15 @@ edge of a triangle before and a vertex, which is the next one or was there a sho
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 _ATTRIBUTES, _TRIANGLES = 0xA0, 0xE1
 _GROUP = 16
 _BLOCK_BYTES, _MOST = 0x2000, 0x100
+_AT_ONCE = 64
+"""Blocks whose bytes are found before their numbers are read."""
 _TAIL = 32
 """Least bytes at the end of attributes."""
 _PER_BYTE = {1: 4, 2: 2}
@@ -103,12 +107,16 @@ def decoded_attributes(data: bytes, count: int, stride: int) -> np.ndarray:
     heads = count // size * -(-size // 64) + -(-(count % size) // 64)
     if 1 + heads * stride + max(_TAIL, stride) > len(data):
         raise ValueError(f"{count:,} elements in {len(data):,} bytes")
-    deltas = np.zeros((count, stride), np.uint8)
-    at = 1
-    for first in range(0, count, size):
-        elements = min(size, count - first)
-        rows, at = _decoded_block(data, at, stride, -(-elements // _GROUP))
-        deltas[first : first + elements] = rows[:, :elements].T
+    deltas = np.empty((count, stride), np.uint8)
+    scan = _Scan(data, data.translate(_THREES), data.translate(_FIFTEENS))
+    at, whole = 1, count // size * size
+    for first in range(0, whole, size * _AT_ONCE):
+        last = min(first + size * _AT_ONCE, whole)
+        rows, at = _decoded_blocks(scan, at, ((last - first) // size, stride, size // _GROUP))
+        deltas[first:last] = rows.transpose(0, 2, 1).reshape(-1, stride)
+    if whole < count:
+        rows, at = _decoded_blocks(scan, at, (1, stride, -(-(count - whole) // _GROUP)))
+        deltas[whole:] = rows[0, :, : count - whole].T
     if at != len(data) - max(_TAIL, stride):
         raise ValueError(f"{at:,} of {len(data):,} bytes are used")
     moved = (deltas >> 1) ^ -(deltas & 1)
@@ -116,26 +124,38 @@ def decoded_attributes(data: bytes, count: int, stride: int) -> np.ndarray:
     return np.cumsum(moved, axis=0, dtype=np.uint8)
 
 
-def _decoded_block(data: bytes, at: int, stride: int, groups: int) -> tuple[np.ndarray, int]:
-    """(stride, 16 groups) differences of the block at byte ``at``, and where it ends."""
+class _Scan(NamedTuple):
+    """Data of attributes, and of each byte how many fields of 2 and of 4 bits are full."""
+
+    data: bytes
+    threes: bytes
+    fifteens: bytes
+
+
+def _decoded_blocks(scan: _Scan, at: int, shape: tuple[int, int, int]) -> tuple[np.ndarray, int]:
+    """(blocks, stride, 16 groups) differences of blocks of this ``shape``, blocks, stride and groups, from
+    byte ``at`` on, and where they end."""
+    data, threes, fifteens = scan
+    blocks, stride, groups = shape
     heads = -(-groups // 4)
+    still = bytes(heads)
     found: tuple[list[tuple[int, int]], ...] = ([], [], [], [])
-    for byte in range(stride):
+    for row in range(0, blocks * stride * groups, groups):
         head, at = at, at + heads
-        if not any(data[head:at]):
+        if data[head:at] == still:
             continue
-        for group in range(groups):
-            mode = data[head + group // 4] >> 2 * (group % 4) & 3
+        modes = [mode for byte in data[head:at] for mode in _MODES[byte]][:groups]
+        for group, mode in enumerate(modes, row):
             if mode:
-                found[mode].append((byte * groups + group, at))
+                found[mode].append((group, at))
                 if mode == 3:
                     at += 16
                 elif mode == 2:
-                    at += 8 + sum(map(_FIFTEENS.__getitem__, data[at : at + 8]))
+                    at += 8 + sum(fifteens[at : at + 8])
                 else:
-                    at += 4 + sum(map(_THREES.__getitem__, data[at : at + 4]))
+                    at += 4 + sum(threes[at : at + 4])
     source = np.frombuffer(data, np.uint8)
-    rows = np.zeros((stride * groups, _GROUP), np.uint8)
+    rows = np.zeros((blocks * stride * groups, _GROUP), np.uint8)
     for mode, listed in enumerate(found):
         if not listed:
             continue
@@ -155,11 +175,12 @@ def _decoded_block(data: bytes, at: int, stride: int, groups: int) -> tuple[np.n
         behind = place[:, None] + packed.shape[1] + np.cumsum(large, axis=1) - 1
         own[large] = source[behind[large]]
         rows[row] = own
-    return rows.reshape(stride, -1), at
+    return rows.reshape(blocks, stride, -1), at
 
 
-_THREES = [sum(b >> s & 3 == 3 for s in (0, 2, 4, 6)) for b in range(256)]
-_FIFTEENS = [(b >> 4 == 15) + (b & 15 == 15) for b in range(256)]
+_MODES = [[b >> s & 3 for s in (0, 2, 4, 6)] for b in range(256)]
+_THREES = bytes(modes.count(3) for modes in _MODES)
+_FIFTEENS = bytes((b >> 4 == 15) + (b & 15 == 15) for b in range(256))
 
 
 # -- triangles
@@ -250,65 +271,72 @@ def decoded_triangles(data: bytes, count: int) -> np.ndarray:
     at = 1 + triangles
     if count % 3 or at > end:
         raise ValueError(f"{count:,} indices in {len(data):,} bytes")
-    table = data[end:]
-    edges = [(0, 0)] * 16
-    recent = [0] * 16
-    following = last = 0
-    found: list[int] = []
-
-    def number() -> int:
-        nonlocal at, last
-        value = shift = 0
-        while data[at] > 0x7F and shift < 28:
-            value |= (data[at] & 0x7F) << shift
-            at, shift = at + 1, shift + 7
-        value |= (data[at] & 0x7F) << shift
-        at += 1
-        last += value >> 1 ^ -(value & 1)
-        return last
-
-    def vertex(nibble: int, exact: bool) -> int:
-        """A corner of a triangle that shares no edge."""
-        nonlocal following
-        if nibble and not (exact and nibble == _EXPLICIT):
-            return recent[-nibble]
-        if nibble:
-            own = number()
-        else:
-            own, following = following, following + 1
-        pushed.append(own)
-        return own
-
-    for code in data[1 : 1 + triangles]:
-        edge, how = code >> 4, code & 15
-        pushed: list[int] = []
-        if edge < 15:
-            a, b = edges[-1 - edge]
-            if how == 0:
-                c, following = following, following + 1
-            elif how < 13:
-                c = recent[-1 - how]
-            else:
-                last += (-1, 1, 0)[how - 13]
-                c = number() if how == 15 else last
-            if how == 0 or how > 12:
-                pushed.append(c)
-            edges += ((c, b), (a, c))
-        else:
-            exact = how > 13
-            aux = data[at] if exact else table[how]
-            at += exact
-            if exact and not aux:
-                following = 0
-            a = vertex(_EXPLICIT if how == 15 else _NEXT, True)
-            b, c = vertex(aux >> 4, exact), vertex(aux & 15, exact)
-            edges += ((b, a), (c, b), (a, c))
-        recent += pushed
-        del recent[:-16], edges[:-16]
-        found += (a, b, c)
+    codes = np.frombuffer(data, np.uint8, triangles, 1)
+    edge, how = codes >> 4, codes & 15
+    alone, exact = codes >= _ALONE, codes >= _FROM_DATA
+    aux = np.frombuffer(data, np.uint8, _AUX, end)[how]
+    aux[exact], numbers, at = _following(data, at, codes[exact | (~alone & (how == _EXPLICIT))])
     if at > end:
         raise ValueError("the data are truncated")
-    indices = np.array(found, np.int64)
+
+    # What is said of each corner; the first two of a triangle at an edge are those of the edge.
+    said = np.stack([np.where(codes == _NOT_NEXT, _EXPLICIT, _NEXT), aux >> 4, aux & 15], axis=1)
+    said[~alone, 2] = how[~alone]
+    named = np.ones((triangles, 3), bool)
+    named[~alone, :2] = False
+    new = named & (said == _NEXT)
+    explicit = named & (said == _EXPLICIT) & (exact | ~alone)[:, None]
+    explicit[:, 2] |= ~alone & (how > 12)
+    value = np.zeros(count + 1, np.int64)  # behind them that of edges before the first
+    before = np.cumsum(new) - new.ravel()
+    restarts = np.where(exact & (aux == 0), before[::3], 0)
+    before -= np.repeat(np.maximum.accumulate(restarts), 3)
+    value[:-1][new.ravel()] = before[new.ravel()]
+    steps = np.where(said[explicit] == 13, -1, 1)
+    steps[said[explicit] == _EXPLICIT] = numbers
+    value[:-1][explicit.ravel()] = np.cumsum(steps)
+
+    # The others are among the last that were new or explicit, ...
+    pushed = (new | explicit).ravel()
+    recent = np.concatenate([np.zeros(16, np.int64), value[:-1][pushed]])
+    row, column = np.nonzero(named & ~new & ~explicit)
+    depth = said[row, column] + ~alone[row]
+    value[3 * row + column] = recent[16 + (np.cumsum(pushed) - pushed)[3 * row] - depth]
+    # ... or corners of an edge of a triangle before, and so on.
+    made = np.where(alone, 3, 2)
+    first = np.cumsum(made) - made
+    row = np.flatnonzero(~alone)
+    number = first[row] - 1 - edge[row]
+    owner = np.repeat(np.arange(triangles), made)[number]
+    side = number - first[owner] + 3 - made[owner]
+    source = np.arange(count + 1)
+    source[3 * row] = np.where(number < 0, count, 3 * owner + (side + 1) % 3)
+    source[3 * row + 1] = np.where(number < 0, count, 3 * owner + side)
+    while not np.array_equal(further := source[source], source):
+        source = further
+    indices: np.ndarray = value[source[:-1]]
     if len(indices) and indices.min() < 0:
         raise ValueError("an index below 0")
     return indices
+
+
+def _following(data: bytes, at: int, codes: np.ndarray) -> tuple[list[int], list[int], int]:
+    """What follows at byte ``at`` for those ``codes`` that need it: bytes for the corners of triangles, steps
+    from one number to the next, and where they end."""
+    found: list[int] = []
+    numbers: list[int] = []
+    for code in codes.tolist():
+        count = 1
+        if code >= _FROM_DATA:
+            own, at = data[at], at + 1
+            found.append(own)
+            count = (code == _NOT_NEXT) + (own >> 4 == _EXPLICIT) + (own & 15 == _EXPLICIT)
+        for _ in range(count):
+            value = shift = 0
+            while data[at] > 0x7F and shift < 28:
+                value |= (data[at] & 0x7F) << shift
+                at, shift = at + 1, shift + 7
+            value |= (data[at] & 0x7F) << shift
+            at += 1
+            numbers.append(value >> 1 ^ -(value & 1))
+    return found, numbers, at

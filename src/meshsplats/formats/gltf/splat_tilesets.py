@@ -8,7 +8,6 @@ https://docs.ogc.org/cs/22-025r4/22-025r4.html.
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterator
 from functools import cached_property
@@ -25,6 +24,7 @@ from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.splats import names_splats, placed_clouds, splat_document
 from meshsplats.formats.gltf.tileset_file import (
     check_tree,
+    entry_of,
     file_below,
     numbers,
     object_in,
@@ -159,10 +159,10 @@ class _Tree:
         return False
 
     def _once(self, path: Path) -> None:
-        real = os.path.realpath(path)  # links lead to one file by many names
-        if real in self._read:
+        entry = entry_of(path)
+        if entry in self._read:
             raise FileFormatError(f"{self._path}: its tree names {path.name!r} twice; a tile is read once")
-        self._read.add(real)
+        self._read.add(entry)
 
     def _matrix(self, tile: dict[str, Any], file: Path) -> np.ndarray:
         if "transform" not in tile:

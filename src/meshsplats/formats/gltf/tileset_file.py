@@ -4,6 +4,7 @@ Errors begin with the name of the file."""
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +42,12 @@ def check_tree(depth: int, count: int, file: Path) -> None:
     if depth > MAX_DEPTH or count > MAX_TILES:
         limits = f"{MAX_DEPTH} levels and {MAX_TILES:,} tiles"
         raise FileFormatError(f"{file}: tiles are nested too deeply, or too many: {limits} are read")
+
+
+def entry_of(path: Path) -> str:
+    """``path``, which is read once, by its real folder: links to folders lead to one file by endless names.
+    Those to files are kept apart, as caches of downloads keep files that are alike as links to one."""
+    return os.path.join(os.path.realpath(path.parent), path.name)
 
 
 def object_in(owner: dict[str, Any], key: str, file: Path, kind: type = dict) -> Any:
