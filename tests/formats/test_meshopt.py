@@ -36,6 +36,7 @@ def faces(kind):
     return {
         "fans": FANS,
         "one": np.array([[0, 1, 2]]),
+        "long fan": np.array([(0, i, i + 1) for i in range(1, 2000)]),
         "soup": np.arange(30).reshape(-1, 3),
         "backwards": np.array([[2, 1, 0], [5, 4, 3], [0, 3, 5]]),
         "old first": np.array([[0, 1, 2], [2, 3, 4], [4, 5, 0]]),
@@ -46,8 +47,19 @@ def faces(kind):
     }[kind]
 
 
-KINDS = ["fans", "one", "soup", "backwards", "old first", "mixed", "random", "far", "largest"]
-SHAPES = [(1, 4), (16, 4), (17, 8), (255, 12), (256, 16), (257, 36), (300, 252), (40, 256), (3000, 8)]
+KINDS = ["fans", "one", "long fan", "soup", "backwards", "old first", "mixed", "random", "far", "largest"]
+SHAPES = [
+    (1, 4),
+    (16, 4),
+    (17, 8),
+    (255, 12),
+    (256, 16),
+    (257, 36),
+    (300, 252),
+    (40, 256),
+    (3000, 8),
+    (20_000, 4),
+]
 
 
 def turned(triangles):

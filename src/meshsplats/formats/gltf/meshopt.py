@@ -139,7 +139,7 @@ def _decoded_blocks(scan: _Scan, at: int, shape: tuple[int, int, int]) -> tuple[
     blocks, stride, groups = shape
     heads = -(-groups // 4)
     still = bytes(heads)
-    found: tuple[list[tuple[int, int]], ...] = ([], [], [], [])
+    found: tuple[list[int], ...] = ([], [], [], [])
     for row in range(0, blocks * stride * groups, groups):
         head, at = at, at + heads
         if data[head:at] == still:
@@ -147,7 +147,7 @@ def _decoded_blocks(scan: _Scan, at: int, shape: tuple[int, int, int]) -> tuple[
         modes = [mode for byte in data[head:at] for mode in _MODES[byte]][:groups]
         for group, mode in enumerate(modes, row):
             if mode:
-                found[mode].append((group, at))
+                found[mode].extend((group, at))
                 if mode == 3:
                     at += 16
                 elif mode == 2:
@@ -159,7 +159,7 @@ def _decoded_blocks(scan: _Scan, at: int, shape: tuple[int, int, int]) -> tuple[
     for mode, listed in enumerate(found):
         if not listed:
             continue
-        row, place = np.array(listed).T
+        row, place = np.array(listed).reshape(-1, 2).T
         if place.max() + _GROUP > len(source) or at > len(source):
             raise ValueError("the data are truncated")
         if mode == 3:
@@ -172,7 +172,7 @@ def _decoded_blocks(scan: _Scan, at: int, shape: tuple[int, int, int]) -> tuple[
         shifts = np.arange(8 - bits, -1, -bits, dtype=np.uint8)
         own = (packed[:, :, None] >> shifts & most).reshape(-1, _GROUP)
         large = own == most
-        behind = place[:, None] + packed.shape[1] + np.cumsum(large, axis=1) - 1
+        behind = place[:, None] + packed.shape[1] + np.cumsum(large, axis=1, dtype=np.uint8) - 1
         own[large] = source[behind[large]]
         rows[row] = own
     return rows.reshape(blocks, stride, -1), at
