@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -124,6 +125,54 @@ def test_a_call_that_gets_no_thread_is_made_all_the_same(monkeypatch):
 
     monkeypatch.setattr(_thread, "start_new_thread", refused)
     assert_same_bits(render(LONG, SHORT), expected)
+
+
+@posix
+def test_what_answers_a_signal_before_the_call_begins_is_no_missing_thread(monkeypatch):
+    def answer(number, frame):
+        raise RuntimeError("enough")
+
+    signal.signal(signal.SIGTERM, answer)
+    monkeypatch.setattr(_thread, "start_new_thread", lambda function, arguments: 1)  # not yet
+    with signals(signal.SIGTERM), pytest.raises(RuntimeError, match="enough"):
+        stopping.stoppable(library.load_core(), lambda: pytest.fail("the call is made"))
+
+
+@posix
+def test_a_second_signal_does_not_leave_the_call_behind():
+    """Which still writes to its arrays."""
+    done = []
+
+    def call():
+        time.sleep(0.8)
+        done.append(True)
+        return 0
+
+    with pytest.raises(KeyboardInterrupt), signals(*[signal.SIGINT] * 3):
+        stopping.stoppable(library.load_core(), call)
+    assert done
+
+
+AT_THE_END = """
+import builtins
+import sys
+from meshsplats._core import library, stopping
+
+class Late:
+    def __init__(self):
+        self.ends, self.stoppable, self.core = sys.is_finalizing, stopping.stoppable, library.load_core()
+
+    def __del__(self):
+        print(self.ends(), self.stoppable(self.core, lambda: 7), flush=True)
+
+builtins.late = Late()
+"""
+
+
+def test_what_is_called_while_python_ends_does_not_wait_forever():
+    """For a thread that does not begin any more."""
+    done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "True 7\n", done.stderr
 
 
 def test_errors_of_a_call_are_its_own():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import ctypes
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,13 +20,14 @@ def stoppable(core: ctypes.CDLL, call: Callable[[], int]) -> int:
     thread makes the call while the main thread waits. Where that is ended by the exception of what answers a
     signal, such as KeyboardInterrupt, the call is, too; what it wrote is of no use then.
     """
-    if threading.current_thread() is not threading.main_thread():
-        return call()
+    if threading.current_thread() is not threading.main_thread() or sys.is_finalizing():
+        return call()  # nothing is answered here; or no thread would begin any more
     stop = ctypes.c_int32(0)
     ended = _thread.allocate_lock()
     ended.acquire()
     turns: list[str] = []
     statuses: list[int | BaseException] = []
+    helper: int | None = None
 
     def work() -> None:
         turns.append("call")
@@ -42,7 +44,7 @@ def stoppable(core: ctypes.CDLL, call: Callable[[], int]) -> int:
             ended.acquire(timeout=PATIENCE)
 
     try:
-        _thread.start_new_thread(work, ())
+        helper = _thread.start_new_thread(work, ())
         wait()
     except BaseException as error:
         turns.append("stop")
@@ -52,7 +54,7 @@ def stoppable(core: ctypes.CDLL, call: Callable[[], int]) -> int:
                 with suppress(BaseException):
                     wait()
             raise
-        if isinstance(error, RuntimeError):  # there are too many threads, or Python is about to end
+        if helper is None and isinstance(error, RuntimeError):  # the system refuses more threads
             return call()
         raise
     status = statuses[0]
