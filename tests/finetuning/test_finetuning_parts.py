@@ -481,6 +481,18 @@ def test_a_lost_terminal_stops_a_run_unless_that_is_ignored(before):
         signal.signal(signal.SIGHUP, kept)
 
 
+def test_a_handler_of_a_program_around_python_stays(monkeypatch):
+    """Blender's own of SIGINT, which Python could not put back."""
+    before, known = signal.getsignal(signal.SIGINT), signal.getsignal
+    monkeypatch.setattr(
+        signal, "getsignal", lambda number: None if number == signal.SIGINT else known(number)
+    )
+    with StopSignals() as stop:
+        assert known(signal.SIGINT) == before
+        signal.raise_signal(signal.SIGTERM)
+    assert stop.received == signal.SIGTERM
+
+
 def test_splats_begin_as_wide_as_in_the_photographs():
     """Those of 3DGS were widened in them, unless the photographs were larger then."""
     cloud = replace(make_scene(300), scales=make_scene(300).scales * np.float32(0.3))

@@ -28,7 +28,8 @@ class Interrupted(KeyboardInterrupt):
 
 class StopSignals:
     """Context manager that stores the first SIGINT, SIGTERM or SIGHUP in ``received`` instead of ending the
-    process. SIGHUP stays ignored where it is (nohup).
+    process. SIGHUP stays ignored where it is (nohup), and signals stay with the handler of a program around
+    Python, such as Blender.
 
     A second SIGINT raises KeyboardInterrupt at once. Outside the main thread, where Python handles no
     signals, it has no effect.
@@ -44,7 +45,8 @@ class StopSignals:
             if _HANGUP is not None and signal.getsignal(_HANGUP) != signal.SIG_IGN:
                 numbers.append(_HANGUP)
             for number in numbers:
-                self._before[number] = signal.signal(number, self._handle)
+                if signal.getsignal(number) is not None:  # else it could not be put back
+                    self._before[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(
