@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from meshsplats.datasets.views import Dataset
+from meshsplats.errors import DataWarning
 from meshsplats.finetuning.checkpoint import load_checkpoint
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.journal import CHECKPOINT
@@ -81,6 +82,14 @@ def test_exposures_are_those_of_the_training(ball, tmp_path, monkeypatch, exposu
     found = load_checkpoint(tmp_path / "run" / CHECKPOINT).arrays["exposure.values"]
     assert np.abs(found - [1, 1, 1, 0, 0, 0]).max() > 0.01
     assert np.array_equal(begun[0], found)
+
+
+def test_a_training_without_time_for_a_step_gives_splats(ball, tmp_path):
+    config, run = replace(CONFIG, steps=None, minutes=1e-6), RunOptions(tmp_path / "run")
+    with pytest.warns(DataWarning, match="over before the first step"):
+        mesh = train(ball, config, run=run)
+    assert not (tmp_path / "run" / CHECKPOINT).exists()
+    assert len(fit_splats(mesh, ball, config, run=run)) > 0
 
 
 def test_fitted_splats_are_nearer_to_photographs_that_were_held_out(ball, trained, fitted):

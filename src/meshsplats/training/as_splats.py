@@ -133,7 +133,10 @@ def fit_splats(
 
 
 def _fitted_exposures(checkpoint: Path, views: int) -> np.ndarray | None:
-    """(views, 6) exposures of the training that ended with ``checkpoint``; None if it fitted none."""
+    """(views, 6) exposures of the training that ended with ``checkpoint``; None if it fitted none, or had no
+    time for a step and left no checkpoint."""
+    if not checkpoint.is_file():
+        return None
     found = load_checkpoint(checkpoint).arrays.get("exposure.values")
     return None if found is None else checked_array("exposures", found, np.float32, (views, 6))
 
