@@ -287,11 +287,13 @@ def decoded_triangles(data: bytes, count: int) -> np.ndarray:
     new = named & (said == _NEXT)
     explicit = named & (said == _EXPLICIT) & (exact | ~alone)[:, None]
     explicit[:, 2] |= ~alone & (how > 12)
+    place = np.int32 if count < 1 << 30 else np.int64  # half the memory
     value = np.zeros(count + 1, np.int64)  # behind them that of edges before the first
-    before = np.cumsum(new) - new.ravel()
+    before = np.cumsum(new, dtype=place) - new.ravel()
     restarts = np.where(exact & (aux == 0), before[::3], 0)
     before -= np.repeat(np.maximum.accumulate(restarts), 3)
     value[:-1][new.ravel()] = before[new.ravel()]
+    del before
     steps = np.where(said[explicit] == 13, -1, 1)
     steps[said[explicit] == _EXPLICIT] = numbers
     value[:-1][explicit.ravel()] = np.cumsum(steps)
@@ -301,15 +303,15 @@ def decoded_triangles(data: bytes, count: int) -> np.ndarray:
     recent = np.concatenate([np.zeros(16, np.int64), value[:-1][pushed]])
     row, column = np.nonzero(named & ~new & ~explicit)
     depth = said[row, column] + ~alone[row]
-    value[3 * row + column] = recent[16 + (np.cumsum(pushed) - pushed)[3 * row] - depth]
+    value[3 * row + column] = recent[16 + (np.cumsum(pushed, dtype=place) - pushed)[3 * row] - depth]
     # ... or corners of an edge of a triangle before, and so on.
-    made = np.where(alone, 3, 2)
-    first = np.cumsum(made) - made
+    made = np.where(alone, np.int8(3), np.int8(2))
+    first = np.cumsum(made, dtype=place) - made
     row = np.flatnonzero(~alone)
     number = first[row] - 1 - edge[row]
-    owner = np.repeat(np.arange(triangles), made)[number]
+    owner = np.repeat(np.arange(triangles, dtype=place), made)[number]
     side = number - first[owner] + 3 - made[owner]
-    source = np.arange(count + 1)
+    source = np.arange(count + 1, dtype=place)
     source[3 * row] = np.where(number < 0, count, 3 * owner + (side + 1) % 3)
     source[3 * row + 1] = np.where(number < 0, count, 3 * owner + side)
     while not np.array_equal(further := source[source], source):
