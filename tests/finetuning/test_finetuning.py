@@ -275,6 +275,23 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
         assert [line[name] for line in metrics[0]] == [line[name] for line in metrics[1]]
 
 
+def test_nothing_is_shown_after_a_signal(scene, tmp_path):
+    """As the terminal may be lost: an error of it would take the place of what says that all is saved."""
+    _, dataset, mesh = scene
+    seen = []
+
+    def after(progress):
+        seen.append(progress.step)
+        if progress.step == 2:
+            signal.raise_signal(signal.SIGTERM)
+
+    folder = tmp_path / "run"
+    with pytest.raises(Interrupted):
+        finetune(mesh, dataset, make_config(steps=2), run=RunOptions(folder), on_progress=after)
+    assert seen == [1, 2]
+    assert load_checkpoint(Journal(folder).checkpoint_path).step == 2
+
+
 def test_resuming_with_other_inputs_is_refused(scene, tmp_path):
     _, dataset, mesh = scene
     run = RunOptions(tmp_path / "run")

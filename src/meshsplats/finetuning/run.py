@@ -315,9 +315,9 @@ class TrainingLoop:
             if clock.step > self.first_step:
                 self._report()
                 self._save_checkpoint()
-            self._notify()
             if signals.received is not None:
                 raise Interrupted(clock.step, signals.received)
+            self._notify()
         return self.finished()
 
     def _step(self) -> None:
