@@ -177,9 +177,10 @@ def test_what_terminals_obey_is_escaped(tmp_path, capsys):
     assert capsys.readouterr().err == "meshsplats: \\u202e Fran\u00e7ais, \u65e5\u672c\n"
     Command().finish(None, "a\tb\nc\x1b\r")
     assert capsys.readouterr().out == "a\tb\nc\\x1b\\r\n"
-    print_table(("view", "dB"), [("\x1b[2Ja", "30"), ("a[/b].png", "31"), ("[red]", "32")])
+    names = ["a[/b].png", "[red]", ":cat:"]
+    print_table(("view", "dB"), [("\x1b[2Ja", "30"), *((name, "31") for name in names)])
     printed = capsys.readouterr().out
-    assert [line.split()[0] for line in printed.splitlines()] == ["view", r"\x1b[2Ja", "a[/b].png", "[red]"]
+    assert [line.split()[0] for line in printed.splitlines()] == ["view", r"\x1b[2Ja", *names]
 
 
 def test_the_mesh_of_train_is_not_replaced_by_its_splats(tmp_path, monkeypatch, capsys):

@@ -151,7 +151,7 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], left: int =
         table.add_column(head, justify="left" if i < left else "right")
     for row in rows:
         table.add_row(*map(with_flags, row))
-    Console(markup=False).print(table)  # names may have brackets
+    Console(markup=False, emoji=False).print(table)  # names may have brackets and colons
 
 
 def draw_preview(

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from meshsplats._common.words import Phase
-from meshsplats.cli.messages import say
+from meshsplats.cli.messages import say, with_flags
 from meshsplats.finetuning.setup import in_words
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class InBar:
     def phase(self, text: str, share: float | None = None, more: str = "") -> None:
         if self._phase.begins(text):  # rich takes a total of None for no change, and a new task for a pulse
             self._bar.remove_task(self._task)
-            self._task = self._bar.add_task(text, total=None, text="")
+            self._task = self._bar.add_task(with_flags(text), total=None, text="")
         if share:
             self._bar.update(self._task, total=1.0, completed=share, text=more or self._phase.left(share))
 
