@@ -285,6 +285,28 @@ def test_memory_for_the_order_of_a_file_is_refused_with_advice(monkeypatch):
         tuned_as_configured(mesh, dataset(2), make_config(order="file"), RunOptions(), Mock())
 
 
+@pytest.mark.parametrize(
+    ("folder", "limit", "used", "cached"),
+    [
+        ("", "memory.max", "memory.current", "inactive_file"),
+        ("memory/", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ],
+)
+def test_what_a_container_keeps_of_files_is_free(tmp_path, folder, limit, used, cached):
+    """Of control groups of either version."""
+    group = tmp_path / "sys/fs/cgroup" / folder
+    group.mkdir(parents=True)
+    assert memory.available_memory(tmp_path) is None
+    (group / limit).write_text("4000000\n")
+    (group / used).write_text("3500000\n")
+    assert memory.available_memory(tmp_path) == 500_000
+    (group / "memory.stat").write_text(f"anon 500000\n{cached} 2800000\nactive_file 100000\n")
+    assert memory.available_memory(tmp_path) == 3_300_000
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "proc/meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    2000 kB\n")
+    assert memory.available_memory(tmp_path) == 2000 << 10
+
+
 def test_splats_that_targets_are_drawn_from_count():
     mesh, cloud = convert(make_scene(200)), make_scene(4000)
     views = splat_views(cloud, [view.camera for view in dataset(2).train])

@@ -63,28 +63,39 @@ def estimate_bytes(vertices: int, faces: int, dataset: Dataset, cache_bytes: int
     )
 
 
-def available_memory() -> int | None:
+def available_memory(system: Path = Path("/")) -> int | None:
     """Bytes that this process may still allocate, by the system, the container and its Dask worker; None if
-    unknown."""
+    unknown. ``system``: the root of the file system."""
     found = []
     try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
+        for line in (system / "proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 found.append(int(line.split()[1]) << 10)
     except (OSError, ValueError):
         pass
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    for limit, used, cached in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
     ):
         try:
-            most = Path(limit).read_text().strip()
+            file = system / "sys/fs/cgroup" / limit
+            most = file.read_text().strip()
             if most.isdigit() and int(most) < 1 << 60:
-                found.append(max(int(most) - int(Path(used).read_text()), 0))
+                taken = int((system / "sys/fs/cgroup" / used).read_text())
+                # What is kept of files counts as taken, but makes way for anything else.
+                found.append(max(int(most) - taken + _counted(file.with_name("memory.stat"), cached), 0))
         except (OSError, ValueError):
             continue
     of_task = memory_of_task()
     return min(found if of_task is None else [*found, of_task], default=None)
+
+
+def _counted(statistics: Path, name: str) -> int:
+    """A number of a control group's ``statistics``, 0 where it is not there."""
+    try:
+        return int(dict(line.split() for line in statistics.read_text().splitlines())[name])
+    except (OSError, ValueError, KeyError):
+        return 0
 
 
 def check_memory(mesh: SplatMesh, dataset: Dataset, *, cache_bytes: int = CACHE_BYTES) -> int:
