@@ -74,6 +74,13 @@ def test_the_least_limit_around_a_process_holds(tmp_path, own, mounts, files, ex
     assert processor_quota(system(tmp_path, own, mounts, files)) == expected
 
 
+def test_names_of_mounts_may_be_in_any_encoding(tmp_path):
+    system(tmp_path, "0::/\n", V2, {"sys/fs/cgroup/cpu.max": "200000 100000\n"})
+    with (tmp_path / "proc/self/mountinfo").open("ab") as file:
+        file.write("24 21 8:2 / /media/Übung rw - vfat /dev/sdb1 rw\n".encode("latin-1"))
+    assert processor_quota(tmp_path) == 2
+
+
 def test_systems_without_control_groups_have_no_limit(tmp_path):
     assert processor_quota(tmp_path) is None
 

@@ -15,10 +15,10 @@ def processor_quota(system: Path = Path("/")) -> float | None:
     """
     try:
         groups: dict[str, str] = {}
-        for line in (system / "proc/self/cgroup").read_text().splitlines():
+        for line in _lines(system / "proc/self/cgroup"):
             _, controllers, path = line.split(":", 2)
             groups |= dict.fromkeys(controllers.split(","), path)  # version 2 names no controller
-        mounts = (system / "proc/self/mountinfo").read_text().splitlines()
+        mounts = _lines(system / "proc/self/mountinfo")
     except (OSError, ValueError):
         return None
     found = []
@@ -39,6 +39,11 @@ def processor_quota(system: Path = Path("/")) -> float | None:
             quota = _quota(folder.joinpath(*names[:depth]))
             found += [] if quota is None else [quota]
     return min(found, default=None)
+
+
+def _lines(file: Path) -> list[str]:
+    """Of a file with names that may be in any encoding."""
+    return file.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
 
 
 def _quota(group: Path) -> float | None:
