@@ -148,7 +148,7 @@ def test_a_second_signal_does_not_leave_the_call_behind():
         done.append(True)
         return 0
 
-    with pytest.raises(KeyboardInterrupt), signals(*[signal.SIGINT] * 3):
+    with pytest.raises(KeyboardInterrupt), signals(signal.SIGINT, signal.SIGINT):
         stopping.stoppable(library.load_core(), call)
     assert done
 
