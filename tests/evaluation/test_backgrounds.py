@@ -113,21 +113,21 @@ def test_a_training_says_whose_choice_its_background_is(tmp_path):
 
 
 def test_a_bright_subject_is_trained_over_black(tmp_path):
-    """A masked one, as its brightness along its outline is, whatever its middle. Photographs with alpha
-    of their own are for white."""
-    inside = np.zeros((24, 32), bool)
-    inside[4:20, 6:26] = True
-    rim = inside.copy()
-    rim[5:19, 7:25] = False
+    """A masked one, as its brightness along its outline is, whatever its middle, and whatever the outermost
+    pixels, which are mixed with what was behind. Photographs with alpha of their own are for white."""
+    inside, other = np.zeros((48, 64), bool), np.ones((48, 64), bool)
+    inside[6:42, 8:56] = True
+    other[8:40, 10:54] = False
+    other[10:38, 12:52] = True
     for at_rim, name, words in (
         (200, "black", "black, as the subject is bright"),
         (60, "white", "white, as usual"),
     ):
-        folder = simple_colmap(tmp_path / name, 3, (32, 24))
+        folder = simple_colmap(tmp_path / name, 3, (64, 48))
         (folder / "masks").mkdir()
         for path in sorted((folder / "images").iterdir()):
-            pixels = np.full((24, 32, 3), 255 - at_rim, np.uint8)
-            pixels[rim] = at_rim
+            pixels = np.full((48, 64, 3), at_rim, np.uint8)
+            pixels[other] = 255 - at_rim
             Image.fromarray(pixels).save(path)
             Image.fromarray(inside).save(folder / "masks" / f"{path.name}.png")
         dataset, found = PhotographOptions(masks="subject").load(folder, TrainConfig())

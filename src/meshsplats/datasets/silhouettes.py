@@ -23,6 +23,9 @@ MOST = 0.5
 rules out what these show."""
 LOOKED_AT = 24
 """Views with alpha, at most and evenly spread, that tell: each must be read."""
+RIM, RIM_SIDE = 2, 200
+"""Distance from the outline, in pixels of an image with at least such a longer side, at which the rim of a
+subject begins, and its width."""
 WHOLE = 0.999
 """Alpha from which nothing behind a pixel shows in its colour."""
 
@@ -60,26 +63,37 @@ def has_silhouettes(views: Sequence[View]) -> bool:
 
 def outline_brightness(views: Sequence[View]) -> float:
     """Mean display brightness, 0 to 1, of the subject along its outline in ``views``, which are cut out; 0.5
-    where there is none."""
+    where there is none. The outermost pixels, in which photographs mix it with what was behind, do not
+    count."""
     total, count = 0.0, 0
     for view in subsample(views, LOOKED_AT):
         image = view.load()
         if image.alpha is None:
             continue
-        inside = image.alpha >= OPAQUE * _unit(image)
-        beside = np.zeros_like(inside)  # pixels with a clear one beside them
-        beside[1:] |= ~inside[:-1]
-        beside[:-1] |= ~inside[1:]
-        beside[:, 1:] |= ~inside[:, :-1]
-        beside[:, :-1] |= ~inside[:, 1:]
-        rim = inside & beside
+        step = max(1, max(image.alpha.shape) // RIM_SIDE)
+        color, alpha = image.color[::step, ::step], image.alpha[::step, ::step]
+        inside = alpha >= OPAQUE * _unit(image)
+        outer = _eroded(inside, RIM)
+        rim = outer & ~_eroded(outer, RIM)
         if image.mask is not None:
-            rim &= image.mask
-        shares = image.alpha[rim].astype(np.float64)
-        colors = image.color[rim].astype(np.float64)  # premultiplied
+            rim &= image.mask[::step, ::step]
+        shares = alpha[rim].astype(np.float64)
+        colors = color[rim].astype(np.float64)  # premultiplied
         total += float((colors.mean(axis=1) / shares).sum())
         count += len(shares)
     return total / count if count else 0.5
+
+
+def _eroded(inside: np.ndarray, pixels: int) -> np.ndarray:
+    """(h, w) bool: ``inside`` (h, w) without what is up to so many pixels from others."""
+    for _ in range(pixels):
+        kept = inside.copy()
+        kept[1:] &= inside[:-1]
+        kept[:-1] &= inside[1:]
+        kept[:, 1:] &= inside[:, :-1]
+        kept[:, :-1] &= inside[:, 1:]
+        inside = kept
+    return inside
 
 
 def with_clear_pixels_masked(dataset: Dataset) -> Dataset:
