@@ -79,12 +79,14 @@ def test_executable_is_run_from_another_folder(program, tmp_path, monkeypatch):
 
 
 def test_nothing_is_imported_from_the_current_folder(tmp_path, monkeypatch):
-    """It may be a downloaded one, with a json.py in it."""
+    """It may be a downloaded one, with a json.py in it; temporary files may lie there."""
+    monkeypatch.setattr(tempfile, "tempdir", os.curdir)
     (tmp_path / "json.py").write_text("open('ran', 'w').close(); raise SystemExit")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep)
     monkeypatch.setattr(launch, "command", lambda executable: [sys.executable, "-m", launch.worker.__name__])
     with launch.begun(SceneOptions(engine="cycles")) as job:
+        assert job.folder.is_absolute()
         (job.folder / launch.JOB).write_text("[]")  # no job: it ends
         said = job.process.stdout.read()
         job.process.wait()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -253,6 +255,15 @@ def test_what_happens_to_the_other_process_is_an_error_here(tmp_path, monkeypatc
     (tmp_path / "m.usda").write_text(stage(shape()))
     with pytest.raises(FileFormatError, match=match):
         load_mesh(tmp_path / "m.usda")
+
+
+@needs_usd
+def test_temporary_files_may_lie_in_the_current_folder(tmp_path, monkeypatch):
+    """Where TMPDIR is "." or no other folder can be written."""
+    save_mesh(MESH, tmp_path / "m.usda")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", os.curdir)
+    assert len(load_mesh("m.usda").faces) == len(MESH.faces)
 
 
 @pytest.mark.slow

@@ -217,7 +217,7 @@ def _scratch() -> Iterator[tuple[Path, int]]:
                 os.close(descriptor)
                 shutil.rmtree(old.parent, ignore_errors=True)
     while True:
-        folder = Path(tempfile.mkdtemp(prefix=prefix))
+        folder = Path(tempfile.mkdtemp(prefix=prefix)).absolute()  # TMPDIR may be "."
         descriptor = None
         with suppress(FileNotFoundError):  # another process has just removed it
             descriptor = try_lock(folder / "lock")

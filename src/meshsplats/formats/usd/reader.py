@@ -108,10 +108,10 @@ def extracted(
         raise MissingDependencyError(f"{path}: reading USD needs the extra 'usd': pip install usd-core")
     budget = Budget(path)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
-        result, file = Path(folder) / "arrays.npz", path.resolve()
+        result, file = Path(folder).absolute() / "arrays.npz", path.resolve()
         with Content(path) as content:
             if content.usd_layer is not None:
-                file = Path(folder) / "packed.usd"
+                file = result.with_name("packed.usd")
                 with content.open_usd() as packed, open(file, "wb") as copy:
                     shutil.copyfileobj(packed, copy)
         report = _extract(module, file, path, result, origin)
