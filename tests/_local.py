@@ -14,6 +14,10 @@ import pytest
 
 SHARED = Path(os.environ.get("MESHSPLATS_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
+linux_names = pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="other systems have other limits of names"
+)
+
 
 def shared_data(path: str) -> Path:
     """A file of the local collection of real data, which is no part of the project; skips without it."""

@@ -7,7 +7,7 @@ import json
 import _splat_encoders as encode
 import numpy as np
 import pytest
-from _local import make_link
+from _local import linux_names, make_link
 from _splat_files import expected_cloud, random_splats
 from _splats import refused
 
@@ -180,8 +180,8 @@ for _ in range(70):
         (tile("https://example.com/0.glb"), "no path below its folder"),
         (tile("%2e%2e/0.glb"), "no path below its folder"),
         (tile("/etc/passwd"), "no path below its folder"),
-        (tile("\ud800.glb"), "no path below its folder"),
-        (tile("\u00e9" * 200 + ".glb"), "no path below its folder"),
+        pytest.param(tile("\ud800.glb"), "no path below its folder", marks=linux_names),
+        pytest.param(tile("\u00e9" * 200 + ".glb"), "no path below its folder", marks=linux_names),
         (tile("9.glb"), "'9.glb' that it names is missing"),
         (tile(None, [tile("0.glb"), tile("0.glb")]), "names '0.glb' twice"),
         (tile("tileset.json"), "names 'tileset.json' twice"),
