@@ -13,8 +13,8 @@ from meshsplats.datasets.views import ImageCache, ViewImage
 from meshsplats.images.reading import load_image
 
 FINE = 2.5
-"""Pixels along a side for each pixel of the undistorted image that suffice: photographs with twice as many are
-made smaller first, down to about these. Finer ones take long, for what cannot be seen."""
+"""Pixels along a side for each pixel of the undistorted image that suffice: photographs with twice as many
+are made smaller first, down to about these. Finer ones take long, for what cannot be seen."""
 
 
 @dataclass(frozen=True, eq=False)
