@@ -49,7 +49,7 @@ def run(program: str) -> str:
 
 def test_import_loads_no_module_of_ours_before_it_is_used():
     loaded = run("import sys, meshsplats; print(*[m for m in sys.modules if m.startswith('meshsplats')])")
-    assert set(loaded.split()) == {"meshsplats", "meshsplats._common.lazy"}
+    assert set(loaded.split()) == {"meshsplats", "meshsplats._common", "meshsplats._common.lazy"}
 
 
 def test_everything_public_needs_numpy_alone():
