@@ -322,7 +322,7 @@ def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, opti
 def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, monkeypatch):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
     killed_in_the_preview(
-        tmp_path, "clean", "scene.ply", "-o", "out.ply", function="save_strip", module="edits"
+        tmp_path, "clean", "scene.ply", "-o", "out.ply", function="save_strip", module="operations.edits"
     )
     killed_in_the_preview(tmp_path, "simplify", "scene.ply", "-o", "out.ply", "--share", "0.5")
     assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == ["scene.ply"]
