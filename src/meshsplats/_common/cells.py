@@ -7,6 +7,8 @@ from copy import copy
 
 import numpy as np
 
+from meshsplats._common.chunks import chunks
+
 _STEPS = [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 """From the key of a cell to those of the 26 cells around it, and its own."""
 _MOST = 1 << 20
@@ -52,8 +54,7 @@ class Cells:
 
     def _blocks(self) -> Iterator[np.ndarray]:
         """(k, 3) points, with those on the ways to their ends, for few of them at a time."""
-        for first in range(0, len(self._points), _CHUNK):
-            part = slice(first, first + _CHUNK)
+        for part in chunks(len(self._points), _CHUNK):
             points = self._points[part]
             if self._ends is not None:
                 ends = self._ends[part].astype(np.float64)
@@ -117,8 +118,8 @@ class Cells:
     def _apart(self) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of cells, by their indices, of points and their ends that are not in cells side by side."""
         count, codes = len(self._cells), [np.zeros(0, np.int64)]
-        for first in range(0, len(self._of), _CHUNK):
-            of = self._of[first : first + _CHUNK]
+        for part in chunks(len(self._of), _CHUNK):
+            of = self._of[part]
             own, end = np.broadcast_arrays(of[:, :1], of[:, 1:])
             other = own != end
             codes.append(_different(own[other] * count + end[other]))
@@ -136,9 +137,8 @@ class Cells:
 
 def _numbered(keys: np.ndarray) -> np.ndarray:
     """The different ``keys`` (n,) int64, ascending; writes the index among them of each in its place."""
-    parts = [slice(first, first + 8 * _CHUNK) for first in range(0, len(keys), 8 * _CHUNK)]
     found = []
-    for part in parts:
+    for part in (parts := chunks(len(keys), 8 * _CHUNK)):
         own, of = np.unique(keys[part], return_inverse=True)
         keys[part] = of.reshape(-1)
         found.append(own)

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshsplats._common.chunks import chunks
 from meshsplats._common.kinds import need, need_all
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
 from meshsplats.scene.camera import Camera
 from meshsplats.scene.face_splats import FaceSplats

@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from meshsplats._common.cells import Cells
+from meshsplats._common.chunks import chunks
 from meshsplats._common.geometry import spacing
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from meshsplats._common.chunks import chunks, thin_product
 from meshsplats._common.geometry import rotation_rows
-from meshsplats.conversion.chunks import chunks, thin_product
 
 CHUNK = 1 << 13
 """Splats per chunk: its arrays stay in the processor's cache."""

@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from meshsplats._common.arrays import spread_indices
+from meshsplats._common.chunks import chunks, thin_product
 from meshsplats._common.geometry import spacing
 from meshsplats.cameras.framing import SAMPLE, guess_up
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.scene.camera import Camera, hiding_near_plane
 from meshsplats.scene.gaussians import SH_C0, GaussianCloud, Kernel

@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._common.arrays import subsample
+from meshsplats._common.chunks import chunks
 from meshsplats._common.geometry import quaternions_of
 from meshsplats._common.kinds import need, need_all
 from meshsplats._core.library import check_threads, processors
-from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import CameraCoverage, usual_pixels, widen
 from meshsplats.conversion.merging_coverage import Parts, Wholes, covered_shares
 from meshsplats.conversion.merging_groups import Groups, Moments, covariances_of, groups_of

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._common.arrays import subsample
+from meshsplats._common.chunks import chunks
 from meshsplats._core.neighbours import nearest
-from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.driver import Driver
 from meshsplats.conversion.footprint import CameraCoverage, SceneSample, SceneViews
 from meshsplats.conversion.options import ConversionOptions
