@@ -141,33 +141,24 @@ def call(
     """Runs a function of the core that draws, or the backward pass of one. Raises MemoryError, RuntimeError
     or, for splats that share vertices and cannot be filtered, ValueError, with the core's message; if what
     answers a signal raises, as KeyboardInterrupt, that."""
-    message = ctypes.create_string_buffer(256)
-    core = load_core()
     count = scene.count if isinstance(scene, SplatsStruct) else scene.face_count
     most = count * camera.width * camera.height * options.samples**2
-
-    def work() -> int:
-        status: int = getattr(core, name)(scene, camera, options, *arguments, message, len(message))
-        return status
-
-    status = stoppable(core, work) if most > QUICK_FRAGMENTS else work()
+    given = scene, camera, options, *arguments
+    status, text = _status(load_core(), name, given, is_long=most > QUICK_FRAGMENTS)
     if status == 1:
-        raise MemoryError(
-            f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time"
-        )
+        raise MemoryError(f"{name}: {text}; render fewer triangles, pixels or samples at a time")
     if status == 3:
         raise ValueError(
-            f"{message.value.decode()}: the filter moves each splat's vertices on their own. Give every splat"
+            f"{text}: the filter moves each splat's vertices on their own. Give every splat"
             " its own vertices, or draw without the filter (filter_px2=0)"
         )
     if status:
-        raise RuntimeError(f"{name}: {message.value.decode()}")
+        raise RuntimeError(f"{name}: {text}")
 
 
 def run(name: str, argument: ctypes.Structure) -> None:
     """Runs a function of the core that takes one structure. Raises MemoryError, or ValueError with the core's
     message; ImportError if the core does not have it; one of ``LONG`` also as ``call`` does."""
-    message = ctypes.create_string_buffer(256)
     core = load_core()
     if not hasattr(core, name) and "baseline" in available_variants():
         core = load_core("baseline")  # has what gains nothing from wide vectors
@@ -175,17 +166,23 @@ def run(name: str, argument: ctypes.Structure) -> None:
         raise ImportError(
             f"the compiled core has no {name}: it is older than the Python code, install the package again"
         )
-
-    def work() -> int:
-        status: int = getattr(core, name)(ctypes.byref(argument), message, len(message))
-        return status
-
-    status = stoppable(core, work) if name in LONG else work()
-    text = message.value.decode()
+    status, text = _status(core, name, (ctypes.byref(argument),), is_long=name in LONG)
     if status == 1:
         raise MemoryError(f"{name}: {text}")
     if status:
         raise ValueError(text)
+
+
+def _status(core: ctypes.CDLL, name: str, arguments: tuple[object, ...], *, is_long: bool) -> tuple[int, str]:
+    """The status that a function of the core returns, and its message. Signals end one that ``is_long``."""
+    message = ctypes.create_string_buffer(256)
+
+    def work() -> int:
+        status: int = getattr(core, name)(*arguments, message, len(message))
+        return status
+
+    status = stoppable(core, work) if is_long else work()
+    return status, message.value.decode()
 
 
 def check_threads(threads: int | None) -> None:
