@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats.datasets.silhouettes import has_silhouettes
 from meshsplats.datasets.splat_targets import RenderedSplats, are_rendered
-from meshsplats.datasets.views import View
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, HARMONICS_RATE, FinetuneConfig
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
@@ -119,9 +119,20 @@ def uses_point_targets(view: View, config: FinetuneConfig, fraction: float) -> b
     return fraction < config.point_share and isinstance(source, RenderedSplats) and source.look == "area"
 
 
+def exposure_of(state: State, view: int) -> np.ndarray | None:
+    """(6,) gain and offset of the training view of this index, as they are now; None if none are fitted."""
+    return None if state.exposures is None else state.exposures[view]
+
+
 def exposed(image: np.ndarray, exposure: np.ndarray | None) -> np.ndarray:
     """``image`` (..., 3) as a photograph of ``exposure`` (6,) shows it: times the gain, plus the offset."""
     return image if exposure is None else image * exposure[GAIN] + exposure[OFFSET]
+
+
+def exposed_over(image: ViewImage, background: Sequence[float], exposure: np.ndarray | None) -> np.ndarray:
+    """(h, w, 3) float32 ``image``, a photograph of ``exposure``, over a background in the same exposure: what
+    the mesh over ``background``, display RGB, is to be, ``exposed`` as a whole."""
+    return image.over(exposed(np.asarray(background, np.float32), exposure))
 
 
 def target_of(
@@ -133,8 +144,7 @@ def target_of(
 ) -> Target:
     """The target of ``view`` in step ``step``; ``points``: sampled at the pixel centres, not averaged.
 
-    ``exposure`` is that of the whole image of the step. It belongs to the photograph, not to the background
-    that shows through where this is transparent: the target has the background in the same exposure.
+    ``exposure`` is that of the whole image of the step (``exposed_over``).
     """
     image = view.source.points() if points and isinstance(view.source, RenderedSplats) else view.load()
     background = view.background
@@ -143,9 +153,8 @@ def target_of(
         if config.background == "random" or (config.background == "mixed" and step % MIXED_INTERVAL == 1):
             color = np.random.default_rng([config.seed, step, 1]).random(3)
             background = tuple(color.astype(np.float32).tolist())
-    shown = image.over(exposed(np.asarray(background, np.float32), exposure))
     mask = None if image.mask is None else np.ascontiguousarray(image.mask)
-    return Target(shown, mask, background)
+    return Target(exposed_over(image, background, exposure), mask, background)
 
 
 class RenderedView:
@@ -263,7 +272,7 @@ def make_step(
     index = view_of_step(config, step, len(views))
     view = views[index]
     plan = schedule.plan(view, step, fraction)
-    exposure = None if state.exposures is None else state.exposures[index]
+    exposure = exposure_of(state, index)
     target = target_of(view, config, step, plan.points, exposure)
     if target.mask is not None and not target.mask.any():
         return None
@@ -289,7 +298,7 @@ def view_gradients(
     factors = dropout_factors(state, plan.dropout, step) if plan.dropout else None
     taped, linear = state.tape(view.camera, options, factors), state.mesh.blending == "linear"
     rendered = RenderedView(taped, linear, state.harmonics)
-    exposure = None if state.exposures is None else state.exposures[index]
+    exposure = exposure_of(state, index)
     image = exposed(rendered.color, exposure)
     if isinstance(loss, DefaultLoss):
         value, grad_image = loss(image, target)

@@ -10,7 +10,13 @@ import numpy as np
 
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, exposed, samples_of
+from meshsplats.finetuning.step import (
+    TRAINING_MIN_TRANSMITTANCE,
+    exposed,
+    exposed_over,
+    exposure_of,
+    samples_of,
+)
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import scatter_to_vertices
@@ -79,9 +85,9 @@ def score(state: State, views: Sequence[View], turn: int = 0, fraction: float = 
         samples = samples_of(view, state.config, fraction)
         options = TapeOptions(view.background, samples, TRAINING_MIN_TRANSMITTANCE[mesh.blending])
         rendering = drawing.tape(triangles, view.camera, options)
-        exposure = None if state.exposures is None else state.exposures[index]
+        exposure = exposure_of(state, index)
         image = exposed(rendering.color, exposure)
-        target = view.load().over(exposed(np.asarray(view.background, np.float32), exposure))
+        target = exposed_over(view.load(), view.background, exposure)
         counts = np.ones(image.shape[:2], np.float32)
         difference = np.square(image - target).sum(axis=2)
         if view.mask is not None:
