@@ -103,7 +103,7 @@ def printable(text: str) -> str:
 
 def natural_key(name: str) -> list[int | str]:
     """What names are sorted by for their natural order: ``view_2`` before ``view_10``."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", name))]
 
 
 def plural(count: int, noun: str, several: str = "") -> str:

@@ -7,12 +7,12 @@ is made of the photographs themselves (Sivic and Zisserman 2003: Video Google).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
 
 from meshsplats._common.arrays import subsample
+from meshsplats._common.words import natural_key
 
 ALL_UP_TO = 60
 """Photographs up to which all pairs are matched."""
@@ -30,16 +30,11 @@ ROUNDS = 6
 """Rounds of k-means."""
 BLOCK = 4096
 """Features that are compared with the words together."""
-_NUMBERS = re.compile("([0-9]+)")
 
 
 def in_sequence(names: Sequence[str]) -> list[str]:
     """``names`` as they are counted: 2.jpg before 10.jpg."""
-
-    def key(name: str) -> list[str | int]:
-        return [int(part) if i % 2 else part for i, part in enumerate(_NUMBERS.split(name))]
-
-    return sorted(names, key=key)
+    return sorted(names, key=natural_key)
 
 
 def alike_pairs(descriptors: Sequence[np.ndarray]) -> np.ndarray:
