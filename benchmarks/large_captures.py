@@ -3,10 +3,11 @@
     python benchmarks/large_captures.py SPLATS [SPLATS ...] [--copies N] [--purposes NAME ...] [--minutes X]
 
 Each command runs in a process of its own. Columns: processor seconds, seconds by the clock and the share of
-the processors that other programs took meanwhile, peak memory, triangles, size. dB: two views of an orbit,
-800 x 800 pixels, on white, against the splats with all degrees, look 'area'. *sorted*: triangles sorted at
-every sample; *viewer*: a blended or masked .glb as three.js draws it with MSAA (`viewer_images`). Of a page,
-its fine mesh as the page has it; of tiles, those with an error of a pixel at most; of splats, those left.
+the processors that other programs took meanwhile, peak memory, triangles, size. dB: four views, of a place
+those that are found in it first, of an object from around it, 800 x 800 pixels, on white, against the splats
+with all degrees, look 'area'. *sorted*: triangles sorted at every sample; *viewer*: a blended or masked .glb
+as three.js draws it with MSAA (`viewer_images`). Of a page, its fine mesh as the page has it; of tiles, those
+with an error of a pixel at most; of splats, those left.
 
 --copies N: first makes a cloud of N copies of each file, side by side, turned and in other shades. --blender:
 a Python with bpy and meshsplats, for the purpose 'blender'.
@@ -33,8 +34,9 @@ from _common import Report, areas, arguments, images, mean_psnr, run
 import meshsplats as ms
 from meshsplats.rendering.viewers import viewer_images
 from meshsplats.viewer.unpacking import unpack_mesh
+from meshsplats.viewpoints.showing import default_views
 
-VIEWS, SIDE = 2, 800
+VIEWS, SIDE = 4, 800
 MESH_BEGINS = '<script type="text/plain" id="mesh">'
 PURPOSES = {
     "page": ["view {input} -o page.html"],
@@ -162,7 +164,8 @@ def save_copies(path: Path, target: Path, count: int) -> None:
 @cache
 def truth(path: Path) -> tuple[list[ms.Camera], list[np.ndarray]]:
     cloud = ms.load_gaussians(path)
-    cameras = ms.orbit(cloud, VIEWS, width=SIDE, height=SIDE)
+    of_place = default_views(cloud, path, VIEWS, side=(SIDE, SIDE))
+    cameras = of_place[0] if of_place else ms.orbit(cloud, VIEWS, width=SIDE, height=SIDE)
     return cameras, areas(cloud, cameras)
 
 
