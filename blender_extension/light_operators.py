@@ -126,7 +126,9 @@ class SetShading(Modal, bpy.types.Operator):
         if self._own:  # lamps alone do not light them
             bake(self, context, done, work.choices["fast"])
         if self.shading == "lit" and is_dark(context.scene):
-            self.report({"WARNING"}, "MeshSplats: no lamp lights it: choose Sun to Studio")
+            self.report(
+                {"WARNING"}, "MeshSplats: nothing lights the splats: click Sun, Noon, Overcast or Studio"
+            )
 
 
 class SetUpRender(bpy.types.Operator):

@@ -50,7 +50,7 @@ def modifier_warning(obj):
     if LIT not in obj.data:
         return ""
     broken = next((m for m in obj.modifiers if m.type in BREAK_SPLATS and m.show_render), None)
-    return "" if broken is None else f"{broken.name} tears splats to strips: Cut Splats cuts whole ones"
+    return "" if broken is None else f"{broken.name} cuts through splats and leaves strips: use Cut Splats"
 
 
 def draw_warning(layout, text):

@@ -84,7 +84,7 @@ def test_from_photographs(tmp_path, monkeypatch, capsys):
     write_photographs(tmp_path / "photos", cameras, [render_splats(cloud, c).color for c in cameras])
     monkeypatch.chdir(tmp_path)
     run_all(TUTORIALS / "from_photographs.md", capsys)
-    assert {"check", "scores", "tuned_exposure.npz"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"check", "scores", "exposures.npz"} <= {p.name for p in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize("path", sorted(TUTORIALS.glob("*.md")), ids=lambda p: p.stem)

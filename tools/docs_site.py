@@ -32,18 +32,11 @@ NAVIGATION = {
         *("docs/tutorials/from_a_splat_file", "docs/tutorials/places", "docs/tutorials/from_photographs")
     ],
     "Using it": [
-        *("docs/install", "docs/commands", "docs/python", "docs/files", "docs/quality", "docs/options"),
-        "docs/view-dependent-colour",
-        *(
-            "docs/large-captures",
-            "docs/pipelines",
-            "docs/finetuning",
-            "docs/levels",
-            "docs/surfaces",
-            "docs/mesh-prior",
-        ),
-        "docs/datasets",
-        *("docs/blender", "docs/viewers", "docs/cluster", "examples"),
+        *("docs/install", "docs/commands", "docs/python", "docs/pipelines", "docs/files", "docs/viewer"),
+        *("docs/blender", "docs/viewers", "docs/quality", "docs/view-dependent-colour"),
+        *("docs/finetuning", "docs/training", "docs/datasets", "docs/surfaces", "docs/mesh-prior"),
+        *("docs/large-captures", "docs/levels", "docs/tiles", "docs/cluster", "docs/webgpu"),
+        *("docs/options", "docs/terms", "examples"),
     ],
     "Python": [],  # the reference
     "How it works": ["docs/method", "docs/conventions", "docs/architecture", "benchmarks/RESULTS"],

@@ -24,7 +24,7 @@ from itertools import pairwise
 from numbers import Real
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from meshsplats.errors import OptionValueError
+from meshsplats.errors import OptionsError, OptionValueError
 
 M = TypeVar("M")
 NUMBERS = (Real,)
@@ -258,7 +258,8 @@ def check_options(
         types: accepted types of numbers; bool is never one.
 
     Raises:
-        OptionValueError: a value of the wrong type, out of range, or without effect.
+        OptionValueError: a value of the wrong type or out of range.
+        OptionsError: one without effect.
     """
     for name, setting in settings(type(options)).items():
         value = getattr(options, name)
@@ -268,7 +269,7 @@ def check_options(
         if condition is not None and is_given and not condition.met(options):
             got = " and ".join(f"{other} {getattr(options, other)!r}" for other in condition.values)
             but = f", got {got}" if got else ""
-            raise OptionValueError(f"``{name}`` has no effect without {condition}{but}")
+            raise OptionsError(f"``{name}`` has no effect without {condition}{but}")
 
 
 def check_naming(group: type, how: Callable[[str], str]) -> Callable[[Any], None]:

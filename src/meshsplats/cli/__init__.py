@@ -234,7 +234,7 @@ def _overview() -> str:
         "Gaussian splats as ordinary triangle meshes: convert, render exactly, compare, save.\n\n"
         f"commands:\n{commands}\n\n"
         "  meshsplats COMMAND --help   the most used options of a command; --help-all: all of them\n"
-        "  --set NAME=VALUE            with any command: an option without a flag (docs/options.md)\n"
+        "  --set NAME=VALUE            with most commands: an option without a flag (docs/options.md)\n"
         "  meshsplats --version\n"
         "  --debug                     with any command: the full traceback of an error\n\n"
         "exit codes: 0 done, 1 wrong input, 2 wrong usage, 3 the output exists, 4 no space, 5 something is\n"

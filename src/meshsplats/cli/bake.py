@@ -26,11 +26,11 @@ class BakeOptions(BakingOptions):
 
 @dataclass(frozen=True)
 class Bake(Command):
-    """Applies the low-pass filter of a mesh to its triangles, for viewers, engines and Blender, which have no
-    such filter; with --colors, also gives each vertex one colour instead of one for each view.
+    """Makes the low-pass filter of a mesh part of its triangles, for viewers and engines, which have none;
+    with --colors, also gives each vertex one colour for all views.
 
-    'convert --set footprint=filter' makes meshes with a filter. The result is right for these views and this
-    image size; nearer it is soft, farther away thin.
+    Meshes have a filter after 'convert --set footprint=filter'. The result is right for these views and this
+    image size: seen from nearer it is too soft, from farther away too thin.
     """
 
     COMMON = (

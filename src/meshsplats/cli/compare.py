@@ -43,7 +43,7 @@ class Compare(Command):
     splats: tyro.conf.Positional[Path]
     """Splat file or model folder."""
     mesh: tyro.conf.Positional[option.File] = None
-    """The mesh. Default: the splats, converted with --preset for these cameras."""
+    """The mesh to compare; may be left out: the splats are then converted with --preset for these cameras."""
     output: option.Output = tyro.MISSING
     """Folder for strips, results.json, cameras.json and config.toml."""
     how: Annotated[CompareOptions, Flat] = field(default_factory=CompareOptions)

@@ -30,7 +30,7 @@ class Deform(Command):
     input: tyro.conf.Positional[Path]
     """The result of 'meshsplats prior': .npz or .glb."""
     base: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE...")]
-    """The edited base, or several, by their numbers if in alphabetical order: its vertices, moved."""
+    """The edited base: the same vertices, moved; or several, such as frames, for a file each."""
     output: option.Output
     """The moved splats: .glb, .npz (both can be moved again), .ply, .usdc, .obj. With several bases, files
     are numbered: edited.glb becomes edited_0001.glb, edited_0002.glb ..."""

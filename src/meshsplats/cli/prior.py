@@ -14,7 +14,7 @@ from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import SplatOptions
 from meshsplats.cli.messages import say
 from meshsplats.cli.training import TrainingCommand, tuning_options
-from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.config import CUTTING, FinetuneConfig
 from meshsplats.prior.options import LayingOptions, prior_config
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from meshsplats.prior.planning import PriorTraining
 
 
-# Layers on a base share a depth, which only the order of fragments knows.
-@tuning_options({"default": prior_config()}, without=("order",))
+# Layers on a base share a depth, which only the order of fragments knows, and are never cut.
+@tuning_options({"default": prior_config()}, without=("order", *CUTTING))
 class PriorTuningOptions(FinetuneConfig):
     """The optimisation."""
 

@@ -48,7 +48,7 @@ class Render(Command):
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, a mesh, or the folder of a tileset."""
     output: option.Output
-    """A .png for one view, or a folder. Without other options: the front view, or an orbit of 60 views."""
+    """A .png for one view, by default of the side that shows most; or a folder, of an orbit of 60 views."""
     images: Annotated[RenderOptions, Flat] = field(default_factory=RenderOptions)
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
     json: option.AsJson = False

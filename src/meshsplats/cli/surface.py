@@ -35,8 +35,8 @@ class FileArguments(SurfaceFileOptions):
 
 @dataclass(frozen=True)
 class Surface(Command):
-    """Makes a light, connected, textured mesh of the surface that splats form: to be lit, edited, walked on,
-    printed, or to carry a mesh prior.
+    """Makes a textured mesh of few triangles of the surface that splats form: connected, opaque, to light,
+    edit, walk on or print, or as the base of a mesh prior.
 
     Writes a preview and the configuration beside it.
     """

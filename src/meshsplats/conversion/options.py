@@ -92,10 +92,11 @@ class ConversionOptions:
     """Box x0 y0 z0 x1 y1 z1, in coordinates of the world, as ``info`` prints them: leave out splats whose
     centre is outside."""
     max_splats: Annotated[int | None, Range(1, 2**31 - 1)] = None
-    """Largest number of splats: see ``budget``."""
+    """Largest number of splats: where there are more, similar ones are merged (or, by ``budget``,
+    dropped)."""
     max_triangles: Annotated[int | None, Range(1, 2**31 - 1)] = None
-    """Largest number of triangles: see ``budget``. In mode 'flat', unless ``sides``, ``rings``,
-    ``rim_radius`` or ``center_opacity`` is given, splats first get fewer triangles each, at least 4."""
+    """Largest number of triangles: beyond it, similar splats are merged. Flat splats get fewer triangles each
+    first, 4 at least, unless ``sides``, ``rings``, ``rim_radius`` or ``center_opacity`` is given."""
     budget: Annotated[Budget | None, Advanced] = None
     """How to keep to ``max_splats`` and ``max_triangles``. merge: merge similar splats. drop: keep only the
     most important ones, by opacity times area in the images of the cameras (splats that no camera sees count

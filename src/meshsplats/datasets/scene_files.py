@@ -208,4 +208,5 @@ class PartOfScene:
     """Part of the scene."""
 
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Only splats with their centre in this box, in the coordinates of the file; 'info' prints its extent."""
+    """Only splats with their centre in this box, X0 Y0 Z0 X1 Y1 Z1, in the coordinates that ``info``
+    prints."""

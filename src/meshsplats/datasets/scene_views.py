@@ -23,7 +23,11 @@ if TYPE_CHECKING:
     Origin = Sequence[float] | np.ndarray
 
 MissingOfData = Annotated[
-    Missing, Help("With ``data``: missing images are left out; few: if fewer than half are missing.")
+    Missing,
+    Help(
+        "With ``data``, where images are missing. few: leave their views out if fewer than half are missing,"
+        " else an error; skip: leave any number out; error: always an error."
+    ),
 ]
 """An option of whatever has an option ``data``, a data set of photographs."""
 MasksOfData = Annotated[

@@ -17,6 +17,11 @@ Unit = Literal["splat", "scene"]
 BackgroundMode = Literal["mixed", "random", "white", "black"]
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
+CUTTING = (
+    *("opacity", "cutoff", "anneal_share", "expected_share", "settle_share"),
+    *("hidden_hits", "opaque_share", "soft_share", "soft_phase"),
+)
+"""Options of meshes that a depth buffer draws."""
 
 HARMONICS_RATE = 0.02
 """``harmonics_rate`` for images of splats."""
@@ -101,9 +106,8 @@ class FinetuneConfig:
     learning rate does. Opacities stay high only where the views keep them there: what floats in front of
     surfaces fades, and what is hidden behind others gets gradients. For opacity 'blended'."""
     exposure: Annotated[bool | None, With(opacity="blended")] = False
-    """For photographs: fit a gain and an offset per colour channel for each training image, so that exposure
-    differences are not baked into the mesh. Their means over all images stay 1 and 0. Default of ``train``:
-    where photographs are found to differ."""
+    """For photographs: fit a gain and an offset per colour channel to each training image, so that
+    differences in exposure are not baked into the mesh. Their means over all images stay 1 and 0."""
     exposure_rate: Annotated[float, Range(1e-9, 1), With("exposure"), Advanced] = 0.002
     """Adam's learning rate of these gains and offsets."""
     prune_epochs: Annotated[float, Range(0, 1e6), Advanced] = 5.0

@@ -93,9 +93,10 @@ class ChainOptions:
     format: MeshEnding = "glb"
     """File format of the meshes."""
     alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
-    """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
-    not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
-    cut there. ordered: in an order of blending, tuned through it, for web viewers and engines that cull."""
+    """.glb: auto: blend or mask for all levels, whichever brings the first one nearer to the sorted image in
+    viewers that do not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format):
+    solid triangles, cut at 20 %. ordered: triangles in an order of blending that the levels are tuned
+    through, for web viewers and engines that cull back sides."""
     order: Order | None = None
     """In which triangles are blended and tuned; None: that of the meshes and of the configuration."""
     sh_degree: int | None = None
@@ -189,11 +190,12 @@ class ScoringOptions:
     downscale: int | None = None
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
-    """Every n-th view is held out, if the data set has no split."""
+    """Every n-th view is held out, if the data set has no split; 0: none, and all are scored."""
     missing: MissingOfData = "few"
     masks: MasksOfData = "count"
     protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
-    """Score all scenes of a benchmark as in the paper's Table 1."""
+    """Score all scenes of a benchmark at its resolution and with its split. mipnerf360: the seven scenes in
+    Table 1 of the MeshSplats paper; mipnerf360-9: all nine."""
     tune: Preset | None = None
     """With ``protocol``: first fine-tune each scene on its training views, with this preset."""
     strips: int = 8

@@ -58,8 +58,9 @@ class SurfaceFileOptions:
     image: base_meshes.TextureImage | None = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     collision: base_meshes.Collision | None = None
-    """(.glb, USD) A static collider for engines, which is drawn, too, or not; or (.glb) convex parts of it
-    that Unreal takes for its collider. Default: none."""
+    """Mark the surface as a static collider for engines. drawn (.glb, USD): it is drawn, too; only (.glb,
+    USD): it is not; convex (.glb): it is drawn, and convex parts of it are its collider in Unreal. Default:
+    no collider."""
     scale: float | None = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""
     no_preview: bool = False

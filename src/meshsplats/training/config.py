@@ -30,6 +30,7 @@ class TrainConfig(FinetuneConfig):
     position_rate: float = 0.12
     position_pixels: float = 0.0
     harmonics_rate: float | None = HARMONICS_RATE
+    """Adam's learning rate of the spherical harmonics. It falls as that of colours does. 0: they stay 0."""
     l2_weight: float = 10.0
     opacity: Annotated[Literal["blended", "cutoff"], Fixed(_GROWS)] = "blended"
     prune_epochs: Annotated[float, Fixed(_GROWS)] = 0.0
@@ -41,6 +42,9 @@ class TrainConfig(FinetuneConfig):
         Literal["mesh", "display", "linear"], Fixed("while training: fine-tune the result with another")
     ] = "mesh"
     order: Literal["mesh", "fragment", "splat"] = "mesh"
+    """Order in which triangles are blended at the end of the run, and in the mesh. mesh, fragment: exact at
+    every sample, as ray tracers draw. splat: whole fans by their centres, for programs that sort those;
+    faster."""
     exposure: bool | None = None
     opacity_decay: float = 0.003
     dropout: float | None = None

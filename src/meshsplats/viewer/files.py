@@ -48,7 +48,8 @@ class ViewingOptions:
     splats: Path | None = None
     """Splats to compare a mesh with. Default: the input, where that is splats."""
     surface: Path | None = None
-    """A surface to compare the input with (.glb or .obj with its texture, or any mesh)."""
+    """A surface to compare the input with: .glb or .obj with its texture, or another opaque mesh, not one of
+    splats."""
     without_splats: bool = False
     """Leave the splats out: the page is smaller."""
     max_triangles: int | None = None

@@ -81,8 +81,8 @@ def own_splats(mesh: SplatMesh, name: str) -> GaussianCloud:
         raise ValueError(_refusal(name, str(error))) from None
     cut = int((~whole).sum())
     if cut:
-        parts = "a part of it is no whole splat" if cut == 1 else f"{cut:,} parts of it are no whole splats"
-        raise ValueError(_refusal(name, f"{parts}, which another conversion would lose"))
+        parts = "a splat in it is" if cut == 1 else f"{cut:,} splats in it are"
+        raise ValueError(_refusal(name, f"{parts} incomplete, which another conversion would lose"))
     return cloud
 
 
