@@ -39,7 +39,10 @@ NAVIGATION = {
         *("docs/options", "docs/terms", "examples"),
     ],
     "Python": [],  # the reference
-    "How it works": ["docs/method", "docs/conventions", "docs/architecture", "benchmarks/RESULTS"],
+    "How it works": [
+        *("docs/method", "docs/conventions", "docs/architecture", "docs/webgpu-host"),
+        "benchmarks/RESULTS",
+    ],
     "The project": ["CHANGELOG", "CONTRIBUTING", "docs/releasing", "license"],
 }
 """Pages by section. Documents that are not listed come last in "Using it"."""
