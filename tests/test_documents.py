@@ -27,6 +27,14 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *sorted((ROOT / "integrations").rglob("*.md")),
 ]
+PROSE = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+COLUMNS = 120
+FENCE = re.compile(r"^ *(`{3,}|~{3,}).*?^ *\1", re.MULTILINE | re.DOTALL)
+WHOLE = re.compile(r" *(\|| {4}|!\[|<|(?:[-*] )?\[[^]]*\]\([^)]*\)[.,;:]?$)")
+"""Lines that cannot be broken: rows of tables, indented code, images, HTML, a link alone."""
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 COMMAND = re.compile(r"meshsplats (\w+)((?:\\\n|[^`\n#])*)")
 OF_ALL_COMMANDS = {"--help", "--help-all", "--config", "--set"}
@@ -98,3 +106,21 @@ def test_no_index_is_asked_for_a_package_that_is_on_none(monkeypatch):
     monkeypatch.setattr(library, "available_variants", list)
     with pytest.raises(ImportError, match=rf"a clone or a wheel \(pip install {PACKAGE}\)"):
         library.load_core.__wrapped__()
+
+
+def long_lines(text: str) -> list[str]:
+    """Lines of prose that are longer than ``COLUMNS``."""
+    lines = FENCE.sub("", text).splitlines()
+    return [line for line in lines if len(line) > COLUMNS and not WHOLE.match(line)]
+
+
+def test_long_lines_are_found_in_prose_alone():
+    long = "word " * 30
+    wholes = [f"| {long}|", f"    {long}", f"![{long}](a.png)", f"- [{long}](a.md)", f"```\n{long}\n```"]
+    assert long_lines("\n".join(wholes)) == []
+    assert len(long_lines(f"- {long}\n[a](b.md) {long}\n```sh\n```\n{long}")) == 3
+
+
+@pytest.mark.parametrize("path", PROSE, ids=name_of)
+def test_lines_of_prose_are_short(path):
+    assert long_lines(path.read_text("utf-8")) == []
