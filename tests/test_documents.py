@@ -33,8 +33,8 @@ PROSE = [
 ]
 COLUMNS = 120
 FENCE = re.compile(r"^ *(`{3,}|~{3,}).*?^ *\1", re.MULTILINE | re.DOTALL)
-WHOLE = re.compile(r" *(\|| {4}|!\[|<|(?:[-*] )?\[[^]]*\]\([^)]*\)[.,;:]?$)")
-"""Lines that cannot be broken: rows of tables, indented code, images, HTML, a link alone."""
+WHOLE = re.compile(r" *(\|| {4}|!\[|<|(?:[-*] )?\[[^]]*\]\([^)]*\)[.,;:]?$|\S+$)")
+"""Lines that cannot be broken: rows of tables, indented code, images, HTML, a link or a word alone."""
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 COMMAND = re.compile(r"meshsplats (\w+)((?:\\\n|[^`\n#])*)")
 OF_ALL_COMMANDS = {"--help", "--help-all", "--config", "--set"}
@@ -116,7 +116,14 @@ def long_lines(text: str) -> list[str]:
 
 def test_long_lines_are_found_in_prose_alone():
     long = "word " * 30
-    wholes = [f"| {long}|", f"    {long}", f"![{long}](a.png)", f"- [{long}](a.md)", f"```\n{long}\n```"]
+    wholes = [
+        f"| {long}|",
+        f"    {long}",
+        f"![{long}](a.png)",
+        f"- [{long}](a.md)",
+        "word" * 40,
+        f"```\n{long}\n```",
+    ]
     assert long_lines("\n".join(wholes)) == []
     assert len(long_lines(f"- {long}\n[a](b.md) {long}\n```sh\n```\n{long}")) == 3
 
