@@ -43,7 +43,7 @@ NAVIGATION = {
         *("docs/method", "docs/conventions", "docs/architecture", "docs/webgpu-host"),
         "benchmarks/RESULTS",
     ],
-    "The project": ["CHANGELOG", "CONTRIBUTING", "docs/releasing", "license"],
+    "The project": ["CHANGELOG", "CONTRIBUTING", "docs/releasing", "SECURITY", "license"],
 }
 """Pages by section. Documents that are not listed come last in "Using it"."""
 RESULTS = "benchmarks/results/"
