@@ -489,6 +489,14 @@ FOREIGN = {
     "sparse/0/images.bin": ("", "sparse/ holds no cameras and images"),
     "scan/transforms.json": ("{}", "scan/ in it looks like one"),
     "scan.psx": ("", "a project of Metashape"),
+    "opensfm/reconstruction.json": ("[{}]", "OpenDroneMap"),
+    "odm_report/stats.json": ("{}", "OpenDroneMap"),
+    "params/x_calibrated_camera_parameters.txt": ("fileName imageWidth", "Pix4D"),
+    "x.p4d": ("", "a project of Pix4D"),
+    "odometry.csv": ("timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner"),
+    "groundtruth.txt": ("# ground truth\n# timestamp tx ty tz qx qy qz qw\n", "TUM RGB-D"),
+    "metadata.json": ('{"w": 720, "K": [1], "poses": [[]]}', "Record3D"),
+    "pose/0.txt": ("1 0 0 0\n", "NSVF or ScanNet"),
 }
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +16,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image, ImageFilter
 
 from meshsplats.cli import main
+from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.training import video as module
 from meshsplats.training.photographs import PhotographOptions
@@ -31,16 +34,22 @@ av = pytest.importorskip(
     "av", reason="the library of videos is not installed: pip install 'meshsplats[video]'"
 )
 
+Graph = pytest.importorskip("av.filter").Graph
 RATE = 10
 """Frames per second."""
 
 
-def write_video(path: Path, frames: list[np.ndarray], rotation: int = 0) -> Path:
-    """``frames`` (h, w, 3) uint8, to be shown turned counter-clockwise by ``rotation`` degrees."""
+def write_video(
+    path: Path, frames: list[np.ndarray], rotation: int = 0, ratio: Fraction | None = None
+) -> Path:
+    """``frames`` (h, w, 3) uint8, to be shown turned counter-clockwise by ``rotation`` degrees, with pixels
+    whose width by their height is ``ratio``."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=RATE)
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
+        if ratio:
+            stream.codec_context.sample_aspect_ratio = ratio
         if rotation:
             stream.set_display_rotation(rotation)
         for frame in frames:
@@ -135,11 +144,119 @@ def test_frames_are_turned_as_players_show_them(tmp_path, degrees):
     assert np.abs(seen - expected).mean() < 8
 
 
+@pytest.mark.parametrize(("ratio", "size"), [("4/3", (128, 64)), ("8/9", (96, 72)), ("1/40", (96, 64))])
+@pytest.mark.parametrize("turn", [0, 90])
+def test_pixels_that_are_not_square_are_stretched(tmp_path, ratio, size, turn):
+    """By hand: a square of the wall is 32 pixels wide as it is stored, and so much wider as it is shown."""
+    if turn and not hasattr(av.video.stream.VideoStream, "set_display_rotation"):
+        pytest.skip("this version of PyAV does not write rotations")
+    picture = np.zeros((64, 96, 3), np.uint8)
+    picture[:, :32] = 255
+    clip = write_video(tmp_path / "tape.mov", [picture] * 4, turn, Fraction(ratio))
+    save_frames(clip, tmp_path / "frames", 2)
+    seen = np.asarray(Image.open(tmp_path / "frames/images/0001.jpg").convert("L"))
+    seen = np.rot90(seen, -turn // 90)
+    assert (seen.shape[1], seen.shape[0]) == size
+    expected = np.zeros(seen.shape)
+    expected[:, : round(size[0] / 3)] = 255
+    assert np.abs(seen - expected).mean() < 8
+
+
+def write_interlaced(path: Path, fields: list[np.ndarray]) -> Path:
+    """Frames of two ``fields`` (h, w, 3) each, of which each second line is taken: the even ones first."""
+    frames = [np.where(np.arange(len(a))[:, None, None] % 2, b, a) for a, b in pairwise(fields)][::2]
+    graph = Graph()
+    height, width = frames[0].shape[:2]
+    begin = graph.add_buffer(width=width, height=height, format="yuv420p", time_base=Fraction(1, RATE))
+    middle, end = graph.add("setfield", "tff"), graph.add("buffersink")
+    begin.link_to(middle)
+    middle.link_to(end)
+    graph.configure()
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
+        stream.height, stream.width = height, width
+        stream.pix_fmt, stream.bit_rate = "yuv420p", 8_000_000
+        for i, picture in enumerate(frames):
+            # Chroma of neighbouring lines is mixed: grey pictures have none.
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+            frame.pts, frame.time_base = i, Fraction(1, RATE)
+            graph.push(frame)
+            field = graph.pull()
+            field.pts, field.time_base = i, Fraction(1, 25)
+            container.mux(stream.encode(field))
+        container.mux(stream.encode())
+    return path
+
+
+def combs(pixels: np.ndarray) -> float:
+    return float(np.abs(pixels[1:-1] - (pixels[:-2] + pixels[2:]) / 2).mean())
+
+
+@pytest.mark.parametrize("can", [True, False])
+def test_of_an_interlaced_video_frames_are_one_moment(tmp_path, monkeypatch, can):
+    # Columns that move by their width from field to field.
+    columns = np.tile(np.where(np.arange(96) // 8 % 2, 230, 25), (64, 1)).astype(np.uint8)
+    fields = [np.repeat(np.roll(columns, 8 * i, axis=1)[..., None], 3, axis=2) for i in range(12)]
+    clip = write_interlaced(tmp_path / "tape.mpg", fields)
+    said: list[str] = []
+    monkeypatch.setattr(module, "_can_deinterlace", lambda: can)
+    if can:
+        save_frames(clip, tmp_path / "frames", 2, said.append)
+        assert sum("video is interlaced" in line for line in said) == 1
+    else:
+        with pytest.warns(DataWarning, match=r"tape\.mpg: is interlaced, .* deinterlace it first"):
+            save_frames(clip, tmp_path / "frames", 2)
+    found = [np.asarray(Image.open(f).convert("L"), float) for f in (tmp_path / "frames/images").iterdir()]
+    assert len(found) == 2
+    for seen in found:
+        assert seen.shape == (64, 96)
+        assert (combs(seen) < 10) == can
+
+
+def test_combs_of_two_fields_are_no_sharpness(tmp_path):
+    smooth = np.rint(127 + 100 * np.sin(np.arange(96) / 96 * 4 * np.pi))
+    fields = [np.tile(np.roll(smooth, 12 * i)[None, :, None], (64, 1, 3)).astype(np.uint8) for i in range(12)]
+    still = look_at_frames(write_interlaced(tmp_path / "still.mpg", fields[:1] * 12))
+    moving = look_at_frames(write_interlaced(tmp_path / "moving.mpg", fields))
+    assert moving.sharpness.mean() < 3 * still.sharpness.mean()
+
+
+KINDS = {"mpegts": ".ts", "asf": ".wmv", "flv": ".flv", "mxf": ".mxf", "vob": ".vob", "3g2": ".3g2"}
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_videos_of_many_kinds_are_known_by_name_and_by_content(tmp_path, kind):
+    plain = tmp_path / f"walk{KINDS[kind]}"
+    codec = {"flv": "flv", "mpegts": "mpeg2video", "mxf": "mpeg2video", "vob": "mpeg2video"}.get(
+        kind, "mpeg4"
+    )
+    with av.open(str(plain), "w", format=kind) as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for frame in passing([0, 5, 10, 15]):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    assert is_video(plain)
+    assert len(look_at_frames(plain).sharpness) >= 3
+    nameless = plain.rename(tmp_path / "walk.copy")
+    assert is_video(nameless)
+    (tmp_path / "walk.copy").write_bytes(b"no video")
+    assert not is_video(nameless)
+
+
+def test_a_video_in_the_place_of_its_frames_names_them(tmp_path):
+    clip = write_video(tmp_path / "walk.mp4", passing([0, 5]))
+    with pytest.raises(FileFormatError, match="puts these into walk-frames, the folder to give as data"):
+        load_dataset(clip)
+
+
 def test_what_is_no_video_is_refused_before_anything_is_written(tmp_path):
     (tmp_path / "noise.mp4").write_bytes(np.random.default_rng(0).bytes(4000))
     (tmp_path / "empty.mov").write_bytes(b"")
     for name in ("noise.mp4", "empty.mov"):
-        with pytest.raises(FileFormatError, match=f"{name}: not a video that can be read"):
+        with pytest.raises(
+            FileFormatError, match=rf"{name}: not a video that can be read .*; was the recording cut short\?"
+        ):
             photographs_of(tmp_path / name)
     with av.open(str(tmp_path / "song.mkv"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000)
@@ -149,7 +266,7 @@ def test_what_is_no_video_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(FileFormatError, match=r"song\.mkv: has no pictures, only sound"):
         photographs_of(tmp_path / "song.mkv")
     short = write_video(tmp_path / "short.mp4", passing([0]))
-    with pytest.raises(FileFormatError, match="1 frames can be read, at least 2 are needed"):
+    with pytest.raises(FileFormatError, match="1 frame can be read, at least 2 are needed"):
         photographs_of(short)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "empty.mov",

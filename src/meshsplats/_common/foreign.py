@@ -17,7 +17,8 @@ _MAX_PICKLE = 1 << 20
 """Bytes of a pickle that are searched for names; it is never unpickled."""
 VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
-    *(".3gp", ".mts", ".m2ts", ".mpg", ".mpeg"),
+    *(".3gp", ".3g2", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".vob"),
+    *(".wmv", ".asf", ".flv", ".ogv", ".mxf"),
 )
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".dng")
 
@@ -38,6 +39,7 @@ _SCENE = "export it as .glb"
 _PRINT = f"which is not read: {_SCENE} or .obj; 'meshsplats surface' makes .glb of splats, too"
 _CODE = "which could run anything when it is opened, and is not read"
 _PICKLE = f"a pickle of Python, {_CODE}: save the splats as .ply"
+_VIDEO = "a video: 'meshsplats train VIDEO -o mesh.npz' makes a mesh of its sharpest frames"
 _KINDS: Sequence[_Kind] = (
     _Kind(".las .laz", rb"LASF", _POINTS),
     _Kind(".e57", rb"ASTM-E57", _POINTS),
@@ -72,8 +74,11 @@ _KINDS: Sequence[_Kind] = (
     _Kind(".insv .360", b"", "a video of a panoramic camera: export it with its program as a flat .mp4"),
     _Kind(
         " ".join(VIDEO_SUFFIXES),
-        rb"....ftyp(isom|iso2|mp4|qt|M4V|avc1|3gp)|....(moov|mdat|wide)|\x1aE\xdf\xa3|RIFF....AVI ",
-        "a video: 'meshsplats train VIDEO -o mesh.npz' makes a mesh of its sharpest frames",
+        rb"....ftyp(isom|iso[2-6]|mp4|qt|M4V|avc1|3g[p2])|....(moov|mdat|wide)|\x1aE\xdf\xa3|RIFF....AVI |"
+        rb"G.{187}G.{187}G|.{4}G.{191}G.{191}G|\0\0\x01\xba|FLV\x01|"
+        rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11|\x06\x0e\x2b\x34\x02\x05\x01\x01\x0d\x01\x02|OggS.{24}\x01video|"
+        rb"OggS.{24}\x80theora",
+        _VIDEO,
     ),
     _Kind(
         ".rar .7z .tar .tgz .xz .bz2 .zst",
@@ -107,13 +112,24 @@ def foreign(path: Path, head: bytes) -> str:
         return "a part of COLMAP's sparse model; commands take the folder of the data set with ``data``"
     if name.endswith(_TORCH):
         return checkpoint(path)
-    for kind in _KINDS:
-        if name.endswith(tuple(kind.suffixes.split())):
-            return kind.what
-    for kind in _KINDS:
-        if kind.begins and re.match(kind.begins, head, re.DOTALL):
-            return kind.what
-    return ""
+    named = (kind for kind in _KINDS if name.endswith(tuple(kind.suffixes.split())))
+    begun = (kind for kind in _KINDS if kind.begins and re.match(kind.begins, head, re.DOTALL))
+    kind = next(named, None) or next(begun, None)
+    if kind is not None and kind.what == _VIDEO:
+        # Who has done so may give the video itself as the photographs.
+        return f"{_VIDEO}, and puts these into {frames_of(path).name}, the folder to give as ``data``"
+    return "" if kind is None else kind.what
+
+
+def is_a_video(path: Path) -> bool:
+    """Whether the file ``path`` is a video by its name, or if that is of no known kind, by its first
+    bytes."""
+    return what_it_is(path).startswith(_VIDEO)
+
+
+def frames_of(video: Path) -> Path:
+    """The folder where the frames of ``video`` are put."""
+    return video.with_name(f"{video.stem}-frames")
 
 
 def what_it_is(path: Path) -> str:

@@ -22,6 +22,10 @@ class _Kind(NamedTuple):
 
 
 _COLMAP = "export the cameras in COLMAP's format (cameras.txt, images.txt) with undistorted images"
+_WRITE = "write them to a transforms.json"
+_WRITE_OR_ANEW = f"{_WRITE}; or give the folder or video of the photographs alone to have others found"
+_PLACES = ("images", "input", "Images", "params", "1_initial/params")
+"""Folders in that of the data set that are looked into, too."""
 _KINDS: Sequence[_Kind] = (
     _Kind(r".*\.xml", rb"<document\b[^>]*>\s*<chunk\b", "cameras of Metashape", f"{_COLMAP} instead"),
     _Kind(r".*\.xml", rb"<BlocksExchange\b", "cameras in ContextCapture's format", f"{_COLMAP} instead"),
@@ -38,21 +42,32 @@ _KINDS: Sequence[_Kind] = (
     _Kind(r"sfm_data.*\.bin", b"", "cameras of OpenMVG", "convert them: openMVG_main_openMVG2Colmap"),
     _Kind(r".*\.(sfm|abc)", rb"\s*\{|Ogawa", "cameras of Meshroom", "convert them: aliceVision_exportColmap"),
     _Kind(r"reconstruction\.json", rb"\s*\[", "cameras of OpenSfM", "convert them: opensfm export_colmap"),
+    _Kind(r"opensfm/|odm_.*/", b"", "cameras of OpenDroneMap", "convert them: ns-process-data odm"),
+    _Kind(r".*_calibrated_camera_parameters\.txt", b"", "cameras of Pix4D", _WRITE),
+    _Kind(r"odometry\.csv", rb"timestamp,\s*frame,", "cameras of Stray Scanner", _WRITE_OR_ANEW),
+    _Kind(r"groundtruth\.txt", rb"#.*\btx\s+ty\s+tz\b", "cameras of a TUM RGB-D sequence", _WRITE_OR_ANEW),
+    _Kind(
+        r"metadata\.json",
+        rb'"(K|poses|initPose|perFrameIntrinsicCoeffs)"\s*:',
+        "a capture of Record3D",
+        "convert it: ns-process-data record3d",
+    ),
     _Kind(r"keyframes/", b"", "a raw capture of Polycam", "convert it: ns-process-data polycam"),
     _Kind(r"exr_rgbd/", b"", "a capture of Record3D", "convert it: ns-process-data record3d"),
     _Kind(r".*\.r3d", b"", "a capture of Record3D", "export it as EXR + RGB, then ns-process-data record3d"),
     _Kind(r"cameras(_sphere|_large|_linear_init)?\.npz", rb"PK", "cameras of NeuS and IDR", _COLMAP),
     _Kind(r"cams(_\d)?/", b"", "cameras of MVSNet", _COLMAP),
     _Kind(r"cameras\.json", rb"\s*\[", "cameras of a 3DGS trainer", "give the folder it was trained on"),
-    _Kind(r"pose/", b"", "cameras of NSVF", "write them to a transforms.json"),
+    _Kind(r"pose/", b"", "cameras of NSVF or ScanNet", _WRITE),
     _Kind(
         r"frame_\d+\.json",
         rb'"cameraPoseARFrame"',
         "a capture of 3D Scanner App",
-        "write its cameras to a transforms.json",
+        _WRITE,
     ),
     _Kind(r"transforms.*\.json", rb"\{", "cameras", "give that file itself, or name it transforms.json"),
     _Kind(r"(cameras|images)\.(bin|txt)", b"", "half of COLMAP's model", "cameras and images must be there"),
+    _Kind(r".*\.p4d", b"", "a project of Pix4D", "write its cameras to a transforms.json"),
     _Kind(r".*\.(psx|psz)", b"", "a project of Metashape", f"{_COLMAP} from it"),
     _Kind(r".*\.(rcproj|rsproj)", b"", "a project of RealityCapture or RealityScan", f"{_COLMAP} from it"),
 )
@@ -61,14 +76,14 @@ _KINDS: Sequence[_Kind] = (
 def cameras_of_others(folder: Path) -> str:
     """What holds cameras that are not read in ``folder``, beside its images or among them, and what to do;
     empty if nothing is known to."""
-    places = [folder, *(folder / name for name in ("images", "input", "Images") if (folder / name).is_dir())]
+    places = [folder, *(folder / name for name in _PLACES if (folder / name).is_dir())]
     for place in places:
         with os.scandir(place) as entries:
             listed = sorted((entry.name + "/" * entry.is_dir() for entry in entries), key=str.casefold)
         for name in listed:
             kind = _kind(place, name)
             if kind is not None:
-                shown = name if place == folder else f"{place.name}/{name}"
+                shown = (place / name).relative_to(folder).as_posix() + "/" * name.endswith("/")
                 return f"{shown} is there, {kind.what}, which is not read: {kind.advice}"
     return ""
 

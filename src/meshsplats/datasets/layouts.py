@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from meshsplats._common.foreign import what_it_is
 from meshsplats.datasets.cameras_of_others import cameras_of_others
 from meshsplats.datasets.colmap import MODEL_FILES, find_model, image_names
-from meshsplats.datasets.image_files import Shelf, is_hidden, is_readable
+from meshsplats.datasets.image_files import READABLE, Shelf, first_names, is_hidden, is_readable
 from meshsplats.errors import FileFormatError
 
 POSES_BOUNDS = "poses_bounds.npy"
@@ -20,6 +20,10 @@ IMAGE_FOLDERS = ("images", "input")
 INRIA's 3DGS expects what it is yet to undistort."""
 _SAMPLE = 50
 """How many names of a model are looked for to tell whether a folder holds its images."""
+_SEVERAL = 3
+"""Photographs from which on a folder is one of them, whatever else is in it."""
+_MOST_FOLDERS = 500
+"""Folders that are searched for photographs, at most."""
 _NAMED = ("transforms_train.json", "transforms.json", POSES_BOUNDS)
 
 
@@ -214,23 +218,37 @@ def what_is_there(path: Path) -> str:
         return "a trained model, not the photographs it was trained on"
     if path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent):
         return f"the images alone; give the folder above it, {path.absolute().parent}, which has the cameras"
+    photographs = max(len(Shelf(path / name).images()) for name in image_folders(path))
+    bare = f"{wanted}; of photographs without, 'meshsplats train' finds the cameras"
+    if photographs >= _SEVERAL:  # phones put videos among them
+        return bare
     kinds = ((name, what_it_is(path / name)) for name in names[:_SAMPLE] if (path / name).is_file())
     if known := next(((name, what) for name, what in kinds if what and not is_readable(name)), None):
-        return f"{wanted}; {known[0]} in it is {known[1]}"
-    if any(Shelf(path / name).images() for name in image_folders(path)):
-        return f"{wanted}; of photographs without, 'meshsplats train' finds the cameras"
-    if deeper := _photographs_beneath(path):
-        return f"{wanted}; there are photographs in {deeper}/: give that folder"
-    return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"
+        return f"{known[0]} in it is {known[1]}; {wanted}"
+    if photographs:
+        return bare
+    for name in image_folders(path):
+        if unread := Shelf(path / name).unread():
+            kind = f"images of kinds that are not read ({first_names(unread)}): convert them to JPEG"
+            return f"{name or 'it'}{'/' * bool(name)} holds {kind}; {wanted}"
+    if deeper := photographs_beneath(path):
+        one = "give that folder" if len(deeper) == 1 else "give one of these, or move all into one"
+        inner = [f"{place}/" for place in deeper]
+        shown = " and ".join(inner) if len(inner) < 3 else first_names(inner)
+        return f"there are photographs in {shown}: {one}; {wanted}"
+    kinds_read = " ".join(READABLE)
+    return f"no photographs in it ({kinds_read}): it holds {', '.join(names[:6]) or 'nothing'}; {wanted}"
 
 
-def _photographs_beneath(path: Path) -> str:
-    """The first folder with photographs, up to two below ``path``; empty if there is none."""
-    for first in _folders(path):
-        for place in (first, *(f"{first}/{second}" for second in _folders(path / first))):
-            if Shelf(path / place).images():
-                return place
-    return ""
+def photographs_beneath(path: Path) -> dict[str, list[str]]:
+    """The names of the photographs in each folder that has some, up to two below ``path``, by the folder's
+    path relative to it. Of very many folders, not all are looked into."""
+    firsts = _folders(path)[:_MOST_FOLDERS]
+    places = [
+        place for first in firsts for place in (first, *(f"{first}/{s}" for s in _folders(path / first)))
+    ]
+    found = {place: Shelf(path / place).images() for place in places[:_MOST_FOLDERS]}
+    return {place: names for place, names in found.items() if names}
 
 
 def unread_cameras(path: Path) -> str:

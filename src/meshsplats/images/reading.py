@@ -37,6 +37,8 @@ ROUNDING = 3
 """Levels of 255 by which a profile that is sRGB by another name differs from it, at most."""
 _HEIF = re.compile(rb"....ftyp(heic|heix|heim|heis|hevc|hevx|mif1|msf1)", re.DOTALL)
 """How HEIF files begin, as iPhones take photographs."""
+_AVIF = re.compile(rb"....ftypavi[fs]", re.DOTALL)
+"""How AVIF files begin."""
 _MAKE, _MODEL, _EXIF_IFD = 0x010F, 0x0110, 0x8769
 """Tags of EXIF data: maker and name of the camera, and the part about the photograph."""
 _LENS, _FOCAL, _FOCAL_OF_FILM, _ZOOM = 0xA434, 0x920A, 0xA405, 0xA404
@@ -223,12 +225,20 @@ def _decoding(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...]:
-    """The formats to try. Raises MissingDependencyError for HEIF without its library."""
+    """The formats to try. Raises MissingDependencyError for HEIF without its library, and for AVIF with a
+    Pillow that does not read it."""
     if data is None:
         with open(path, "rb") as file:
             head = file.read(12)
     else:
         head = data[:12]
+    if _AVIF.match(head):
+        if not _reads_avif():
+            raise MissingDependencyError(
+                f"{path}: an AVIF image, which needs Pillow 11.3 or later, built with AVIF: pip install -U"
+                " pillow; or convert it to JPEG"
+            )
+        return (*FORMATS, "AVIF")
     if not _HEIF.match(head):
         return FORMATS
     try:
@@ -240,6 +250,13 @@ def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...
         ) from None
     register_heif_opener()
     return (*FORMATS, "HEIF")
+
+
+@lru_cache(maxsize=1)
+def _reads_avif() -> bool:
+    from PIL import features
+
+    return "avif" in features.get_supported_modules()  # ``check`` warns of what older versions do not know
 
 
 def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:

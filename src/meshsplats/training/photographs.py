@@ -66,8 +66,9 @@ class PhotographOptions:
         where there are none, by as many ``threads``, or by all processors. ``say`` gets lines about it.
         ``resumed``: for a run that goes on with those that it began with. OptionsError if they are not to be
         found."""
+        from meshsplats._common.foreign import frames_of
         from meshsplats.training.reconstruction import check_library, ensure_cameras
-        from meshsplats.training.video import frames_of, is_video, photographs_of
+        from meshsplats.training.video import is_video, photographs_of
 
         if is_video(source) and not frames_of(source).is_dir():
             check_library()  # before the frames are chosen, which takes long

@@ -8,13 +8,15 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._common.foreign import VIDEO_SUFFIXES
+from meshsplats._common.foreign import VIDEO_SUFFIXES, frames_of, is_a_video
 from meshsplats._common.json_files import read_json
+from meshsplats._common.words import plural
 from meshsplats._files.atomic import write_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
 from meshsplats.images.reading import MAX_PIXELS
@@ -43,6 +45,11 @@ SAID_EVERY = 10.0
 """Seconds after which it is said how far the look at a video has come."""
 RGB_MATRIX = "ITU601"
 """Matrix that is asked for: older versions of PyAV heed a frame's own only if it is another. RGB has none."""
+WIDEST = 4
+"""Sides of a pixel have a ratio of so much, at most. Beyond it, the file is taken to be wrong."""
+DEINTERLACER = "estdif"
+"""FFmpeg's filter of interlaced frames: of one frame alone, as frames that are taken are far from each
+other."""
 NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
 
 
@@ -59,13 +66,8 @@ class Frames(NamedTuple):
 
 
 def is_video(path: Path) -> bool:
-    """Whether ``path`` is a file with the suffix of a video."""
-    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
-
-
-def frames_of(video: Path) -> Path:
-    """The folder of the frames of ``video``."""
-    return video.with_name(f"{video.stem}-frames")
+    """Whether ``path`` is a file with the suffix of a video, or of no known kind that begins like one."""
+    return path.is_file() and (path.suffix.lower() in VIDEO_SUFFIXES or is_a_video(path))
 
 
 def photographs_of(
@@ -110,7 +112,8 @@ def save_frames(
     """Writes the ``count`` best frames of ``video`` as JPEG files to ``folder``/images, whole or not at all.
 
     The way of the camera is divided into as many equal parts, and the sharpest frame of each is taken.
-    Frames are turned as players show them.
+    Frames are turned and stretched as players show them, and of interlaced ones the later lines are made of
+    the earlier.
 
     Args:
         count: number of frames; None: two per second, 40 to 120.
@@ -131,7 +134,9 @@ def save_frames(
     if count is not None and count < 2:
         raise ValueError(f"at least 2 frames are needed, got {count}")
     if not os.access(folder.parent, os.W_OK):
-        raise PermissionError(f"{folder.parent}: no permission to write the frames there")
+        raise PermissionError(
+            f"{folder.parent}: no permission to write the frames there; copy {video.name} to where you may"
+        )
     if folder.exists():
         raise FileExistsError(f"{folder}: is there already, without frames: move it away")
     say(f"looking at the frames of {video.name}")
@@ -141,20 +146,32 @@ def save_frames(
     wanted = {int(frame): place for place, frame in enumerate(chosen)}
     # A video may have fewer frames that differ than were wanted, and the user may throw some away.
     record = {"name": video.name, "sha256": _digest(video), "wanted": count}
-    transfer, primaries = _colors(video)
-    if is_hdr(transfer, primaries):
+    stored = _stored(video)
+    if is_hdr(stored.transfer, stored.primaries):
         say("the video is HDR: its colours are brought to sRGB")
+    can_mend, interlaced = _can_deinterlace(), False
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as beside:
         made = Path(beside) / folder.name
         (made / IMAGES).mkdir(parents=True)
         for index, frame in enumerate(_decoded(video)):
             if index in wanted:
-                pixels = _turned(_pixels(frame, transfer, primaries), frame.rotation)
+                if frame.interlaced_frame and can_mend and not interlaced:
+                    say("the video is interlaced: frames are made of one of their two fields")
+                interlaced |= frame.interlaced_frame
+                field = _one_field(frame) if frame.interlaced_frame and can_mend else frame
+                pixels = _turned(_pixels(field, stored), frame.rotation)
                 save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", pixels)
             if index == chosen[-1]:
                 break
         write_json(made / RECORD, record)
         made.rename(folder)
+    if interlaced and not can_mend:
+        warnings.warn(
+            f"{video}: is interlaced, which shows as combs where it moves, and this version of PyAV has no"
+            f" filter {DEINTERLACER}: deinterlace it first, with ffmpeg -vf bwdif, for one",
+            DataWarning,
+            stacklevel=2,
+        )
     return len(chosen)
 
 
@@ -182,7 +199,11 @@ def look_at_frames(video: Path, say: Callable[[str], None] = lambda text: None) 
     for frame in _decoded(video, warn=True):
         scale = min(1.0, LOOK_SIDE / max(frame.width, frame.height))
         size = {"width": max(1, round(scale * frame.width)), "height": max(1, round(scale * frame.height))}
-        grey = frame.reformat(**size, format="gray").to_ndarray().astype(np.float32)
+        if frame.interlaced_frame:  # the combs of two fields would count as edges where the camera moves
+            field = frame.reformat(width=size["width"], format="gray").to_ndarray()[::2]
+            grey = field.astype(np.float32)
+        else:
+            grey = frame.reformat(**size, format="gray").to_ndarray().astype(np.float32)
         small = frame.reformat(width=MOTION_SIDE, height=MOTION_SIDE, format="gray").to_ndarray()
         # Exposure and contrast may change while the camera stands still.
         now = small.astype(np.float32) - small.mean(dtype=np.float32)
@@ -196,7 +217,8 @@ def look_at_frames(video: Path, say: Callable[[str], None] = lambda text: None) 
             place = f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
             say(f"looking at the frames of {video.name}: {len(sharpness):,} so far, to {place}")
     if len(sharpness) < 2:
-        raise FileFormatError(f"{video}: {len(sharpness)} frames can be read, at least 2 are needed")
+        count = plural(len(sharpness), "frame")
+        raise FileFormatError(f"{video}: {count} can be read, at least 2 are needed")
     return Frames(np.array(sharpness), np.array(motion), seconds)
 
 
@@ -241,26 +263,73 @@ def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
                 count += 1
     except av.FFmpegError as error:
         if not count:
-            raise FileFormatError(f"{video}: not a video that can be read ({error.strerror})") from None
+            cut = "; was the recording cut short?" if isinstance(error, av.InvalidDataError) else ""
+            raise FileFormatError(f"{video}: not a video that can be read ({error.strerror}){cut}") from None
         if warn:
             text = f"{video}: cannot be read beyond frame {count:,} ({error.strerror})"
             warnings.warn(text, DataWarning, stacklevel=3)
 
 
-def _colors(video: Path) -> tuple[int, int]:
-    """FFmpeg's numbers of the transfer function and of the primaries of a video that was decoded."""
+class _Stored(NamedTuple):
+    """How the frames of a video are stored."""
+
+    transfer: int
+    primaries: int
+    """FFmpeg's numbers of the transfer function and of the primaries."""
+    ratio: Fraction
+    """Width of a pixel by its height."""
+
+
+def _stored(video: Path) -> _Stored:
+    """That of a video that was decoded."""
     import av
 
     with av.open(str(video)) as container:
-        context = container.streams.video[0].codec_context
-        return int(context.color_trc), int(context.color_primaries)
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        ratio = Fraction(stream.sample_aspect_ratio or 1)  # the file's own counts more than the codec's
+        if not Fraction(1, WIDEST) <= ratio <= WIDEST:
+            ratio = Fraction(1)
+        return _Stored(int(context.color_trc), int(context.color_primaries), ratio)
 
 
-def _pixels(frame: Any, transfer: int, primaries: int) -> np.ndarray:
-    """(h, w, 3) float32 sRGB in [0, 1] of a frame with these numbers of FFmpeg."""
-    if is_hdr(transfer, primaries):
-        return as_srgb(frame.to_ndarray(format="rgb48le", dst_colorspace=RGB_MATRIX), transfer, primaries)
-    return frame.to_ndarray(format="rgb24", dst_colorspace=RGB_MATRIX) / np.float32(255)
+def _pixels(frame: Any, stored: _Stored) -> np.ndarray:
+    """(h, w, 3) float32 sRGB in [0, 1] of a frame, with square pixels: the side is stretched that is too
+    short."""
+    width, height = frame.width, frame.height
+    if stored.ratio > 1:
+        width = round(width * stored.ratio)
+    else:
+        height = round(height / stored.ratio)
+    given = {"dst_colorspace": RGB_MATRIX}
+    if (width, height) != (frame.width, frame.height):
+        given |= {"width": width, "height": height, "interpolation": "BICUBIC"}
+    if is_hdr(stored.transfer, stored.primaries):
+        rgb = frame.to_ndarray(format="rgb48le", **given)
+        return as_srgb(rgb, stored.transfer, stored.primaries)
+    return frame.to_ndarray(format="rgb24", **given) / np.float32(255)
+
+
+def _can_deinterlace() -> bool:
+    from av.filter import filters_available
+
+    return DEINTERLACER in filters_available
+
+
+def _one_field(frame: Any) -> Any:
+    """An interlaced ``frame`` whose second field is made of the first, which was taken at another time."""
+    from av.filter import Graph
+
+    graph = Graph()
+    base = frame.time_base or Fraction(1, 25)
+    begin = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=base)
+    middle, end = graph.add(DEINTERLACER, "mode=frame:deint=all"), graph.add("buffersink")
+    begin.link_to(middle)
+    middle.link_to(end)
+    graph.configure()
+    graph.push(frame)
+    graph.push(None)
+    return graph.pull()
 
 
 def _turned(pixels: np.ndarray, degrees: float) -> np.ndarray:
