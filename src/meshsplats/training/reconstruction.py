@@ -29,6 +29,12 @@ from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyErr
 from meshsplats.formats.outputs import PREVIEW
 from meshsplats.images.reading import Shot
 from meshsplats.training.feature_masks import FeatureMasks
+from meshsplats.training.hints import (
+    matching_images,
+    say_what_has_no_camera,
+    warn_of_inner_folders,
+    why_none,
+)
 from meshsplats.training.likeness import ALL_UP_TO, alike_pairs, in_sequence
 from meshsplats.training.poses import find_poses
 from meshsplats.training.pycolmap_input import by_lens, for_pycolmap, needs_copy, read_shots
@@ -103,6 +109,7 @@ def ensure_cameras(
     if layout is not None:
         tried = _tried(layout.source) if layout.source == folder / CAMERAS else None
         if tried is None:
+            say_what_has_no_camera(layout, say)
             return layout.source
         added = [path for path in _photographs(folder) if path.relative_to(folder).as_posix() not in tried]
         if replacing:
@@ -141,15 +148,15 @@ def find_cameras(
 
     Raises:
         MissingDependencyError: pycolmap is not installed.
-        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other; most
-            are panoramas.
+        ValueError: fewer than ``FEWEST`` photographs that are whole, or so few that match each other; all
+            were taken from one place; most are panoramas.
         FileFormatError: photographs that are links out of the folder, which are not read as a data set; masks
             that do not fit their photographs.
         FileExistsError: ``sparse_points.ply`` is there already, unless ``replacing`` it.
         OSError: the folder cannot be written.
 
-    Warns with a DataWarning about photographs that are broken, of kinds that are not read, panoramas, or
-    found no place, and about places that contradict matches.
+    Warns with a DataWarning about photographs that are broken, of kinds that are not read, in folders
+    inside, panoramas, or found no place, and about places that contradict matches.
     """
     began = time.perf_counter()
     photographs = _photographs(folder) if replacing else bare_photographs(folder)
@@ -162,7 +169,10 @@ def find_cameras(
     for name in tried:
         inside(folder, name, str(folder))
     if not os.access(folder, os.W_OK):
-        raise PermissionError(f"{folder}: no permission to write the cameras beside the photographs")
+        raise PermissionError(
+            f"{folder}: no permission to write the cameras beside the photographs; copy the folder to where"
+            " you may write"
+        )
     if not replacing and (folder / POINTS).exists():
         raise FileExistsError(
             errno.EEXIST,
@@ -176,6 +186,7 @@ def find_cameras(
             DataWarning,
             stacklevel=2,
         )
+    warn_of_inner_folders(photographs)
     pycolmap = _imported()
     say(f"looking at {len(photographs)} photographs")
     shots = _whole(folder, photographs, threads)
@@ -194,13 +205,10 @@ def find_cameras(
         say(f"finding the cameras of {len(photographs)} photographs: features")
         database = _matched(pycolmap, Path(work), images, list(shots.values()), masks, say, threads)
         poses = find_poses(pycolmap, database, place, Path(work), len(images), say, threads)
+        matching = matching_images(database)
     count = 0 if poses is None else poses.model.num_reg_images()
     if poses is None or count < FEWEST:
-        raise ValueError(
-            f"{folder}: {count} of {len(photographs)} photographs match each other, at least {FEWEST} must."
-            " Photographs must overlap by two thirds, be sharp and flat, not panoramas, and show a subject"
-            " with texture that does not move"
-        )
+        raise ValueError(f"{folder}: {why_none(count, matching, len(photographs), FEWEST)}")
     best = poses.model
     named = {image.name: path.name for image, path in zip(images, photographs, strict=True)}
     placed = {named[image.name] for image in best.images.values() if image.has_pose}
@@ -231,7 +239,8 @@ def find_cameras(
         write_bytes(folder / POINTS, _points(best))
         write_text(folder / CAMERAS, json.dumps(cameras, indent=1) + "\n")
     made = f"cameras of {count} photographs and {len(best.points3D):,} points"
-    say(f"{made}, in {time.perf_counter() - began:.0f} s: {folder / CAMERAS}")
+    took = f"{time.perf_counter() - began:.0f} s"
+    say(f"{made}, in {took}, kept for the next time: {folder / CAMERAS}")
 
 
 def check_library() -> None:

@@ -1,0 +1,87 @@
+"""What to say of photographs that a search for cameras passes over, and of those that it fails with."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path, PurePosixPath
+
+from meshsplats._common.words import plural
+from meshsplats.datasets.colmap import image_names
+from meshsplats.datasets.image_files import Shelf
+from meshsplats.datasets.layouts import Layout, photographs_beneath
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.training.poses import pair_of
+from meshsplats.training.suspects import shortened
+
+MATCHING = 15
+"""Matches from which on two photographs show the same: COLMAP's own least."""
+_OTHERS = re.compile(
+    r"mask|depth|preview|thumb|confidence|normals?$|images_\d+$|.*-(frames|evaluation)$", re.IGNORECASE
+)
+"""How names of folders begin whose images are no photographs, are copies, or were made here."""
+_NO_MATCH = (
+    "Photographs must overlap by two thirds, be sharp and flat, not panoramas, and show a subject with"
+    " texture that does not move"
+)
+_NO_PARALLAX = (
+    "but they show no parallax, as from one place: walk around the subject, do not stand still or turn on the"
+    " spot"
+)
+
+
+def warn_of_inner_folders(photographs: Sequence[Path]) -> None:
+    """A DataWarning about folders beside ``photographs``, which are all in one, that have more of the same
+    kinds and of other names."""
+    place = photographs[0].parent
+    names, kinds = {path.name for path in photographs}, {path.suffix.lower() for path in photographs}
+    passed = []
+    for inner, found in photographs_beneath(place).items():
+        more = [name for name in found if name not in names and Path(name).suffix.lower() in kinds]
+        if more and not any(map(_OTHERS.match, PurePosixPath(inner).parts)):
+            passed.append(f"{inner}/ ({len(more):,})")
+    if passed:
+        warnings.warn(
+            f"{place}: there are more photographs in {shortened(passed)}, which are left out, as folders"
+            " inside are not searched: move them beside the others",
+            DataWarning,
+            stacklevel=3,
+        )
+
+
+def say_what_has_no_camera(layout: Layout, say: Callable[[str], None]) -> None:
+    """Says how many photographs beside a model of COLMAP found no camera in it."""
+    if layout.name != "COLMAP":
+        return
+    try:
+        known = {
+            PurePosixPath(name.replace("\\", "/")).stem.casefold() for name in image_names(layout.source)
+        }
+    except FileFormatError:
+        return  # its reader says so
+    there = Shelf(layout.root / layout.images).images()
+    without = [name for name in there if Path(name).stem.casefold() not in known]
+    if without and len(without) < len(there):
+        say(
+            f"{len(without):,} of {plural(len(there), 'photograph')} have no camera in {layout.source}, and"
+            f" are left out: {shortened(without)}"
+        )
+
+
+def matching_images(database: Path) -> int:
+    """Number of images in COLMAP's ``database`` that match another one."""
+    query = "select pair_id from two_view_geometries where rows >= ?"
+    with closing(sqlite3.connect(database)) as connection:
+        rows = connection.execute(query, (MATCHING,)).fetchall()
+    return len({image for (number,) in rows for image in pair_of(number)})
+
+
+def why_none(placed: int, matching: int, count: int, fewest: int) -> str:
+    """Why so few of ``count`` photographs were ``placed``, fewer than the ``fewest`` that must be, though so
+    many match another one."""
+    if 2 * matching > count and matching >= fewest:
+        return f"{matching} of {count} photographs match each other, {_NO_PARALLAX}"
+    return f"{placed} of {count} photographs match each other, at least {fewest} must. {_NO_MATCH}"
