@@ -76,7 +76,7 @@ def test_mistakes(splats, tmp_path, capsys):
     assert "not a mesh" in capsys.readouterr().err
     assert run(splats, "-o", tmp_path / "out", *cameras, "--preset", "nonsense") != 0
     assert "nonsense" in capsys.readouterr().err
-    assert run(splats, "-o", tmp_path / "out", *cameras, "--amplify", "0") == 1
+    assert run(splats, "-o", tmp_path / "out", *cameras, "--amplify", "0") == 2
     assert run(splats, *cameras) == 2
     assert run(tmp_path / "two.json", "-o", tmp_path / "out") == 1
     assert not (tmp_path / "out").exists()
@@ -86,3 +86,9 @@ def test_mistakes(splats, tmp_path, capsys):
     assert run(splats, "-o", tmp_path / "out", *cameras, "--sh-degree", "0") == 3
     assert "--force" in capsys.readouterr().err
     assert (tmp_path / "out" / "results.json").read_bytes() == before
+
+
+def test_a_mesh_in_place_of_splats_is_sent_to_evaluate(splats, tmp_path, capsys):
+    save_mesh(convert(load_gaussians(splats)), tmp_path / "mesh.npz")
+    assert run(tmp_path / "mesh.npz", "-o", tmp_path / "out") == 1
+    assert "'meshsplats evaluate' compares a mesh with photographs" in capsys.readouterr().err

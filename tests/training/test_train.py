@@ -18,6 +18,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from meshsplats._core.kernels import round_fans
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import main
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.splat_targets import splat_dataset
@@ -65,8 +66,10 @@ from meshsplats.training.growth import (
 )
 from meshsplats.training.initial import fans_of
 from meshsplats.training.patches import Patches, flat_splats
+from meshsplats.training.result_cameras import camera_files, save_result_cameras
 from meshsplats.training.run import COVERAGE, SO_FAR, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
+from meshsplats.viewpoints.showing import cameras_given
 
 LAYERS = ("color", "alpha")
 SMALL = {"start_splats": 150, "max_splats": 600, "growth_events": 3}
@@ -1007,6 +1010,8 @@ def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     assert len(load_gaussians(splats)) == fan_count(mesh) + int(HALVED * fan_count(mesh))
     for name in ("config.toml", "preview.png"):
         assert (tmp_path / f"mesh.npz.{name}").is_file()
+    records = [str(path) + ".cameras.json" for path in (out, splats)]
+    assert json.loads(capsys.readouterr().out)["cameras"] == records
     with Image.open(tmp_path / "mesh.npz.preview.png") as preview:  # from the first held-out photograph
         seen = views[0].camera
         large = seen.scaled(SIDE / max(seen.width, seen.height))
@@ -1071,6 +1076,40 @@ def test_a_trained_mesh_outlives_a_failure_to_write_its_splats(ball, tmp_path, m
     words += ["--max-splats", "100", "--test-every", "0", "--as-splats", str(tmp_path / "splats.ply")]
     assert main(words) != 0
     assert fan_count(load_mesh(tmp_path / "mesh.npz")) <= 100
+
+
+def test_the_result_opens_from_where_it_was_photographed(ball, start, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("meshsplats.training.run.starting_fans", lambda *_: start)
+    views, out = ball.train[:4], tmp_path / "mesh.npz"
+    folder = write_photographs(
+        tmp_path / "photos", [view.camera for view in views], [straight(view) for view in views]
+    )
+    words = ["train", str(folder), "-o", str(out), "--steps", "1", "--max-splats", "100", "--test-every", "0"]
+    record = tmp_path / "mesh.npz.cameras.json"
+    record.write_text("mine")
+    assert main(words) == 3  # before the work
+    assert record.read_text() == "mine"
+    assert not out.exists()
+    capsys.readouterr()
+    assert main([*words, "--force"]) == 0
+    told = capsys.readouterr()
+    assert f"next: meshsplats view {out}" in told.out
+    assert "4 photographs to train on" in told.err
+    shown, given = load_cameras(record), [view.camera for view in views]
+    np.testing.assert_allclose([c.center for c in shown], [c.center for c in given], atol=1e-6)
+    assert [c.name for c in cameras_given(out)] == [c.name for c in shown]
+
+
+@pytest.mark.parametrize(
+    ("origin", "moved"), [("keep", (10, 20, 30)), ("local", (0, 0, 0)), ((8, 20, 30), (2, 0, 0))]
+)
+def test_cameras_beside_a_result_are_in_its_world(ball, tmp_path, origin, moved):
+    far = replace(ball, origin=np.array([10.0, 20.0, 30.0]))
+    save_result_cameras(far, tmp_path / "mesh.npz", origin)
+    (path,) = camera_files(tmp_path / "mesh.npz")
+    shown = load_cameras(path)
+    assert len(shown) == min(len(ball.train), 60)
+    np.testing.assert_allclose(shown[0].center, ball.train[0].camera.center + moved, atol=1e-9)
 
 
 def test_splats_are_made_up_for_after_ctrl_c_while_they_were_fitted(ball, tmp_path, monkeypatch, capsys):

@@ -12,6 +12,7 @@ from _glb import edit_glb
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import look_at
+from meshsplats.conversion import convert
 from meshsplats.errors import DataWarning
 from meshsplats.formats.base_meshes import load_vertex_colored, save_base
 from meshsplats.scene.base_mesh import BaseMesh
@@ -19,6 +20,7 @@ from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints import showing
 from meshsplats.viewpoints.finding import FoundCameras
+from meshsplats.viewpoints.opening import opening_camera
 from meshsplats.viewpoints.showing import default_views, opening_beside
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -48,6 +50,7 @@ def kind(monkeypatch):
 
     monkeypatch.setattr(showing, "find_cameras", found)
     monkeypatch.setattr(showing, "kind_from_outside", lambda cloud, up, threads: (looks[0], 0.4))
+    monkeypatch.setattr(showing, "surely_object", lambda cloud, up, threads: looks[0] == "object")
     return looks
 
 
@@ -103,6 +106,43 @@ def test_objects_and_meshes_are_seen_from_all_around(kind, tmp_path):
     assert default_views(nothing, tmp_path, 4) is None
     huge = replace(splats(2000), scales=np.full((2000, 3), 50.0))  # would take long
     assert default_views(huge, tmp_path, 4) is None
+
+
+def fans(count: int = 40) -> SplatMesh:
+    return convert(splats(count))
+
+
+def test_a_mesh_of_a_place_is_seen_from_within_by_its_splats(kind, tmp_path):
+    mesh, file = fans(), tmp_path / "mesh.npz"
+    assert heights(default_views(mesh, file, 4)[0]) == {2.0}
+    assert len(default_views(mesh, file, 30, film=True)[0]) == 30
+    assert heights([opening_camera(mesh)]) == {2.0}
+    assert default_views(replace(mesh, face_splat=None), file, 4) is None
+    kind[0] = "object"
+    assert default_views(mesh, file, 4) is None
+    assert heights([opening_camera(mesh)]) != {2.0}
+
+
+@pytest.mark.parametrize("scene", ["mesh", "splats", "surface"])
+def test_cameras_beside_a_file_come_before_found_ones(kind, tmp_path, scene):
+    known = {"mesh": fans(), "splats": splats(), "surface": replace(fans(), face_splat=None)}[scene]
+    file = tmp_path / "scene.npz"
+    file.write_bytes(b"")
+    save_cameras(views(10), tmp_path / "scene.npz.cameras.json")
+    cameras, words = default_views(known, file, 5)
+    assert [camera.center[0] for camera in cameras] == [0, 2, 4, 6, 8]
+    assert heights(cameras) == {1.0}
+    assert "5 of its 10 cameras" in words
+    assert len(default_views(known, file, 30, film=True)[0]) == 30
+    moved = replace(known, origin=np.array([1.0, 0, 0]))
+    assert [camera.center[0] for camera in default_views(moved, file, 5)[0]] == [-1, 1, 3, 5, 7]
+    if scene != "surface":
+        kind[0] = "object"
+        assert default_views(known, file, 5) is None
+    kind[0] = "place"
+    (tmp_path / "scene.npz.cameras.json").write_text("{}")
+    with pytest.warns(DataWarning, match="the cameras beside the file are not used"):
+        default_views(known, file, 5)
 
 
 def test_the_start_camera_is_the_first_view(kind, tmp_path):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from meshsplats._common.words import command_line, plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import again, say_origin
@@ -20,6 +21,7 @@ from meshsplats.formats.outputs import check_mesh_suffix, check_outputs, check_s
 from meshsplats.formats.splat_formats import written_ending
 from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.photographs import PhotographOptions
+from meshsplats.training.result_cameras import FEW, camera_files, files_after_mesh
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -46,8 +48,8 @@ class Train(TrainingCommand):
     """Makes a mesh from photographs with cameras: COLMAP, NeRF-synthetic, nerfstudio or LLFF folders.
 
     Without cameras, they are found first (extra photos) and saved beside the photographs. Of a video (extra
-    video), frames are taken, to a folder beside it. Beside the result NAME: its configuration, a preview, and
-    a folder NAME.run with metrics, previews and a checkpoint, from which --resume continues after Ctrl-C.
+    video), frames are taken, to a folder beside it. Beside the result NAME: its configuration, a preview, the
+    cameras from which it is shown, and a folder NAME.run, from which --resume continues after Ctrl-C.
     """
 
     COMMON = (
@@ -76,7 +78,7 @@ class Train(TrainingCommand):
             check_splat_endings(written_ending(self.as_splats.name))
             if self.as_splats.resolve() == self.output.resolve():
                 raise UsageError("--as-splats must not be the mesh itself: give another name")
-            check_outputs([self.as_splats], self.force, inputs=self.inputs)
+        check_outputs(files_after_mesh(self.output, self.as_splats), self.force, inputs=self.inputs)
         super().check()
 
     def prepared(self, config: FinetuneConfig) -> Self:
@@ -87,13 +89,17 @@ class Train(TrainingCommand):
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         assert isinstance(config, TrainConfig)
-        return self.target.plan(self.input, config, as_splats=self.as_splats is not None, say=say)
+        plan = self.target.plan(self.input, config, as_splats=self.as_splats is not None, say=say)
+        if (count := len(plan.dataset.train)) < FEW:
+            say(f"warning: {plural(count, 'photograph')} to train on: views between them need ten or more")
+        return plan
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         from meshsplats.finetuning.run_options import RunOptions
-        from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.training.as_splats import fit_splats
+        from meshsplats.training.result_cameras import save_result_cameras, save_splats
 
+        save_result_cameras(plan.dataset, self.output, self.origin)
         if self.as_splats is None:
             return
         run = RunOptions(files.folder, threads=self.threads, device=self.device, report_every=0)
@@ -102,7 +108,11 @@ class Train(TrainingCommand):
             splats = fit_splats(trained.saved, plan.dataset, self.configured(), run=run, on_progress=show)
         splats = placed(splats, self.origin)
         say_origin(splats.origin, "keep", splats=True)
-        save_gaussians(splats, self.as_splats)
+        save_splats(splats, self.as_splats, plan.dataset, self.origin)
+
+    def finish(self, result: dict[str, Any], *lines: str, indent: int | None = 1) -> None:
+        result["cameras"] = camera_files(self.output, self.as_splats)
+        super().finish(result, *lines, indent=indent)
 
     def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
         from meshsplats.training.run import SO_FAR
@@ -112,8 +122,8 @@ class Train(TrainingCommand):
         return code
 
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
-        """The command that scores the result on held-out views, or one that renders it if there are none."""
-        if not plan.dataset.test:
-            return self.rendering_next()
+        """The commands that show the result, and score it on held-out views, if there are any."""
+        lines = [f"next: {command_line(['meshsplats', 'view', self.output])}"]
         how = again(self.target, downscale=1, test_every=8, missing="few", masks="count")
-        return self.evaluating_next(["--data", self.input, *how], plan, config)
+        scored = plan.dataset.test and self.evaluating_next(["--data", self.input, *how], plan, config)
+        return [*lines, *(scored or ())]

@@ -65,6 +65,11 @@ def save_comparison(
     """
     splats, folder = as_path("splats", splats), as_path("folder", folder)
     options.check()
+    if splats.is_file() and identify(splats) == "mesh":
+        raise FileFormatError(
+            f"{splats}: a mesh, not splats: give the splats first, then the mesh; 'meshsplats evaluate'"
+            " compares a mesh with photographs"
+        )
     cloud = options.reading.load(splats, up=options.views.up, threads=options.draw.threads)
     cloud, look = cropped(cloud, options.part.crop), options.look or "area"
     if options.look is None:

@@ -32,7 +32,7 @@ from meshsplats.viewer.content import (
     measured,
 )
 from meshsplats.viewer.page import Page, PageOptions
-from meshsplats.viewpoints.showing import default_views, opening_beside
+from meshsplats.viewpoints.showing import cameras_given, default_views, opening_beside
 
 FOUND_VIEWS = 12
 """Viewpoints of a place, where the input has none."""
@@ -212,8 +212,9 @@ def _cameras(
     first = [] if opening is None else [opening]
     if beside is not None:
         return [*first, *beside]
-    # As many as splats are merged for: looking for them once is enough.
-    count, up = max(FOUND_VIEWS, VIEWS), optional_up(options.up)
+    # As many as splats are merged for, where views are looked for: once is enough.
+    searched = isinstance(scene, GaussianCloud) and not cameras_given(source, scene.origin)
+    count, up = max(FOUND_VIEWS, VIEWS) if searched else FOUND_VIEWS, optional_up(options.up)
     if isinstance(scene, GaussianCloud):
         options.reading.tell_of("looking for views of", len(scene))
     found = default_views(scene, source, count, up=up, threads=threads)

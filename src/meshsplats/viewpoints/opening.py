@@ -1,4 +1,4 @@
-"""The side of an object to show first: that on which there is most to see."""
+"""The view to show first: of an object, the side on which there is most to see."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats._common.geometry import quaternions_of
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.rendering.api import render, render_splats
 from meshsplats.rendering.layers import fragments
 from meshsplats.rendering.previews import USUAL, preview_camera
 from meshsplats.scene.camera import Camera
-from meshsplats.scene.gaussians import SH_C0, GaussianCloud
+from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
+from meshsplats.viewpoints.mesh_splats import splats_like
+from meshsplats.viewpoints.showing import default_views
 
 DIRECTIONS = 12
 """Directions around the object that are looked from."""
@@ -23,6 +24,8 @@ SIDE, PART = 128, 2
 finer than those."""
 SPLATS = 40_000
 """Splats, at most, that are drawn in them."""
+SIDE_WITHIN = 800
+"""Pixels along the sides of an image from within a place."""
 AREA = 0.5
 """Weight of the area."""
 MARGIN = 1.05
@@ -31,8 +34,6 @@ MOST_FRAGMENTS = 2e7
 """Fragments of one of the images above which nothing is looked at."""
 SOLID = 0.5
 """Least alpha of pixels that count."""
-WIDTH = 0.65
-"""Standard deviation of a splat, as a share of the root mean square of the corners of its triangles."""
 SHADES = 12
 """Steps from 0 to 1 in which colours are told apart."""
 
@@ -65,48 +66,22 @@ def opening_azimuth(
 
 
 def opening_camera(scene: SplatMesh | GaussianCloud, threads: int | None = None) -> Camera:
-    """``preview_camera`` from the side that shows most."""
+    """``preview_camera`` from the side that shows most; of a mesh of a place, a view from within."""
+    if isinstance(scene, SplatMesh):
+        within = default_views(scene, None, 1, side=(SIDE_WITHIN, SIDE_WITHIN), threads=threads)
+        if within is not None:
+            return within[0][0]
     return preview_camera(scene, opening_azimuth(scene, threads=threads))
 
 
 def _sample(scene: SplatMesh | GaussianCloud) -> SplatMesh | GaussianCloud:
     """Some of its splats, evenly spread and larger for it; all of a mesh that has none."""
-    if isinstance(scene, GaussianCloud):
-        step = max(1, -(-len(scene) // SPLATS))
-        some = scene.take(slice(None, None, step)).of_degree(0)
-    elif scene.face_splat is None or not len(scene.faces):
-        return scene.plain
-    else:
-        splats = scene.splats
-        step = -(-len(splats) // SPLATS)
-        some = _splats_like(scene.take(splats.of_face % step == 0).plain)
+    if isinstance(scene, SplatMesh):
+        some = splats_like(scene, SPLATS)
+        return scene.plain if some is None else some
+    step = max(1, -(-len(scene) // SPLATS))
+    some = scene.take(slice(None, None, step)).of_degree(0)
     return replace(some, scales=some.scales * np.float32(step**0.5))
-
-
-def _splats_like(mesh: SplatMesh) -> GaussianCloud:
-    """Splats about where those of ``mesh`` are, so that it is seen as the splats that it was made of."""
-    splats, corner = mesh.splats, mesh.faces.ravel()
-    owner, count = np.repeat(splats.of_face, 3), len(splats)
-    opacity = mesh.colors[:, 3].astype(np.float64)
-    centers = splats.centers(mesh.vertices, opacity)
-    away = mesh.vertices[corner] - centers[owner]
-    moments = np.empty((count, 3, 3))
-    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        moments[:, i, j] = moments[:, j, i] = np.bincount(owner, away[:, i] * away[:, j], count)
-    squares, axes = np.linalg.eigh(moments / (3 * splats.counts)[:, None, None])
-    axes[np.linalg.det(axes) < 0, :, 0] *= -1
-    weight = opacity[corner] + 1e-6
-    tints = [np.bincount(owner, weight * mesh.colors[corner, k], count) for k in range(3)]
-    colors = np.stack(tints, axis=1) / np.bincount(owner, weight, count)[:, None]
-    peaks = np.maximum.reduceat(opacity[corner], 3 * splats.starts)
-    return GaussianCloud(
-        centers,
-        quaternions_of(axes),
-        WIDTH * np.sqrt(np.maximum(squares, 0)),
-        np.clip(peaks, 0, 1),
-        ((colors - 0.5) / SH_C0)[:, None],
-        up=mesh.up,
-    )
 
 
 def _shown(

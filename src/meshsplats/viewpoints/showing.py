@@ -1,4 +1,4 @@
-"""The views that commands show of splats where no option names any: given ones first, then found ones."""
+"""The views that commands show of a scene where no option names any: given ones first, then found ones."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._common.json_files import read_json
-from meshsplats.cameras.files import cameras_beside
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.cameras.viewer_settings import NAME, start_camera
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.gltf.cameras import cameras_in_gltf, cameras_in_mesh
+from meshsplats.formats.outputs import CAMERAS, beside
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named
 from meshsplats.formats.usd.cameras import cameras_in_usd
@@ -23,7 +24,8 @@ from meshsplats.scene.camera import Camera
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewpoints.finding import find_cameras, worth_a_look
-from meshsplats.viewpoints.kind import kind_from_outside
+from meshsplats.viewpoints.kind import kind_from_outside, surely_object
+from meshsplats.viewpoints.mesh_splats import splats_to_look_at
 from meshsplats.viewpoints.relief import find_relief
 from meshsplats.viewpoints.walking import keys_of, walk
 
@@ -65,6 +67,20 @@ def opened_with(
     return [*first, *cameras][: len(cameras)]
 
 
+def cameras_given(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
+    """The training cameras of ``source``, relative to ``origin``: those of the record ``NAME.cameras.json``
+    beside the file NAME, as ``train`` writes it, or of a model folder (``cameras_beside``). None where there
+    are none; a DataWarning says where they cannot be read."""
+    record = beside(source, CAMERAS)
+    if not (source.is_file() and record.is_file()):
+        return cameras_beside(source, origin)
+    try:
+        return load_cameras(record, origin=origin)
+    except FileFormatError as error:
+        warnings.warn(f"{error}; the cameras beside the file are not used", DataWarning, stacklevel=2)
+        return None
+
+
 def default_views(
     scene: GaussianCloud | SplatMesh | BaseMesh,
     source: Path | None,
@@ -76,51 +92,75 @@ def default_views(
     given: Sequence[Camera] | None = None,
     threads: int | None = None,
 ) -> tuple[list[Camera], str] | None:
-    """Up to ``count`` views of splats that are no object, and a line that says where they come from. None for
-    objects, which are seen from all around, and for meshes, unless their glTF or USD file has cameras.
+    """Up to ``count`` views of a scene that is no object, and a line that says where they come from. None for
+    objects, which are seen from all around, and for meshes that do not know their splats and have no cameras.
 
-    The cameras of a model folder come first, then those that ``find_cameras`` finds. A start camera
-    (``opening_beside``) is the first of these, and of an object, too, where one view is asked for.
+    The cameras inside a glTF or USD file of a mesh come first, then those of ``cameras_given``, then those
+    that ``find_cameras`` finds in the splats, or in those that a mesh was made of. A start camera
+    (``opening_beside``) is the first of these, and of an object, too, where one view of splats is asked for.
 
     Args:
-        source: the file or folder of the splats; None: they have none that could give cameras.
+        source: the file or folder of the scene; None: it has none that could give cameras.
         side: width and height of the images, pixels.
         up: (3,) direction, where the user names it.
         film: the views are on a smooth round.
-        given: cameras relative to the scene's origin, in place of those of the folder.
+        given: cameras relative to the scene's origin, in place of those of ``cameras_given``.
         threads: at most this many; all processors by default.
     """
-    if not isinstance(scene, GaussianCloud):
-        return _of_mesh(scene, source, count, side, film)
-    if not len(scene):
-        return None
-    if count == 1 and not film and (opening := opening_beside(source, scene.origin)) is not None:
-        return [_in_shape(opening, side)], "seen as the start camera beside or inside the file does"
-    if not worth_a_look(scene):
-        return None
-    if given is None and source is not None:
-        given = cameras_beside(source, scene.origin)
-    if given:
-        toward = guess_up(scene, given) if up is None else unit_up(up)
-        around = kind_from_outside(scene, toward, threads)[0] == "object"
-        if around and find_relief(scene, toward) is None:
+    cloud: GaussianCloud | None
+    if isinstance(scene, GaussianCloud):
+        cloud = scene
+        if not len(cloud):
             return None
-        some = _spread(given, keys_of(count) if film else count)
-        views = [_in_shape(camera.with_near_plane(scene.means), side) for camera in some]
-        if film:
-            return walk(
-                views, count, toward
-            ), f"seen on a round through {len(views)} of its {len(given)} cameras"
-        return views, f"seen from {len(views)} of its {len(given)} cameras"
+        if count == 1 and not film and (opening := opening_beside(source, cloud.origin)) is not None:
+            return [_in_shape(opening, side)], "seen as the start camera beside or inside the file does"
+    else:
+        if (inside := _of_mesh(scene, source, count, side, film)) is not None:
+            return inside
+        cloud = splats_to_look_at(scene) if isinstance(scene, SplatMesh) else None
+        if cloud is not None and surely_object(cloud, scene.up if up is None else up, threads):
+            return None  # at a glance, as most meshes are
+        source = source if source is not None and source.is_file() else None
+    if given is None and source is not None:
+        given = cameras_given(source, scene.origin)
+    if cloud is None:
+        toward = guess_up(None, given) if up is None else unit_up(up)
+        return _of_given(scene, given, count, side, toward, film) if given else None
+    if not worth_a_look(cloud):
+        return None
+    if given:
+        toward = guess_up(cloud, given) if up is None else unit_up(up)
+        around = kind_from_outside(cloud, toward, threads)[0] == "object"
+        if around and find_relief(cloud, toward) is None:
+            return None
+        return _of_given(scene, given, count, side, toward, film)
     number = keys_of(count) if film else count
-    found = find_cameras(scene, number, up=up, width=side[0], height=side[1], threads=threads)
+    found = find_cameras(cloud, number, up=up, width=side[0], height=side[1], threads=threads)
     if found.kind == "object":
         return None
     if film:
         words = f"seen on a round through {len(found.cameras)} views that were found"
         return walk(found.cameras, count, found.up), f"{found.in_words()}: {words}"
-    views = opened_with(found.cameras, source, scene.origin, side)
-    return views, found.seen_in_words()
+    start = source if cloud is scene else None
+    return opened_with(found.cameras, start, cloud.origin, side), found.seen_in_words()
+
+
+def _of_given(
+    scene: GaussianCloud | SplatMesh | BaseMesh,
+    given: Sequence[Camera],
+    count: int,
+    side: tuple[int, int],
+    up: np.ndarray,
+    film: bool,
+) -> tuple[list[Camera], str]:
+    """As ``default_views``, by ``given`` cameras."""
+    some = _spread(given, keys_of(count) if film else count)
+    points = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
+    views = [_in_shape(camera.with_near_plane(points), side) for camera in some]
+    words = f"{len(views)} of its {len(given)} cameras"
+    if film:
+        return walk(views, count, up), f"seen on a round through {words}"
+    return views, f"seen from {words}"
 
 
 def _of_mesh(
