@@ -67,17 +67,25 @@ class CutSplats(bpy.types.Operator):
     )
     outside: BoolProperty(name="Outside", description="Choose what lies outside of the region", default=False)
     below_opacity: FloatProperty(
-        name="Up to Opacity", description="1: of any opacity", default=1.0, min=0.0, max=1.0
+        name="Max. Opacity",
+        description="Only splats of at most this opacity; 1: all",
+        default=1.0,
+        min=0.0,
+        max=1.0,
     )
     above_size: FloatProperty(
-        name="Size from", description="Radius of a splat; 0: of any size", default=0.0, min=0.0, unit="LENGTH"
+        name="Min. Size",
+        description="Only splats with at least this radius; 0: all",
+        default=0.0,
+        min=0.0,
+        unit="LENGTH",
     )
-    by_color: BoolProperty(name="Only of a Colour", description="Choose by colour, too", default=False)
+    by_color: BoolProperty(name="By Colour", description="Only splats of a colour", default=False)
     color: FloatVectorProperty(
         name="Colour", subtype="COLOR_GAMMA", size=3, default=(1.0, 1.0, 1.0), min=0.0, max=1.0
     )
     color_distance: FloatProperty(
-        name="Differs up to",
+        name="Tolerance",
         description="Greatest difference from that colour: the distance of red, green and blue, each 0 to 1",
         default=0.15,
         min=0.0,
@@ -153,22 +161,22 @@ class CleanSplats(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
     sparse: FloatProperty(
-        name="Sparse",
-        description="Splats with fewer neighbours than this share of the median; 0: stay",
+        name="Min. Neighbours",
+        description="Delete splats with fewer neighbours than this share of the median; 0: none",
         default=0.05,
         min=0.0,
         max=1.0,
     )
     min_part: FloatProperty(
-        name="Parts below",
-        description="Parts that touch nothing else and have less than this share of all opacity; 0: stay",
+        name="Min. Part",
+        description="Delete parts that touch nothing else with less than this share of all opacity; 0: none",
         default=0.01,
         min=0.0,
         max=1.0,
     )
     max_size: FloatProperty(
-        name="Size from",
-        description="Splats longer than this many radii of the subject",
+        name="Max. Size",
+        description="Delete splats longer than this many radii of the subject",
         default=1000,
         min=0.1,
     )

@@ -351,11 +351,11 @@ def test_given_cameras_are_where_the_targets_are_drawn_from(splats, tmp_path, ca
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--steps", "3", "--minutes", "1"], 2, "give one of --epochs, --steps and --minutes"),
+        (["--steps", "3", "--minutes", "1"], 2, "give only one of --epochs, --steps and --minutes"),
         (["--data", "d", "--views", "9"], 2, "--views has no effect with --data"),
         (["--downscale", "2"], 2, "--downscale has no effect with splats"),
         (["--resume"], 1, "no checkpoint at"),
-        (["--set", "color_rate=7"], 1, "color_rate must be a number"),
+        (["--set", "color_rate=7"], 2, "color_rate must be a number"),
         (["--data", "nowhere"], 1, "no such data set"),
         (["--held-out", "-1"], 1, "at least 1 training view"),
     ],
@@ -475,8 +475,8 @@ def test_a_mesh_for_engines(splats, tmp_path, capsys):
     assert (mesh.colors[:, 3] == 1).all()
     assert result["triangles"] == len(mesh.faces)
     assert alpha_modes(out) == ["OPAQUE"]
-    assert run(splats, "-o", tmp_path / "b.npz", *SMALL, "--cutoff", "0.3") != 0
-    assert "cutoff has no effect without opacity 'cutoff'" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "b.npz", *SMALL, "--cutoff", "0.3") == 2
+    assert "--cutoff has no effect without --opacity cutoff" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from meshsplats.formats.base_meshes import save_base
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.scene.base_mesh import BaseMesh, Texture
+from meshsplats.scene.mesh import SplatMesh
 from meshsplats.viewer import content
 from meshsplats.viewer.unpacking import unpack_mesh
 
@@ -364,6 +365,16 @@ def test_a_textured_surface_alone_or_beside(folder, surface, tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert (result["triangles"], result["surface_triangles"]) == (0, 1)
     assert 0 < result["texture_bytes"] < result["bytes"]
+
+
+def test_a_mesh_of_splats_is_no_surface(tmp_path, capsys):
+    bright = SplatMesh(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 4), [2.0, 0.5, 0.5, 0.5]))
+    save_mesh(bright, tmp_path / "bright.npz")
+    words = [str(tmp_path / "bright.npz"), "--surface", str(tmp_path / "bright.npz")]
+    assert main(["view", *words, "-o", str(tmp_path / "page.html")]) == 2
+    error = capsys.readouterr().err
+    assert "bright.npz is a mesh of splats, whose colours depend on the view: give a mesh of" in error
+    assert not (tmp_path / "page.html").exists()
 
 
 def test_options_that_a_surface_has_not(folder, surface, tmp_path, capsys):

@@ -123,7 +123,7 @@ def test_what_few_people_set_is_marked():
 
 
 def test_the_help_is_the_docstring_and_what_the_option_needs():
-    assert settings(Baking)["coats"].text == "Layers of egg. Only with glaze."
+    assert settings(Baking)["coats"].text == "Layers of egg. Only with ``glaze``."
     assert docstrings(Baking)["heat"] == "Temperature of the oven, degrees Celsius."
 
 

@@ -79,7 +79,8 @@ class With:
 
     def __str__(self) -> str:
         return " or ".join(
-            [*self.names, *(f"{name} {value!r}" for name, known in self.values.items() for value in known)]
+            [f"``{name}``" for name in self.names]
+            + [f"``{name}`` {value!r}" for name, known in self.values.items() for value in known]
         )
 
     def met(self, options: object) -> bool:
@@ -176,6 +177,8 @@ def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:
     def values_of(name: str) -> str:
         values = {preset: getattr(options, name) for preset, options in presets.items()}
         known = [f"{preset}: {value}" for preset, value in values.items() if value is not None]
+        if len(known) == len(presets) and len(set(values.values())) == 1:
+            return f"(default: {next(iter(values.values()))})"
         return f"({'; '.join(known)})" if known else ""
 
     return values_of
@@ -267,7 +270,7 @@ def check_options(
         condition = setting.mark(With)
         is_given = value != setting.default if given is None else name in given
         if condition is not None and is_given and not condition.met(options):
-            got = " and ".join(f"{other} {getattr(options, other)!r}" for other in condition.values)
+            got = " and ".join(f"``{other}`` {getattr(options, other)!r}" for other in condition.values)
             but = f", got {got}" if got else ""
             raise OptionsError(f"``{name}`` has no effect without {condition}{but}")
 
@@ -280,7 +283,7 @@ def check_naming(group: type, how: Callable[[str], str]) -> Callable[[Any], None
             if (own := getattr(group, "__post_init__", None)) is not None:
                 own(options)
         except OptionValueError as error:
-            raise ValueError(error.spelled(how)) from None
+            raise type(error)(error.spelled(how)) from None
 
     return check
 

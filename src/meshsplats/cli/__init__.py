@@ -17,22 +17,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from meshsplats._files import DISK_FULL
-from meshsplats.cli.messages import (
-    ENDINGS,
-    OK,
-    UNREAD,
-    USAGE,
-    Terminated,
-    UsageError,
-    close_output,
-    exit_code,
-    one_line,
-    open_missing_streams,
-    print_json_error,
-    read_from_standard_input,
-    say,
-    write_options,
-)
+from meshsplats.cli import messages
+from meshsplats.cli.messages import OK, USAGE, Terminated, UsageError, exit_code, one_line, say
 from meshsplats.errors import ClusterError, DeviceError
 
 COMMANDS = {
@@ -70,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     SIGTERM, 141 where nobody reads standard output any more (``| head``). With ``--json``, an error is
     printed as JSON too: ``{"error": {"kind", "code", "message", "path", "type"}}``.
     """
-    open_missing_streams()
+    messages.open_missing_streams()
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # as standard error: some file names are no UTF-8
     if "numpy" not in sys.modules:
@@ -85,29 +71,26 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _answer(name) if name not in COMMANDS else _run(name, arguments[1:])
             sys.stdout.flush()
             return code
-    except SystemExit as stop:  # help, or an error in the arguments, has been printed
-        code = stop.code if isinstance(stop.code, int) else USAGE
-        if code == USAGE and as_json:
-            print_json_error(UsageError("the options were not understood; standard error says why"))
-        return code
+    except SystemExit as stop:  # help has been printed
+        return stop.code if isinstance(stop.code, int) else USAGE
     except (KeyboardInterrupt, Terminated) as stop:
         number = getattr(stop, "number", signal.SIGINT)
-        say(f"{ENDINGS.get(number, 'ended')}; no file was left half-written")
+        say(f"{messages.ENDINGS.get(number, 'ended')}; no file was left half-written")
         return 128 + number
     except BrokenPipeError:
-        close_output()
-        return UNREAD
+        messages.close_output()
+        return messages.UNREAD
     except (UsageError, ValueError, OSError, ImportError, MemoryError, DeviceError, ClusterError) as error:
         if debug:
             raise
         if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:
             # All files have names in their errors.
             error = OSError(error.errno, error.strerror, "standard output")
-            close_output()
+            messages.close_output()
         hint = f" (see meshsplats {name} --help)" if isinstance(error, UsageError) else ""
         say(f"error: {one_line(error)}{hint}")
         if as_json:
-            print_json_error(error)
+            messages.print_json_error(error)
         return exit_code(error)
 
 
@@ -124,7 +107,7 @@ def _signals_raise() -> Iterator[None]:
 
     ours = []
     if threading.current_thread() is threading.main_thread():
-        ours = [n for n in ENDINGS if n != signal.SIGINT and signal.getsignal(n) == signal.SIG_DFL]
+        ours = [n for n in messages.ENDINGS if n != signal.SIGINT and signal.getsignal(n) == signal.SIG_DFL]
     for number in ours:
         signal.signal(number, end)
     try:
@@ -135,7 +118,6 @@ def _signals_raise() -> Iterator[None]:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    from meshsplats.cli import messages
     from meshsplats.errors import DataWarning, StraysWarning
 
     warned: list[tuple[str, ...]] = []
@@ -161,7 +143,7 @@ def _execute(name: str, words: list[str]) -> int:
 
     module, _, attribute = COMMANDS[name][0].partition(":")
     kind = getattr(importlib.import_module(module), attribute)
-    write_options(lambda name: spelled(kind, name))
+    messages.write_options(lambda name: spelled(kind, name))
     with usage_errors(), promises_kept():
         return parse(kind, f"meshsplats {name}", words).execute() or OK
 
@@ -170,7 +152,7 @@ def _execute(name: str, words: list[str]) -> int:
 def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
     """``arguments`` with the path of a file in place of -, which holds standard input: readers open their
     files several times."""
-    read_from_standard_input(None)
+    messages.read_from_standard_input(None)
     places = [
         i
         for i, argument in enumerate(arguments)
@@ -193,7 +175,7 @@ def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
                 shutil.copyfileobj(sys.stdin.buffer, file, 1 << 20)
         except OSError as error:
             raise OSError(error.errno, f"standard input does not fit here: {error.strerror}", path) from None
-        read_from_standard_input(path)  # until the next command: errors are printed after this one
+        messages.read_from_standard_input(path)  # until the next command: errors are printed after this one
         yield [*arguments[: places[0]], path, *arguments[places[0] + 1 :]]
 
 
@@ -207,19 +189,18 @@ def _answer(name: str) -> int:
 
         print(f"meshsplats {meshsplats.__version__}")
         return OK
-    return _unknown(name)
+    from meshsplats._common.options import did_you_mean
+
+    hint = did_you_mean(name, COMMANDS) or f"commands: {', '.join(COMMANDS)}"
+    say(f"error: there is no command {name!r}; {hint}")
+    return USAGE
 
 
 def _joined(arguments: list[str]) -> list[str]:
     """``--up -y`` as ``--up=-y``: a value that begins with a minus sign would be taken for an option."""
     joined: list[str] = []
     for argument in arguments:
-        if (
-            joined
-            and joined[-1] in _TAKES_SIGN
-            and argument.startswith("-")
-            and not argument.startswith("--")
-        ):
+        if joined and joined[-1] in _TAKES_SIGN and argument[:1] == "-" != argument[1:2]:
             joined[-1] += "=" + argument
         else:
             joined.append(argument)
@@ -244,11 +225,3 @@ def _overview() -> str:
         "  meshsplats view scene.ply                in the browser\n"
         "  meshsplats convert scene.ply -o scene.glb"
     )
-
-
-def _unknown(name: str) -> int:
-    from meshsplats._common.options import did_you_mean
-
-    hint = did_you_mean(name, COMMANDS) or f"commands: {', '.join(COMMANDS)}"
-    say(f"error: there is no command {name!r}; {hint}")
-    return USAGE

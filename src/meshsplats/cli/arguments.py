@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import textwrap
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,10 +16,12 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 import tyro
 
 from meshsplats._common import toml
+from meshsplats._common.help_titles import Captured, titled
+from meshsplats._common.misuse import Usage, in_one_line, misuse
 from meshsplats._common.option_values import converted, from_text, short
 from meshsplats._common.options import check_naming, did_you_mean, reachable, settings
 from meshsplats.cli.messages import OK, UsageError, flag, say, with_flags
-from meshsplats.errors import OptionsError, OptionValueError
+from meshsplats.errors import OptionValueError, with_options
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
@@ -82,10 +83,12 @@ class Option:
     @property
     def without_flag(self) -> bool:
         """Whether it may be given without its flag: by its place, or by a short one; or has to be given."""
-        _, hint, default = self.part
-        marks = getattr(hint, "__metadata__", ())
-        short = any(getattr(mark, "aliases", None) for mark in marks)
-        return short or tyro.conf.Positional in marks or isinstance(default, Field)
+        short = any(getattr(mark, "aliases", None) for mark in getattr(self.part[1], "__metadata__", ()))
+        return short or self.positional or isinstance(self.part[2], Field)
+
+    @property
+    def positional(self) -> bool:
+        return tyro.conf.Positional in getattr(self.part[1], "__metadata__", ())
 
     def value(self, command: object) -> Any:
         for name in self.path:
@@ -107,14 +110,13 @@ def parse(command: type[C], prog: str, words: Sequence[str]) -> C:
     """The command that ``words`` describe.
 
     Raises:
-        SystemExit: after --help (0), or for words that are not understood (2), which has been printed.
-        UsageError: for --set or a configuration file that is wrong.
-        ValueError: --threads is below 1.
+        SystemExit: after --help.
+        UsageError: for words, --set or a configuration file that are wrong.
     """
     made = _parsed(command, prog, _taken_apart(words))
     option = options_of(command).get("threads")
     if option is not None and (count := option.value(made)) is not None and count < 1:
-        raise ValueError(f"--threads must be at least 1, got {count}")  # before the work: images come last
+        raise UsageError(f"--threads must be at least 1, got {count}")  # before the work: images come last
     return made
 
 
@@ -123,7 +125,9 @@ def _parsed(command: type[C], prog: str, line: Line) -> C:
         _print_help(command, prog, everything="--help-all" in line.words)
         raise SystemExit(OK)
     flags = {word.partition("=")[0] for word in line.words if word[:2] == "--"}
-    _refuse_flags_of_settings(command, flags)
+    for name in (name for name, option in options_of(command).items() if not option.has_flag):
+        if flag(name) in flags:
+            raise UsageError(f"{flag(name)} is not an option of its own: write --set {name}=VALUE")
     if line.config is None and not line.settings:
         return _with_given(command, prog, line.words, flags)
     name = prog.rpartition(" ")[2]
@@ -159,19 +163,26 @@ def _with_given(command: type[C], prog: str, words: list[str], flags: Collection
 
 def _with_all(command: type[C], prog: str, words: list[str], values: Mapping[str, Any] | None = None) -> C:
     """``command`` as ``words`` describe it, where ``values`` of a configuration are not replaced."""
-
-    def read(kind: type[T]) -> T:
-        if values is None:
-            return tyro.cli(kind, prog=prog, args=words, config=_PARSED)
-        return tyro.cli(kind, prog=prog, args=words, default=_filled(kind, values), config=_FILLED)
-
+    how: dict[str, Any] = {"config": _PARSED if values is None else _FILLED}
+    how |= {} if values is None else {"default": _filled(command, values)}
+    printed = io.StringIO()
     try:
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            return read(command)
-    except SystemExit:
-        flags = [name for name, option in options_of(command).items() if option.has_flag]
-        read(_described(command, flags, flags))  # says why, with the help of options that are close
-        return read(command)  # or what is wrong are values
+        with redirect_stderr(printed):
+            return tyro.cli(command, prog=prog, args=words, **how)
+    except SystemExit as stop:
+        if not stop.code:
+            raise  # it has printed what was asked for
+        full = ["--output" if word == "-o" else word for word in words]
+        problem = misuse(full, _usage(command, values or ()))
+        raise UsageError(problem or in_one_line(printed.getvalue())) from None
+
+
+def _usage(command: type, filled: Collection[str]) -> Usage:
+    """What ``command`` takes; ``filled``: names of options that a configuration has."""
+    parts = {name: option for name, option in options_of(command).items() if option.has_flag}
+    shown = {name: name if option.positional else flag(name) for name, option in parts.items()}
+    needed = [name for name in parts if isinstance(parts[name].part[2], Field) and name not in filled]
+    return Usage({shown[name]: parts[name].hint for name in parts}, [shown[name] for name in needed])
 
 
 def _default(part: Field[Any]) -> Any:
@@ -208,13 +219,11 @@ def spelled(command: type, name: str) -> str:
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Within the block, an OptionsError of the library becomes a UsageError."""
+    """Within the block, an OptionValueError of the library becomes a UsageError."""
     try:
         yield
-    except OptionsError as error:
-        raise UsageError(*error.args) from None
     except OptionValueError as error:
-        raise ValueError(*error.args) from None
+        raise UsageError(*error.args) from None
 
 
 def as_cli_options(
@@ -260,7 +269,8 @@ def as_cli_options(
                 start = field(default_factory=hint)  # type: ignore[arg-type]
             elif presets or setting.optional:
                 metavar = metavars.get(name) or setting.placeholder
-                hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
+                end = "" if "Default:" in setting.help else defaults(name)
+                hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=end)]
             parts.append((name, hint, start))
         names: dict[str, Any] = {"__doc__": about or group.__doc__, "__module__": group.__module__}
         names["__post_init__"] = check_naming(group, flag) if checked else lambda self: None
@@ -296,13 +306,6 @@ def _taken_apart(words: Sequence[str]) -> Line:
     return Line(rest, Path(found["--config"][0]) if found["--config"] else None, settings)
 
 
-def _refuse_flags_of_settings(command: type[Command], flags: Collection[str]) -> None:
-    """UsageError for an option that has no flag, but is given as one."""
-    for name, option in options_of(command).items():
-        if not option.has_flag and flag(name) in flags:
-            raise UsageError(f"{flag(name)} is not an option of its own: write --set {name}=VALUE")
-
-
 def _read_settings(
     command: type[Command], texts: Mapping[str, str], flags: Collection[str], name: str
 ) -> dict[str, Any]:
@@ -325,8 +328,9 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
     flags = [name for name, option in options.items() if option.has_flag]
     hidden = [] if everything or not common else [name for name in flags if name not in common]
     shown = _described(command, [name for name in flags if name not in hidden], flags)
-    with suppress(SystemExit):
+    with suppress(SystemExit), redirect_stdout(Captured()) as printed:
         tyro.cli(shown, prog=prog, args=["--help"], config=_PARSED)
+    print(titled(printed.getvalue()), end="")
     others = [name for name, option in options.items() if not option.has_flag]
     notes = [f"{len(hidden)} more options: --help-all."] if hidden else []
     if command.CONFIGURABLE:
@@ -352,23 +356,24 @@ def _described_parts(
 ) -> list[tuple[str, Any, Any]]:
     parts: list[tuple[str, Any, Any]] = []
     known, hints = settings(command), get_type_hints(command, include_extras=True)
+    named = {name: flag(name) for name in flags}
     for part in fields(command):
         hint, name = hints[part.name], part.name
         if Flat in getattr(hint, "__metadata__", ()):
             parts += _described_parts(hint.__origin__, shown, flags)
         elif is_dataclass(hint):
-            group = _described(hint, shown, flags, known[name].help)  # type: ignore[arg-type]
-            parts.append((name, group, field(default_factory=group)))
-        elif name in shown:
+            inner = _described_parts(hint, shown, flags)  # type: ignore[arg-type]
+            if len(inner) > 1:  # one option needs no box of its own
+                group = _described(hint, shown, flags, known[name].help)  # type: ignore[arg-type]
+                inner = [(name, group, field(default_factory=group))]
+            parts += inner
+        elif name in shown and getattr(hint, "__origin__", hint) is not object:
             if known[name].help:  # else its type has the help, for options of several commands
-                hint = Annotated[hint, tyro.conf.arg(help=_with_flags(known[name].text, flags))]
+                hint = Annotated[
+                    hint, tyro.conf.arg(help=with_options(known[name].text, lambda key: named.get(key, key)))
+                ]
             parts.append((name, hint, _default(part)))
     return parts
-
-
-def _with_flags(text: str, options: Collection[str]) -> str:
-    """``text`` without double backquotes; the names of ``options`` in them become flags."""
-    return re.sub("``(.+?)``", lambda match: flag(match[1]) if match[1] in options else match[1], text)
 
 
 # ---- Configuration files

@@ -5,15 +5,16 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from meshsplats import errors
 from meshsplats._common.words import naming, printable
 from meshsplats._files import DISK_FULL
-from meshsplats.errors import ClusterError, DeviceError, NamingOptions, OverwritingError, with_options
 
 OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
 """Exit codes. FAILED: the input, or a path that was named, is wrong. LACKING: a library, a program, a GPU or
@@ -49,13 +50,14 @@ class Terminated(BaseException):
 
 def exit_code(error: BaseException) -> int:
     """The exit code for ``error``."""
-    if isinstance(error, (UsageError, OverwritingError)):
+    if isinstance(error, (UsageError, errors.OverwritingError, errors.OptionValueError)):
         return USAGE
     if isinstance(error, FileExistsError):
         return EXISTS
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return NO_SPACE
-    return LACKING if isinstance(error, (ImportError, MemoryError, DeviceError, ClusterError)) else FAILED
+    lacking = (ImportError, MemoryError, errors.DeviceError, errors.ClusterError)
+    return LACKING if isinstance(error, lacking) else FAILED
 
 
 def error_record(error: BaseException) -> dict[str, Any]:
@@ -101,7 +103,8 @@ def write_options(how: Callable[[str], str]) -> None:
 
 def with_flags(text: str) -> str:
     """``text`` with flags for the names of options in double backquotes, fit for terminals."""
-    return printable(with_options(text, _spelled or flag))
+    named = errors.with_options(text, _spelled or flag)
+    return printable(re.sub(r"(--[\w-]+) '(\w+)'", r"\1 \2", named))  # as shells take it
 
 
 def shown_path(path: str | os.PathLike[str]) -> str:
@@ -117,7 +120,7 @@ def one_line(error: object) -> str:
             reason = os.strerror(errno.EISDIR)  # Windows says "Permission denied"
         text = f"{os.fsdecode(error.filename)}: {reason}"
     else:
-        text = error.spelled(_spelled or flag) if isinstance(error, NamingOptions) else str(error)
+        text = error.spelled(_spelled or flag) if isinstance(error, errors.NamingOptions) else str(error)
     if isinstance(error, MemoryError) and not text:
         text = "out of memory"
     if _standard_input is not None:

@@ -74,7 +74,7 @@ class Tiles(Command):
         lines = [f"{found.in_words()}, in {seconds:.1f} s", found.alpha.in_words() if found.alpha else None]
         lines += [f"{table}: geometric error of the root {found.error:.3g}"]
         if not found.on_globe:
-            lines += ["next: docs/tiles.md has a page for CesiumJS, whose globe would hide it in the Earth"]
+            lines += ["next: docs/tiles.md has a page that shows it in CesiumJS, without the globe around it"]
         result = {"tileset": str(table), **asdict(found), "seconds": round(seconds, 2)}
         self.finish(result, *filter(None, lines))
 

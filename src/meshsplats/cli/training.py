@@ -221,7 +221,7 @@ class TrainingCommand(Command):
             raise UsageError("--exposure has no effect without --data: rendered images have one exposure")
         lengths = {name: getattr(self, name) for name in LENGTHS if getattr(self, name) is not None}
         if len(lengths) > 1:
-            raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
+            raise UsageError("give only one of --epochs, --steps and --minutes")
         return tuning | lengths
 
     def rendering_next(self) -> list[str]:

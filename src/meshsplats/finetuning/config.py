@@ -56,7 +56,7 @@ class FinetuneConfig:
     """Length in epochs: passes over all training views. Exactly one of epochs, steps and minutes is given."""
     steps: Annotated[int | None, Range(0, 10**9)] = 1000
     """Length in steps, of one view each."""
-    minutes: Annotated[float | None, Range(0, 1e5)] = None
+    minutes: Annotated[float | None, Range(1e-4, 1e5)] = None
     """Length in minutes, including what came before (reading, finding cameras, converting, rendering the
     targets). The only length whose result depends on the machine's speed."""
     color_rate: Annotated[float, Range(1e-9, 1), Advanced] = 0.02

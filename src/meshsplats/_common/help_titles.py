@@ -1,0 +1,39 @@
+"""Titles of the groups of options in help texts, where tyro has the names of fields."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+
+TITLES = {
+    "chain": "levels of detail",
+    "draw": "drawing",
+    "files": "output files",
+    "laying": "splats on the base",
+    "light": "light and surroundings",
+    "part": "part of the scene",
+    "reading": "reading splats",
+    "target": "targets",
+    "tuning": "optimisation",
+}
+"""By the names of fields; where none is here, the name is the title."""
+
+
+class Captured(io.StringIO):
+    """What is printed while it stands for standard output, in the same colours."""
+
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return sys.__stdout__ is not None and sys.__stdout__.isatty()
+
+
+def titled(text: str) -> str:
+    """``text`` with the titles of its groups, "files options" say, in words; lines stay as long."""
+    return re.sub(r"(\w+) options(\S*) (─+)", _titled, text)
+
+
+def _titled(found: re.Match[str]) -> str:
+    title = TITLES.get(found[1], found[1])
+    return f"{title}{found[2]} " + "─" * (len(found[3]) + len(f"{found[1]} options") - len(title))

@@ -1,0 +1,141 @@
+"""What is wrong with the words of a command line, said in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from meshsplats._common.option_values import converted, from_text, short
+from meshsplats._common.options import alternatives, did_you_mean
+
+_MANY = 10**9
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".avif", ".dng")
+
+
+@dataclass(frozen=True)
+class Usage:
+    """The words that a command takes."""
+
+    kinds: Mapping[str, Any]
+    """Type of each flag, by its name such as ``--steps``, and of each word without a flag, by a name without
+    dashes, in their order. bool: a flag without a value; a tuple without end: all words that follow."""
+    required: Collection[str]
+    """Names of those that cannot be left out."""
+
+    @property
+    def places(self) -> list[str]:
+        """Names of words without a flag."""
+        return [name for name in self.kinds if name[0] != "-"]
+
+
+def misuse(words: Sequence[str], usage: Usage) -> str:
+    """What is wrong with ``words``; empty where nothing is found."""
+    waiting, plain, given = list(words), [], set()
+    while waiting:
+        word = waiting.pop(0)
+        if not _is_flag(word):
+            plain.append(word)
+            continue
+        name, equals, value = word.partition("=")
+        name = name.replace("_", "-")
+        if (kind := usage.kinds.get(name)) is None:
+            if usage.kinds.get(name.replace("no-", "", 1)) is bool:
+                continue
+            hint = did_you_mean(name, usage.kinds)
+            return f"there is no option {short(name)[1:-1]}" + (f"; {hint}" if hint else "")
+        given.add(name)
+        if kind is bool:
+            if equals:
+                return f"{name} takes no value, got {short(value)}"
+            continue
+        values = [value] if equals else []
+        while waiting and len(values) < _most(kind, values) and not _is_flag(waiting[0]):
+            values.append(waiting.pop(0))
+        if problem := _problem(kind, values):
+            return f"{name} {problem}"
+    return _of_places(plain, given, usage)
+
+
+def _is_flag(word: str) -> bool:
+    with suppress(ValueError):
+        float(word)
+        return False
+    return len(word) > 1 and word[0] == "-"
+
+
+def _most(kind: Any, values: Sequence[str]) -> int:
+    """Most values of an option that begin with these."""
+    most = 1
+    for each in alternatives(kind):
+        if values and get_origin(each) is Literal and values[0] in get_args(each):
+            return 1
+        if get_origin(each) is tuple:
+            most = _MANY if Ellipsis in get_args(each) else len(get_args(each))
+    return most
+
+
+def _problem(kind: Any, values: Sequence[str]) -> str:
+    """What is wrong with these values of an option, for its name in front; empty if nothing is."""
+    if not values:
+        return f"needs {_wanted(kind)}"
+    kinds = [each for each in alternatives(kind) if each is not type(None)]
+    lists = [each for each in kinds if get_origin(each) is tuple]
+    others = [each for each in kinds if each not in lists]
+    if not lists or (others and not _of_value(others[0], values[0])):
+        return _of_value(kind, values[0])
+    parts = get_args(lists[0])
+    if Ellipsis in parts:
+        parts = (parts[0],) * len(values)
+    if len(values) != len(parts):
+        return f"needs {_wanted(kind)}, got {short(' '.join(values))}"
+    return next(filter(None, map(_of_value, parts, values)), "")
+
+
+def _of_value(kind: Any, text: str) -> str:
+    try:
+        converted(from_text(text, kind), kind, Path())
+    except TypeError as error:
+        number = re.match(r"-?\d+" if float not in alternatives(kind) else r"-?\d+(\.\d+)?", text)
+        such_as = f", such as {number[0]}" if number and "number" in str(error) else ""
+        return f"must be {error}{such_as}, got {short(text)}"
+    return ""
+
+
+def _wanted(kind: Any) -> str:
+    """What an option of this type takes, in words."""
+    wanted = []
+    for each in alternatives(kind):
+        if get_origin(each) is tuple:
+            count = len(get_args(each))
+            wanted.append("values" if Ellipsis in get_args(each) else f"{count} values")
+        elif each is not type(None):
+            try:
+                converted(None, each, Path())
+            except TypeError as error:
+                wanted.append(str(error))
+    return " or ".join(wanted)
+
+
+def _of_places(plain: Sequence[str], given: Collection[str], usage: Usage) -> str:
+    """What is wrong with the words without a flag, or missing, where the flags ``given`` are."""
+    endless = any(_most(usage.kinds[name], ()) == _MANY for name in usage.places)
+    if len(plain) > len(usage.places) and not endless:
+        if all(word.lower().endswith(_PHOTOGRAPHS) for word in plain):
+            return "give the folder of the photographs, not the photographs themselves"
+        return f"{short(plain[len(usage.places)])} is one word too many"
+    found = {*given, *usage.places[: len(plain)]}
+    missing = [name if name[0] == "-" else f"the {name}" for name in usage.required if name not in found]
+    if not missing:
+        return ""
+    return f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+
+
+def in_one_line(text: str) -> str:
+    """A message in a box of lines as one line, without its reference to help."""
+    inner = text.partition("For full helptext")[0].partition("\u256e")[2] or text
+    words = re.sub("[\u2500-\u257f]+", " ", inner)
+    return " ".join(words.split()) or "the options were not understood"
