@@ -210,6 +210,23 @@ def test_cameras_placed_upright_tell_up_exactly():
     np.testing.assert_allclose(guess_up(None, down), (0, -1, 0), atol=1e-9)
 
 
+def test_cameras_on_one_side_tell_up_though_all_look_down():
+    """Along 18 degrees, held by hand, 30 degrees down: the mean of their own up directions leans as far."""
+    rng = np.random.default_rng(3)
+    held = []
+    for angle in np.radians(np.linspace(-9, 9, 20)):
+        place = (5 * np.sin(angle), -5 * np.tan(np.radians(30)), -5 * np.cos(angle))
+        held.append(look_at(place, (0, 0, 0), up=(np.tan(np.radians(rng.normal(0, 1))), -1, 0)))
+    assert guess_up(None, held) @ (0, -1, 0) > np.cos(np.radians(10))
+    # Held so badly that what is level cannot be told, their mean is the better guess.
+    rolled = [
+        look_at(camera.center, (0, 0, 0), up=(np.tan(np.radians(roll)), -1, 0))
+        for camera, roll in zip(held, rng.permutation(np.linspace(-6, 6, 20)), strict=True)
+    ]
+    mean = np.mean([camera.up for camera in rolled], axis=0)
+    np.testing.assert_allclose(guess_up(None, rolled), mean / np.linalg.norm(mean), atol=1e-9)
+
+
 def test_cameras_of_one_direction_or_rolled_ones_tell_up_by_their_mean():
     same = [look_at((0.1 * i, -1, -5), (0.1 * i, 0, 0), up=(0, -1, 0)) for i in range(3)]
     np.testing.assert_allclose(guess_up(None, same), same[0].up, atol=1e-9)

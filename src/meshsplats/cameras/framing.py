@@ -42,11 +42,14 @@ COVERED = 0.995
 MARGIN = 1.08
 """Distance of the cameras as a multiple of the one at which the subject just fits."""
 
-LEVEL_SPREAD = 0.03
+LEVEL_SPREAD = 0.006
 """Least mean square of the second principal component of the directions to the right of cameras, for these
-to tell what is level: cameras that look the same way within some 20 degrees do not."""
-LEVEL_ROLL = 0.2
-"""Greatest mean square of what stands out of that plane, as a share of the former: people roll cameras."""
+to tell what is level: cameras that look the same way within some 10 degrees do not. In 35 series of 18 to 30
+neighbouring photographs of a room, from above, it is 0.007 to 0.065, and what they tell 0.4 to 11 degrees
+off; their mean up direction is 24 to 35 off in the 21 below 0.03."""
+LEVEL_ROLL = 0.12
+"""Greatest mean square of what stands out of that plane, as a share of the former: people roll cameras. In
+these series, 0.002 to 0.107; where the camera was turned on its side, 0.88."""
 LEVEL_AGREES = 0.3
 """Least cosine between that direction and the cameras' mean up direction."""
 

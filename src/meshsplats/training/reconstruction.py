@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._common.json_files import read_json
+from meshsplats._common.words import plural
 from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together, write_bytes, write_text
 from meshsplats.datasets.image_files import Shelf, inside
@@ -214,9 +215,11 @@ def find_cameras(
     placed = {named[image.name] for image in best.images.values() if image.has_pose}
     groups = [[named[name] for name in group] for group in poses.apart]
     apart = {name for group in groups for name in group}
-    lost = [path.name for path in photographs if path.name not in placed | apart]
+    outvoted = [named[name] for name in poses.outvoted]
+    lost = [path.name for path in photographs if path.name not in {*placed, *apart, *outvoted}]
     for names, text in (
         (lost, "found no place among the others and are left out"),
+        (outvoted, "were placed where most of their matches contradict it: left out"),
         *((group, "match each other, but nothing joins them to the rest: left out") for group in groups),
     ):
         if names:
@@ -227,10 +230,11 @@ def find_cameras(
             )
     if poses.doubtful:
         suspects = shortened([named[name] for name in poses.suspects()])
+        pairs = plural(len(poses.contradicting), "pair of photographs", "pairs of photographs")
         warnings.warn(
-            f"{folder}: some cameras may be wrong: {len(poses.contradicting):,} pairs of photographs that"
-            f" match contradict them, most of {suspects}."
-            " Photographs between those of such a pair help, or the cameras of another program",
+            f"{folder}: some cameras may be wrong: they contradict {pairs} that match, most of all"
+            f" those of {suspects}. Leave these out, add photographs between them and their neighbours, or"
+            " give the cameras of another program",
             DataWarning,
             stacklevel=2,
         )
