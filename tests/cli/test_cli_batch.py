@@ -110,7 +110,7 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
         (["scans/none.ply", "scans/a.ply", "-o", "no/out"], 1, "no"),
         (["scans", "-o", "out", "--lit", "--formats", "npz"], 2, "--lit is for .glb"),
         (["scans", "-o", "out", "--as-splats", "--formats", "obj"], 2, "splats are written as .ply"),
-        (["scans", "-o", "out", "--set", "sides=2"], 1, "sides"),
+        (["scans", "-o", "out", "--set", "sides=2"], 2, "sides"),
         (
             ["scans", "-o", "out", "--formats", "glb", "compressed.ply"],
             2,
@@ -120,7 +120,7 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
         (["scans", "-o", "out", "--formats", "usdz", "obj"], 2, "a second command (see meshsplats convert"),
         (["-", "-", "-o", "out"], 2, "can be read once"),
         (["scans/a.ply", "-o", "-"], 2, "-o must end in"),
-        (["scans/a.ply", "-o", "a.glb", "--fidelity", "0"], 1, "--fidelity must be"),
+        (["scans/a.ply", "-o", "a.glb", "--fidelity", "0"], 2, "--fidelity must be"),
     ],
 )
 def test_mistakes_are_reported_first(scans, tmp_path, capsys, arguments, code, words):

@@ -196,7 +196,7 @@ def test_another_topology_writes_nothing(scene, trained, tmp_path, capsys):
         (["--data", "d", "--splats", "s.ply"], 2, "give --data or --splats, not both"),
         (["--data", "d", "--layers", "1", "--spacing", "0.1"], 2, "--spacing has no effect with one layer"),
         (["--data", "d", "--texture", "t.png", "--colors", "grey"], 2, "--texture has no effect"),
-        (["--data", "d", "--steps", "1", "--epochs", "1"], 2, "give one of --epochs"),
+        (["--data", "d", "--steps", "1", "--epochs", "1"], 2, "give only one of --epochs"),
         (["--data", "nowhere"], 1, "no such data set"),
         (["--data", "d", "--resume"], 1, "no checkpoint at"),
     ],
