@@ -229,7 +229,7 @@ def test_the_command_keeps_to_its_threads(file, tmp_path, monkeypatch, kind):
 def test_threads_are_checked_before_the_work(file, tmp_path, capsys, command):
     more = ["--share", "0.5"] if command == "simplify" else []
     output = str(tmp_path / "out.ply")
-    assert main([command, str(file), "-o", output, "--threads", "0", *more]) == 1
+    assert main([command, str(file), "-o", output, "--threads", "0", *more]) == 2
     assert capsys.readouterr().err == "meshsplats: error: --threads must be at least 1, got 0\n"
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 

@@ -423,7 +423,7 @@ def photograph(path):
         (lambda f: (f / "clip.MP4").touch(), r"clip\.MP4 in it is a video: 'meshsplats train"),
         (lambda f: (f / "clip.mts").touch(), r"clip\.mts in it is a video: 'meshsplats train"),
         (lambda f: (f / "a.dng").touch(), r"a\.dng in it is a raw photograph, .*: develop it to JPEG"),
-        (lambda f: (f / "a.avif").touch(), r"a\.avif in it is an image .*: convert it to JPEG"),
+        (lambda f: (f / "a.jxl").touch(), r"a\.jxl in it is an image .*: convert it to JPEG"),
         (lambda f: photograph(f / "a.jpg"), "of photographs without, 'meshsplats train' finds the cameras"),
         (lambda f: photograph(f / "DCIM/100APPLE/a.jpg"), "there are photographs in DCIM/100APPLE/: give"),
         (lambda f: (f / "scan.las").touch(), r"scan\.las in it is a point cloud"),

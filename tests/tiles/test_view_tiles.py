@@ -94,8 +94,8 @@ def test_they_are_left_out_unless_asked_for(splats, tileset, tmp_path, capsys):
     assert digest(tmp_path / "v") == digest(tileset)
     assert main([*words, "--color-degree", "1", "--force"]) == 0  # a degree asks for them, too
     assert digest(tmp_path / "v") == digest(tileset)
-    assert main([*words, "--colors", "base", "--color-degree", "1", "--force"]) == 1
-    assert "color-degree has no effect without colors 'view'" in capsys.readouterr().err
+    assert main([*words, "--colors", "base", "--color-degree", "1", "--force"]) == 2
+    assert "--color-degree has no effect without --colors view" in capsys.readouterr().err
 
 
 def test_files_of_different_degrees(tmp_path):

@@ -124,7 +124,7 @@ def test_a_run_says_its_size_and_keeps_it(command, scene, photographs, tmp_path,
     assert f"of {SIDE} x {SIDE} pixels" in shown.err
     assert "as time allows" not in shown.err
     assert "--downscale" not in shown.out
-    assert main([*words, "--steps", "2", "--downscale", "0", "--force"]) == 1
+    assert main([*words, "--steps", "2", "--downscale", "0", "--force"]) == 2
     assert "downscale must be a whole number from 1 to 64, got 0" in capsys.readouterr().err
     scored = [
         "evaluate",
@@ -134,7 +134,7 @@ def test_a_run_says_its_size_and_keeps_it(command, scene, photographs, tmp_path,
         "-o",
         str(tmp_path / "scores"),
     ]
-    assert main([*scored, "--downscale", "0"]) == 1
+    assert main([*scored, "--downscale", "0"]) == 2
     assert "from 1 to 64, got 0" in capsys.readouterr().err
     assert main([*words, "--steps", "2", "--downscale", "3", "--force"]) == 0
     assert f"of {SIDE // 3} x {SIDE // 3} pixels" in capsys.readouterr().err

@@ -455,7 +455,7 @@ def test_wrong_options_are_refused_before_cameras_are_found(
     monkeypatch.setattr(PhotographOptions, "with_cameras", lambda *given, **more: pytest.fail("looked"))
     (tmp_path / "photos").mkdir()
     words = ["train", str(tmp_path / "photos"), "-o", str(tmp_path / "mesh.npz"), option, value]
-    assert main(words) == 1
+    assert main(words) == 2
     assert message in capsys.readouterr().err
 
 

@@ -20,7 +20,10 @@ VIDEO_SUFFIXES = (
     *(".3gp", ".3g2", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".vob"),
     *(".wmv", ".asf", ".flv", ".ogv", ".mxf"),
 )
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".dng")
+IMAGE_SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".heic", ".heif", ".avif", ".webp"),
+    *(".tif", ".tiff", ".bmp", ".exr", ".dng"),
+)
 
 
 class _Kind(NamedTuple):
@@ -65,9 +68,9 @@ _KINDS: Sequence[_Kind] = (
         b"",
         "a raw photograph, which is not read: develop it to JPEG or TIFF first",
     ),
-    _Kind(".avif .jxl .jp2", b"", "an image of a kind that is not read: convert it to JPEG or PNG first"),
+    _Kind(".jxl .jp2", b"", "an image of a kind that is not read: convert it to JPEG or PNG first"),
     _Kind(
-        ".jpg .jpeg .png .webp .tif .tiff .bmp .gif .heic .heif .exr",
+        ".jpg .jpeg .png .webp .tif .tiff .bmp .gif .heic .heif .avif .exr",
         rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|II\*\0|MM\0\*|v/1\x01|....ftyp(heic|heix|mif1|avif)",
         "an image; 'meshsplats train' makes a mesh of a folder of photographs",
     ),

@@ -24,10 +24,10 @@ from meshsplats.scene.camera import Camera
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
-READABLE = (*dict.fromkeys(suffix.lower() for suffix in SUFFIXES), ".ppm", ".heic", ".heif")
+READABLE = (*dict.fromkeys(suffix.lower() for suffix in SUFFIXES), ".ppm", ".heic", ".heif", ".avif")
 """Suffixes of photographs, in letters of any case."""
 UNREADABLE = (
-    *(".exr", ".hdr", ".tga", ".avif", ".jxl", ".jp2", ".gif", ".jfif", ".jpe"),
+    *(".exr", ".hdr", ".tga", ".jxl", ".jp2", ".gif", ".jfif", ".jpe"),
     *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".raw"),
 )
 """Suffixes of images that are not read."""
