@@ -64,7 +64,7 @@ CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
 help:
 	@echo 'make demo    splats to mesh, GLB, images, a comparison and a page, in $(DEMO)/'
-	@echo 'make test    the tests, but for those that take seconds each, which make test-slow and test-nightly run'
+	@echo 'make test    the quick tests; make test-slow and make test-nightly run the others'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'

@@ -230,7 +230,8 @@ def test_threads_are_checked_before_the_work(file, tmp_path, capsys, command):
     more = ["--share", "0.5"] if command == "simplify" else []
     output = str(tmp_path / "out.ply")
     assert main([command, str(file), "-o", output, "--threads", "0", *more]) == 2
-    assert capsys.readouterr().err == "meshsplats: error: --threads must be at least 1, got 0\n"
+    said = f"--threads must be at least 1, got 0 (see meshsplats {command} --help)"
+    assert capsys.readouterr().err == f"meshsplats: error: {said}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 

@@ -1,6 +1,6 @@
 """Gradients of meshes on the GPU: images with a tape, and their backward pass.
 
-docs/webgpu.md describes the kernels.
+docs/webgpu-host.md describes the kernels.
 """
 
 from __future__ import annotations

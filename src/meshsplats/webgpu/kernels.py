@@ -1,6 +1,6 @@
 """The WGSL text of the kernels, and the frame: which kernel runs when, on which buffers, how often.
 
-Any host can run it, in Python or in a browser: docs/webgpu.md describes what a host has to do.
+Any host can run it, in Python or in a browser: docs/webgpu-host.md describes what a host has to do.
 """
 
 from __future__ import annotations

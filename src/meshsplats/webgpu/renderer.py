@@ -1,4 +1,4 @@
-"""Draws meshes on the GPU, in windows of the image. docs/webgpu.md describes the kernels."""
+"""Draws meshes on the GPU, in windows of the image. docs/webgpu-host.md describes the kernels."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Optimisation steps on the GPU: positions, colours and moments stay there, and only targets travel.
 
-docs/webgpu.md describes the kernels.
+docs/webgpu-host.md describes the kernels.
 """
 
 from __future__ import annotations

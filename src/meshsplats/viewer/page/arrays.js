@@ -62,7 +62,7 @@ export function fitting(mesh, most, runs, groups) {
   return part;
 }
 
-// The buffers `owners` and `harmonics` of docs/webgpu.md, of a mesh with harmonics or of a part of it.
+// The buffers `owners` and `harmonics` of docs/webgpu-host.md, of a mesh with harmonics or of a part of it.
 export function shadingOf(mesh, part) {
   const { terms, step, values } = mesh.harmonics, width = 3 * terms, all = ownersOf(mesh);
   if (!part) return { owners: all, harmonics: Float32Array.from(values, value => value * step) };
@@ -83,7 +83,7 @@ function fresh(faces, used, from, to) {
   return new Set(faces.subarray(3 * from, 3 * to).filter(v => !used[v])).size;
 }
 
-// The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last 3 unused. filter: variance in
+// The uniform `frame` of docs/webgpu-host.md, one sample a pixel: 64 words, the last 3 unused. filter: variance in
 // square samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
 export function frameUniform(
   { width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter, budget,

@@ -1,5 +1,5 @@
 // WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in
-// the page as Python wrote them; docs/webgpu.md says what a host has to do.
+// the page as Python wrote them; docs/webgpu-host.md says what a host has to do.
 
 import { TILE, findFans, findGroups, findRuns, fitting, frameUniform, shadingOf } from "./arrays.js";
 import { counting } from "./scene.js";
