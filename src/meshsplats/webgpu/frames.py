@@ -1,4 +1,7 @@
-"""A mesh on the GPU: its buffers, and the frames that run over them. docs/webgpu-host.md describes the kernels."""
+"""A mesh on the GPU: its buffers, and the frames that run over them.
+
+docs/webgpu-host.md describes the kernels.
+"""
 
 from __future__ import annotations
 
