@@ -84,7 +84,8 @@ function fresh(faces, used, from, to) {
 }
 
 // The uniform `frame` of docs/webgpu-host.md, one sample a pixel: 64 words, the last 3 unused. filter:
-// variance in square samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
+// variance in square samples. Each value of the pinhole is split into the nearest float32 and that of the
+// rest.
 export function frameUniform(
   { width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter, budget,
 ) {
