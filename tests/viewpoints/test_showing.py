@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,6 +145,20 @@ def test_cameras_beside_a_file_come_before_found_ones(kind, tmp_path, scene):
     (tmp_path / "scene.npz.cameras.json").write_text("{}")
     with pytest.warns(DataWarning, match="the cameras beside the file are not used"):
         default_views(known, file, 5)
+
+
+def test_cameras_of_an_older_file_of_the_name_are_not_used(kind, tmp_path):
+    file, record = tmp_path / "scene.npz", tmp_path / "scene.npz.cameras.json"
+    file.write_bytes(b"")
+    save_cameras(views(10), record)
+    for seconds, height in ((9, 1.0), (11, 2.0)):
+        os.utime(record, (1e9, 1e9))
+        os.utime(file, (1e9, 1e9 + seconds))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            cameras, _ = default_views(fans(), file, 5)
+        assert heights(cameras) == {height}
+        assert any("may be of another scene" in str(w.message) for w in said) == (height == 2.0)
 
 
 def test_the_start_camera_is_the_first_view(kind, tmp_path):

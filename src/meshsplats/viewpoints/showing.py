@@ -31,6 +31,8 @@ from meshsplats.viewpoints.walking import keys_of, walk
 
 _ROUND = 4
 """Fewest cameras of a mesh's file that a round leads through."""
+_OLDER = 10.0
+"""Seconds by which a record of cameras may be older than its file: copies are made in any order."""
 
 
 def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
@@ -70,9 +72,17 @@ def opened_with(
 def cameras_given(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
     """The training cameras of ``source``, relative to ``origin``: those of the record ``NAME.cameras.json``
     beside the file NAME, as ``train`` writes it, or of a model folder (``cameras_beside``). None where there
-    are none; a DataWarning says where they cannot be read."""
+    are none; a DataWarning says where they cannot be read, and where the record is of an older file NAME."""
     record = beside(source, CAMERAS)
     if not (source.is_file() and record.is_file()):
+        return cameras_beside(source, origin)
+    if record.stat().st_mtime < source.stat().st_mtime - _OLDER:
+        warnings.warn(
+            f"{record} is older than {source.name} and may be of another scene: it is not used."
+            " Save it again, or delete it",
+            DataWarning,
+            stacklevel=2,
+        )
         return cameras_beside(source, origin)
     try:
         return load_cameras(record, origin=origin)
