@@ -196,21 +196,36 @@ class Sample:
     def panoramas(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """What is seen from each of the ``places`` (k, 3), as ``panorama`` tells it."""
         with ThreadPoolExecutor(min(self.threads or processors(), AT_A_TIME)) as pool:
-            return list(pool.map(self.panorama, places))
+            return [self._in_cones(*pixels) for pixels in pool.map(self._pixels, places)]
 
     def panorama(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What is seen from ``place`` (3,), found by one thread: images as small as its faces gain nothing
-        from more.
+        """What is seen from ``place`` (3,).
 
         Returns:
             (DIRECTIONS, bins) shares of the view that opaque pixels of an angle take, (DIRECTIONS,) mean
             alpha, and (6 * SIDE * SIDE,) the distance of each pixel along ``rays``, inf where it is empty.
         """
+        return self._in_cones(*self._pixels(place))
+
+    def _in_cones(
+        self, shares: np.ndarray, alpha: np.ndarray, depth: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``panorama`` from what ``_pixels`` returns."""
+        scale = self.cone_sum[:, None] * LEVELS
+        seen = (self.cone @ np.round(alpha * LEVELS)) / scale[:, 0]
+        return (self.cone @ shares) / scale, seen, depth
+
+    def _pixels(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(p, bins) shares, (p,) alpha and (p,) distances of the pixels of ``panorama``.
+
+        Found by one thread: images as small as its faces gain nothing from more. Without BLAS: some builds of
+        OpenBLAS for Windows, such as that of NumPy 1.26, crash where two threads call it at once.
+        """
         thin, means, size = self.thin, self.means, self.size
         if self.by_place is not None:
             thin, size = self.by_place.seen_from(place, self.near)
             means = thin.means.astype(np.float64)
-        apart = (means - place) @ self.axes.T
+        apart = np.einsum("ni,ki->nk", means - place, self.axes)
         away = np.linalg.norm(apart, axis=1) + 1e-9 * self.radius
         angle = angle_as_color(size / away)
         shown = coded(np.stack([angle, np.clip(self.near / away, 0, 1), angle], axis=1))
@@ -226,9 +241,7 @@ class Sample:
         depth = np.full(len(alpha), np.inf)
         full = alpha > 0.5
         depth[full] = self.near * alpha[full] / np.maximum(color[full, 1], 1e-9)
-        scale = self.cone_sum[:, None] * LEVELS
-        seen = (self.cone @ np.round(alpha * LEVELS)) / scale[:, 0]
-        return (self.cone @ shares) / scale, seen, depth
+        return shares, alpha, depth
 
     def _drawn(
         self,
