@@ -72,6 +72,11 @@ def test_found_views_where_none_are_given(kind, tmp_path):
     assert len(default_views(splats(), tmp_path, 30, film=True)[0]) == 30
 
 
+def test_a_model_folder_may_be_where_one_is(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(model(tmp_path))
+    assert heights(default_views(splats(), Path("."), 5)[0]) == {1.0}
+
+
 def test_cameras_of_a_model_come_before_found_ones(kind, tmp_path):
     cameras, words = default_views(splats(), model(tmp_path), 5, side=(90, 120))
     assert heights(cameras) == {1.0}

@@ -73,8 +73,7 @@ def cameras_given(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)
     """The training cameras of ``source``, relative to ``origin``: those of the record ``NAME.cameras.json``
     beside the file NAME, as ``train`` writes it, or of a model folder (``cameras_beside``). None where there
     are none; a DataWarning says where they cannot be read, and where the record is of an older file NAME."""
-    record = beside(source, CAMERAS)
-    if not (source.is_file() and record.is_file()):
+    if not (source.is_file() and (record := beside(source, CAMERAS)).is_file()):
         return cameras_beside(source, origin)
     if record.stat().st_mtime < source.stat().st_mtime - _OLDER:
         warnings.warn(
