@@ -30,7 +30,7 @@ START = {"camera": {"position": [1, 2, 3], "target": [0, 0, 0], "fov": 60}}
 
 
 def views(count: int, height: float = 1.0):
-    return [look_at((i, height, 0), (i, height, 1), width=60, height=40, near=0.1) for i in range(count)]
+    return [look_at((i, height, -20), (i, height, 1), width=60, height=40, near=0.1) for i in range(count)]
 
 
 def splats(count: int = 40) -> GaussianCloud:
@@ -156,14 +156,46 @@ def test_cameras_of_an_older_file_of_the_name_are_not_used(kind, tmp_path):
     file, record = tmp_path / "scene.npz", tmp_path / "scene.npz.cameras.json"
     file.write_bytes(b"")
     save_cameras(views(10), record)
-    for seconds, height in ((9, 1.0), (11, 2.0)):
+    for seconds, height in ((59, 1.0), (61, 2.0)):
         os.utime(record, (1e9, 1e9))
         os.utime(file, (1e9, 1e9 + seconds))
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             cameras, _ = default_views(fans(), file, 5)
         assert heights(cameras) == {height}
-        assert any("may be of another scene" in str(w.message) for w in said) == (height == 2.0)
+        assert any("may be of another" in str(w.message) for w in said) == (height == 2.0)
+
+
+@pytest.mark.parametrize("away", [1e4, 1e300])
+def test_cameras_that_see_nothing_of_the_scene_are_not_used(kind, tmp_path, away):
+    file, record = tmp_path / "scene.npz", tmp_path / "scene.npz.cameras.json"
+    file.write_bytes(b"")
+    matrix = np.eye(4)
+    matrix[2, 3] = -away  # behind the camera
+    off = replace(views(1)[0], world_to_camera=matrix)
+    save_cameras([off, off], record)
+    with pytest.warns(DataWarning, match="none of the 2 cameras beside the file sees"):
+        assert heights(default_views(fans(), file, 5)[0]) == {2.0}
+    save_cameras([off, *views(3)], record)
+    assert heights(default_views(fans(), file, 5)[0]) == {1.0}
+
+
+def test_a_record_that_cannot_be_opened_ends_nothing(kind, tmp_path, monkeypatch):
+    def refuse(path, **_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    file = tmp_path / "scene.npz"
+    file.write_bytes(b"")
+    save_cameras(views(3), tmp_path / "scene.npz.cameras.json")
+    monkeypatch.setattr(showing, "load_cameras", refuse)
+    with pytest.warns(DataWarning, match="Permission denied"):
+        assert heights(default_views(fans(), file, 5)[0]) == {2.0}
+
+
+def test_names_may_be_as_long_as_the_system_allows(kind, tmp_path):
+    file = tmp_path / ("n" * 251 + ".ply")
+    file.write_bytes(b"")
+    assert heights(default_views(fans(), file, 5)[0]) == {2.0}
 
 
 def test_the_start_camera_is_the_first_view(kind, tmp_path):

@@ -213,11 +213,12 @@ def _cameras(
     if beside is not None:
         return [*first, *beside]
     # As many as splats are merged for, where views are looked for: once is enough.
-    searched = isinstance(scene, GaussianCloud) and not cameras_given(source, scene.origin)
+    given = cameras_given(source, scene.origin) or ()
+    searched = isinstance(scene, GaussianCloud) and not given
     count, up = max(FOUND_VIEWS, VIEWS) if searched else FOUND_VIEWS, optional_up(options.up)
     if isinstance(scene, GaussianCloud):
         options.reading.tell_of("looking for views of", len(scene))
-    found = default_views(scene, source, count, up=up, threads=threads)
+    found = default_views(scene, source, count, up=up, given=given, threads=threads)
     if found is None:
         return first
     say(found[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.arrays import subsample
 from meshsplats._common.json_files import read_json
 from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up, unit_up
@@ -31,8 +33,10 @@ from meshsplats.viewpoints.walking import keys_of, walk
 
 _ROUND = 4
 """Fewest cameras of a mesh's file that a round leads through."""
-_OLDER = 10.0
+_OLDER = 60.0
 """Seconds by which a record of cameras may be older than its file: copies are made in any order."""
+_POINTS = 10_000
+"""Points of a scene, at most, that cameras are asked for."""
 
 
 def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
@@ -73,21 +77,44 @@ def cameras_given(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)
     """The training cameras of ``source``, relative to ``origin``: those of the record ``NAME.cameras.json``
     beside the file NAME, as ``train`` writes it, or of a model folder (``cameras_beside``). None where there
     are none; a DataWarning says where they cannot be read, and where the record is of an older file NAME."""
-    if not (source.is_file() and (record := beside(source, CAMERAS)).is_file()):
-        return cameras_beside(source, origin)
-    if record.stat().st_mtime < source.stat().st_mtime - _OLDER:
-        warnings.warn(
-            f"{record} is older than {source.name} and may be of another scene: it is not used."
-            " Save it again, or delete it",
-            DataWarning,
-            stacklevel=2,
-        )
+    record = _record_of(source)
+    if record is None:
         return cameras_beside(source, origin)
     try:
-        return load_cameras(record, origin=origin)
-    except FileFormatError as error:
-        warnings.warn(f"{error}; the cameras beside the file are not used", DataWarning, stacklevel=2)
+        if os.stat(record).st_mtime < os.stat(source).st_mtime - _OLDER:
+            said = f"{record} is older than {source.name} and may be of another: save it anew, or delete it"
+        else:
+            return load_cameras(record, origin=origin)
+    except (FileFormatError, OSError) as error:
+        said = str(error)
+    warnings.warn(f"{said}; the cameras beside the file are not used", DataWarning, stacklevel=2)
+    return None
+
+
+def _record_of(source: Path) -> Path | None:
+    """The record of cameras beside the file ``source``; None if there is none."""
+    if not source.is_file():
         return None
+    record = beside(source, CAMERAS)
+    return record if os.path.isfile(record) else None  # which bears names that are too long
+
+
+def _that_see(
+    cameras: Sequence[Camera] | None, scene: GaussianCloud | SplatMesh | BaseMesh
+) -> Sequence[Camera] | None:
+    """Those of the ``cameras`` that see some of ``scene``. A DataWarning says that none does."""
+    if not cameras:
+        return cameras
+    points = subsample(scene.means if isinstance(scene, GaussianCloud) else scene.vertices, _POINTS)
+    with np.errstate(all="ignore"):  # a camera may be anywhere
+        seeing = [camera for camera in cameras if camera.sees(points).any()]
+    if not seeing:
+        warnings.warn(
+            f"none of the {len(cameras)} cameras beside the file sees anything of it: they are not used",
+            DataWarning,
+            stacklevel=3,
+        )
+    return seeing
 
 
 def default_views(
@@ -132,6 +159,7 @@ def default_views(
         source = source if source is not None and source.is_file() else None
     if given is None and source is not None:
         given = cameras_given(source, scene.origin)
+    given = _that_see(given, scene)
     if cloud is None:
         toward = guess_up(None, given) if up is None else unit_up(up)
         return _of_given(scene, given, count, side, toward, film) if given else None
