@@ -110,7 +110,7 @@ def test_what_would_be_lost_is_refused_with_a_remedy(captures, tmp_path):
     edit.to_mesh(one.data)
     edit.free()
     count = len(one.data.polygons)
-    with pytest.raises(RuntimeError, match=r"one was edited.* a part of it is no whole.* Import its"):
+    with pytest.raises(RuntimeError, match=r"one was edited.* a splat in it is incomplete.* Import its"):
         bpy.ops.object.meshsplats_convert_again()
     assert len(one.data.polygons) == count
     corners = np.array([[-1.0, -2, 0], [1, -2, 0], [1, 0, 0], [-1, 0, 0]])

@@ -75,7 +75,9 @@ def test_lit_where_nothing_lights_it(ball, capfd, light):
         tree = scene.world.node_tree
         tree.links.new(tree.nodes.new("ShaderNodeTexEnvironment").outputs[0], background.inputs["Color"])
     bpy.ops.object.meshsplats_shading(shading="lit")
-    assert ("no lamp lights it: choose Sun to Studio" in capfd.readouterr().out) == (light == "none")
+    assert ("nothing lights the splats: click Sun, Noon, Overcast or Studio" in capfd.readouterr().out) == (
+        light == "none"
+    )
 
 
 def test_up_is_that_of_the_scene_after_the_rotation_was_applied(ball):

@@ -399,7 +399,7 @@ def test_a_modifier_that_tears_splats_is_named(ball, extension):
     ball.modifiers.new("Bend", "SIMPLE_DEFORM")
     assert warning(ball) == ""
     ball.modifiers.new("Hole", "BOOLEAN")
-    assert warning(ball) == "Hole tears splats to strips: Cut Splats cuts whole ones"
+    assert warning(ball) == "Hole cuts through splats and leaves strips: use Cut Splats"
 
 
 def recording_layout():

@@ -69,10 +69,10 @@ def test_up_is_said_of_streamed_splats(tmp_path, splats):
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["--scale", "0"], 1, "--scale must be a number above 0"),
-        (["--scale", "nan"], 1, "--scale must be a number above 0"),
+        (["--scale", "0"], 2, "--scale must be a number above 0"),
+        (["--scale", "nan"], 2, "--scale must be a number above 0"),
         (["--scale", "2", "--stream"], 2, "need all in memory: leave out --stream"),
-        (["--as-splats", "--up", "w"], 1, "--up must be an axis"),
+        (["--as-splats", "--up", "w"], 2, "--up must be an axis"),
     ],
 )
 def test_wrong_values_are_refused_first(tmp_path, splats, capsys, words, code, message):

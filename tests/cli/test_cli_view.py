@@ -373,7 +373,10 @@ def test_a_mesh_of_splats_is_no_surface(tmp_path, capsys):
     words = [str(tmp_path / "bright.npz"), "--surface", str(tmp_path / "bright.npz")]
     assert main(["view", *words, "-o", str(tmp_path / "page.html")]) == 2
     error = capsys.readouterr().err
-    assert "bright.npz is a mesh of splats, whose colours depend on the view: give a mesh of" in error
+    assert "--surface: " in error
+    assert (
+        "bright.npz is no surface, as one of 'meshsplats surface' is, but perhaps a mesh of splats" in error
+    )
     assert not (tmp_path / "page.html").exists()
 
 

@@ -514,6 +514,15 @@ def test_cameras_that_are_not_read_are_named_and_not_replaced(tmp_path, name):
         ensure_cameras(folder)
 
 
+@pytest.mark.parametrize(
+    "content", ['{"colors": {"k": 4}}', '{"colors": {"K": 4}}', '{"poses": ["standing"]}']
+)
+def test_metadata_of_any_program_are_no_cameras(tmp_path, content):
+    folder = pictures(tmp_path / "set", [f"im{i}.png" for i in range(3)])
+    (folder / "metadata.json").write_text(content)
+    assert unread_cameras(folder) == ""
+
+
 def test_train_does_not_estimate_cameras_where_some_lie(tmp_path, capsys, monkeypatch):
     calls = []
     monkeypatch.setattr(

@@ -10,7 +10,7 @@ from _photographs import write_photographs
 from meshsplats.cameras.files import save_cameras
 from meshsplats.datasets.views import WHITE
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import OptionsError
+from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.finetuning.targets import Targets
 from meshsplats.scene.mesh import SplatMesh
 
@@ -45,7 +45,7 @@ def test_photographs_that_are_all_held_out_leave_nothing_to_train_on(tmp_path):
     data = Targets(data=folder, test_every=2).make(CLOUD, tmp_path, WHITE, 1)
     assert (len(data.train), len(data.test)) == (2, 2)
     lone = write_photographs(tmp_path / "lone", cameras_around(1), [np.zeros((64, 64, 3))])
-    with pytest.raises(ValueError, match="all its 1 views are held out"):
+    with pytest.raises(FileFormatError, match="all its 1 views are held out"):
         Targets(data=lone).make(CLOUD, tmp_path, WHITE, 1)
 
 

@@ -209,7 +209,7 @@ def test_what_differs_is_named(splats, tmp_path, changes, reading, message):
     out = tmp_path / "tiles"
     end_after("survey", splats, out)
     options = TileOptions(**{"max_triangles": 800, "alpha": "mask"} | changes)
-    with pytest.raises(ValueError, match="was started with other") as caught:
+    with pytest.raises(ms.FileFormatError, match="was started with other") as caught:
         build_tiles(ms.stream_gaussians(splats, **reading), out, options, resume=True)
     assert message in caught.value.spelled("``{}``".format)
 
@@ -377,7 +377,7 @@ def test_coordinates_of_a_map_are_told_of(tmp_path, capsys):
         assert main([*words, *more]) == 0
         out, err = capsys.readouterr()
         assert (text in err) is told
-        assert ("next: docs/tiles.md has a page for CesiumJS" in out) is (name == "map")
+        assert ("next: docs/tiles.md has a page that shows it in CesiumJS" in out) is (name == "map")
 
 
 def test_boxes_lie_in_those_of_their_parents(tmp_path):

@@ -29,7 +29,10 @@ def test_photographs_in_folders_inside_are_named(tmp_path):
     folder = pictures(tmp_path, ["a.jpg", "b.jpg", "c.JPG"])
     pictures(folder / "more", ["d.jpg", "e.JPG"])
     pictures(folder / "trip/day2", ["f.jpg"])
-    with pytest.warns(DataWarning, match=r"more photographs in more/ \(2\), trip/day2/ \(1\), .*: move them"):
+    with pytest.warns(
+        DataWarning,
+        match=r"more photographs in more/ \(2\), trip/day2/ \(1\), .*: if they show the same subject, move",
+    ):
         warn_of_inner_folders(bare_photographs(folder))
 
 
@@ -44,10 +47,25 @@ def test_photographs_in_folders_inside_are_named(tmp_path):
         "images_4/x.jpg",
         "walk-frames/images/0001.jpg",
         "mesh-evaluation/x.jpg",
+        "mesh-compare/x.jpg",
+        "mesh-images/x.jpg",
+        "renders/x.jpg",
+        "alpha/x.jpg",
+        "cam_masks/x.jpg",
+        "deleted/x.jpg",
     ],
 )
 def test_other_images_inside_are_no_photographs(tmp_path, name):
     folder = pictures(tmp_path, ["a.jpg", "b.jpg", "c.jpg", name])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_inner_folders(bare_photographs(folder))
+
+
+def test_results_inside_are_no_photographs(tmp_path):
+    """Of any name, folders in which a command left its configuration."""
+    folder = pictures(tmp_path, ["a.png", "b.png", "c.png", "best/x.png", "best/strips/y.png"])
+    (folder / "best/config.toml").write_text("")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_inner_folders(bare_photographs(folder))

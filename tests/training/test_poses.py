@@ -69,6 +69,15 @@ def test_where_many_are_outvoted_none_is_left_out():
     assert all(image.has_pose for image in poses.model.images.values())
 
 
+def test_of_a_pair_that_contradicts_only_each_other_none_is_left_out():
+    """Either may be right; two pairs against a photograph are a vote."""
+    poses = Poses(placed_in(range(1, 21)), (), ((19, 20),))
+    assert poses.without_outvoted() is poses
+    assert poses.doubtful
+    more = Poses(placed_in(range(1, 21)), (), ((19, 20), (18, 20)))
+    assert more.without_outvoted().outvoted == ("20.jpg",)
+
+
 def placed_in(numbers) -> SimpleNamespace:
     """A model in which the images ``numbers`` have poses, each with a frame of its own."""
     images = {

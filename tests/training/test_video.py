@@ -340,6 +340,14 @@ def test_larger_frames_than_images_may_have_are_refused(tmp_path, monkeypatch):
         photographs_of(clip)
 
 
+def test_frames_that_are_larger_once_stretched_are_refused(tmp_path, monkeypatch):
+    clip = write_video(tmp_path / "wide.mov", passing([0, 5]), ratio=Fraction(2))
+    monkeypatch.setattr(module, "MAX_PIXELS", 2 * 96 * 64 - 1)
+    with pytest.raises(FileFormatError, match="more than 12,287 pixels, as they are shown"):
+        photographs_of(clip)
+    assert not (tmp_path / "wide-frames").exists()
+
+
 def test_the_frames_of_a_video_are_made_once(tmp_path):
     clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(20)]))
     said: list[str] = []
@@ -401,7 +409,7 @@ def test_frames_of_another_video_of_that_name_are_refused(tmp_path):
     other = write_video(tmp_path / "walk.mov", passing([3 * i for i in range(20)]))
     folder = photographs_of(clip, 5)
     with pytest.raises(
-        ValueError, match=r"the frames of another video \(walk\.mp4\): give walk\.mov another"
+        FileFormatError, match=r"the frames of another video \(walk\.mp4\): give walk\.mov another"
     ):
         photographs_of(other)
     assert photographs_of(clip) == folder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -13,7 +13,6 @@ from meshsplats._common.option_values import converted, from_text, short
 from meshsplats._common.options import alternatives, did_you_mean
 
 _MANY = 10**9
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".avif", ".dng")
 
 
 @dataclass(frozen=True)
@@ -25,6 +24,10 @@ class Usage:
     dashes, in their order. bool: a flag without a value; a tuple without end: all words that follow."""
     required: Collection[str]
     """Names of those that cannot be left out."""
+    letters: Mapping[str, str] = field(default_factory=dict)
+    """Flags by their short forms, such as ``-o``."""
+    negatable: bool = False
+    """Whether ``--no-FLAG`` clears a flag without a value."""
 
     @property
     def places(self) -> list[str]:
@@ -34,17 +37,24 @@ class Usage:
 
 def misuse(words: Sequence[str], usage: Usage) -> str:
     """What is wrong with ``words``; empty where nothing is found."""
-    waiting, plain, given = list(words), [], set()
+    waiting, plain, given = [_in_full(word, usage) for word in words], [], set()
+    runs: list[str] = []
+    after_flag = True
     while waiting:
         word = waiting.pop(0)
         if not _is_flag(word):
             plain.append(word)
+            runs += [word] if after_flag else []
+            after_flag = False
             continue
-        name, equals, value = word.partition("=")
-        name = name.replace("_", "-")
+        after_flag = True
+        name, equals, value = _name_of(word), *word.partition("=")[1:]
         if (kind := usage.kinds.get(name)) is None:
-            if usage.kinds.get(name.replace("no-", "", 1)) is bool:
-                continue
+            positive = "--" + name.removeprefix("--no-")
+            if name != positive and usage.kinds.get(positive) is bool:
+                if usage.negatable:
+                    continue
+                return f"there is no option {name}: leave {positive} out"
             hint = did_you_mean(name, usage.kinds)
             return f"there is no option {short(name)[1:-1]}" + (f"; {hint}" if hint else "")
         given.add(name)
@@ -56,15 +66,40 @@ def misuse(words: Sequence[str], usage: Usage) -> str:
         while waiting and len(values) < _most(kind, values) and not _is_flag(waiting[0]):
             values.append(waiting.pop(0))
         if problem := _problem(kind, values):
+            if not values and waiting and _may_begin_with_dash(kind) and not _is_known(waiting[0], usage):
+                problem += f"; one that begins with - is written {name}={waiting[0]}"
             return f"{name} {problem}"
-    return _of_places(plain, given, usage)
+    return _of_places(plain, runs, given, usage)
+
+
+def _in_full(word: str, usage: Usage) -> str:
+    """``word`` with the whole flag in place of a short one: ``-o=x`` and ``-ox`` are ``--output=x``."""
+    letter, rest = word[:2], word[2:]
+    if letter not in usage.letters or "-" + _name_of(word) in usage.kinds:  # -orbit lacks a dash
+        return word
+    return usage.letters[letter] + (f"={rest.removeprefix('=')}" if rest else "")
+
+
+def _name_of(word: str) -> str:
+    """The flag that ``word`` begins with."""
+    return word.partition("=")[0].replace("_", "-")
+
+
+def _is_known(word: str, usage: Usage) -> bool:
+    """Whether ``word`` is an option, or meant as one."""
+    name = _name_of(word)
+    return name in usage.kinds or "--" + name.removeprefix("--no-") in usage.kinds or word[:2] == "--"
+
+
+def _may_begin_with_dash(kind: Any) -> bool:
+    return any(each in (str, Path) for each in alternatives(kind))
 
 
 def _is_flag(word: str) -> bool:
     with suppress(ValueError):
         float(word)
         return False
-    return len(word) > 1 and word[0] == "-"
+    return len(word) > 1 and word[0] == "-" and not re.match(r"-[\d.]", word)  # -1,2,3 is a value
 
 
 def _most(kind: Any, values: Sequence[str]) -> int:
@@ -120,13 +155,18 @@ def _wanted(kind: Any) -> str:
     return " or ".join(wanted)
 
 
-def _of_places(plain: Sequence[str], given: Collection[str], usage: Usage) -> str:
-    """What is wrong with the words without a flag, or missing, where the flags ``given`` are."""
+def _of_places(plain: Sequence[str], runs: Sequence[str], given: Collection[str], usage: Usage) -> str:
+    """What is wrong with the words without a flag, or missing, where the flags ``given`` are. ``runs``: the
+    first word of each sequence of ``plain`` words that flags do not part."""
+    from meshsplats._common.foreign import IMAGE_SUFFIXES  # loads the module of zip archives
+
     endless = any(_most(usage.kinds[name], ()) == _MANY for name in usage.places)
     if len(plain) > len(usage.places) and not endless:
-        if all(word.lower().endswith(_PHOTOGRAPHS) for word in plain):
+        if all(word.lower().endswith(IMAGE_SUFFIXES) for word in plain):
             return "give the folder of the photographs, not the photographs themselves"
         return f"{short(plain[len(usage.places)])} is one word too many"
+    if endless and len(runs) > 1:
+        return f"{short(runs[1])} comes after an option: give all inputs before the options"
     found = {*given, *usage.places[: len(plain)]}
     missing = [name if name[0] == "-" else f"the {name}" for name in usage.required if name not in found]
     if not missing:
@@ -136,6 +176,8 @@ def _of_places(plain: Sequence[str], given: Collection[str], usage: Usage) -> st
 
 def in_one_line(text: str) -> str:
     """A message in a box of lines as one line, without its reference to help."""
-    inner = text.partition("For full helptext")[0].partition("\u256e")[2] or text
-    words = re.sub("[\u2500-\u257f]+", " ", inner)
+    said = re.split("for full helptext", text, maxsplit=1, flags=re.IGNORECASE)[0]
+    # The title of the box is in its first line; where the terminal has no lines, they are of dashes.
+    inner = re.split("\u256e|-{5,}", said, maxsplit=1)[-1]
+    words = re.sub("[\u2500-\u257f]+|-{5,}", " ", inner)
     return " ".join(words.split()) or "the options were not understood"

@@ -172,17 +172,17 @@ def _with_all(command: type[C], prog: str, words: list[str], values: Mapping[str
     except SystemExit as stop:
         if not stop.code:
             raise  # it has printed what was asked for
-        full = ["--output" if word == "-o" else word for word in words]
-        problem = misuse(full, _usage(command, values or ()))
-        raise UsageError(problem or in_one_line(printed.getvalue())) from None
+        raise UsageError(misuse(words, _usage(command, values)) or in_one_line(printed.getvalue())) from None
 
 
-def _usage(command: type, filled: Collection[str]) -> Usage:
-    """What ``command`` takes; ``filled``: names of options that a configuration has."""
+def _usage(command: type, filled: Collection[str] | None) -> Usage:
+    """What ``command`` takes; ``filled``: names of options that a configuration has, None without one."""
     parts = {name: option for name, option in options_of(command).items() if option.has_flag}
     shown = {name: name if option.positional else flag(name) for name, option in parts.items()}
-    needed = [name for name in parts if isinstance(parts[name].part[2], Field) and name not in filled]
-    return Usage({shown[name]: parts[name].hint for name in parts}, [shown[name] for name in needed])
+    start = {name: option.part[2] for name, option in parts.items() if name not in (filled or ())}
+    needed = [shown[name] for name in start if start[name] is tyro.MISSING or isinstance(start[name], Field)]
+    kinds = {shown[name]: parts[name].hint for name in parts}
+    return Usage(kinds, needed, {"-o": "--output"}, negatable=filled is not None)
 
 
 def _default(part: Field[Any]) -> Any:

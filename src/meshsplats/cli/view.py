@@ -62,13 +62,7 @@ class View(Command):
         if self.output is not None:
             inputs = filter(None, [self.input, viewing.splats, viewing.surface, viewing.cameras])
             check_outputs([self.output, beside(self.output, CONFIGURATION)], self.force, inputs=[*inputs])
-        try:
-            shown = shown_file(self.input, viewing, say=say, threads=self.threads)
-        except ValueError as error:
-            if viewing.surface is None or "colors must lie in [0, 1]" not in str(error):
-                raise
-            what = f"{viewing.surface} is a mesh of splats, whose colours depend on the view"
-            raise UsageError(f"--surface: {what}: give a mesh of 'meshsplats surface'") from None
+        shown = shown_file(self.input, viewing, say=say, threads=self.threads)
         self._announce(shown.content)
         name = shown_path(self.input)
         page, result = shown.page("scene" if name == "-" else subject_name(Path(name).resolve()))

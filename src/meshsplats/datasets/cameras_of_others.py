@@ -48,7 +48,7 @@ _KINDS: Sequence[_Kind] = (
     _Kind(r"groundtruth\.txt", rb"#.*\btx\s+ty\s+tz\b", "cameras of a TUM RGB-D sequence", _WRITE_OR_ANEW),
     _Kind(
         r"metadata\.json",
-        rb'"(K|poses|initPose|perFrameIntrinsicCoeffs)"\s*:',
+        rb'(?-i:"(initPose|perFrameIntrinsicCoeffs|K)"\s*:\s*\[|"poses"\s*:\s*\[\s*\[)',
         "a capture of Record3D",
         "convert it: ns-process-data record3d",
     ),

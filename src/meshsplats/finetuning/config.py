@@ -17,6 +17,7 @@ Unit = Literal["splat", "scene"]
 BackgroundMode = Literal["mixed", "random", "white", "black"]
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
+LEAST_MINUTES = 1e-4
 CUTTING = (
     *("opacity", "cutoff", "anneal_share", "expected_share", "settle_share"),
     *("hidden_hits", "opaque_share", "soft_share", "soft_phase"),
@@ -56,7 +57,7 @@ class FinetuneConfig:
     """Length in epochs: passes over all training views. Exactly one of epochs, steps and minutes is given."""
     steps: Annotated[int | None, Range(0, 10**9)] = 1000
     """Length in steps, of one view each."""
-    minutes: Annotated[float | None, Range(1e-4, 1e5)] = None
+    minutes: Annotated[float | None, Range(LEAST_MINUTES, 1e5)] = None
     """Length in minutes, including what came before (reading, finding cameras, converting, rendering the
     targets). The only length whose result depends on the machine's speed."""
     color_rate: Annotated[float, Range(1e-9, 1), Advanced] = 0.02

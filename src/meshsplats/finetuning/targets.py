@@ -11,7 +11,7 @@ from meshsplats._common.choices import Look, Masks
 from meshsplats._common.options import Advanced, changed
 from meshsplats._common.words import parse_up
 from meshsplats.datasets.scene_views import MissingOfData
-from meshsplats.errors import OptionsError, OptionValueError
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
 from meshsplats.finetuning.config import FEWEST_VIEWS
 
 if TYPE_CHECKING:
@@ -118,7 +118,8 @@ class Targets:
             preset: of the fine-tuning, for the look of images of splats.
             zooms: of these images, as for ``splat_dataset``.
 
-        Raises ValueError if no view is left to train on, and what ``load_dataset`` or ``splat_dataset`` do.
+        Raises FileFormatError if no view is left to train on, and what ``load_dataset`` or ``splat_dataset``
+        do.
         """
         from meshsplats._common.kinds import need
         from meshsplats.cameras.files import cameras_beside, load_cameras
@@ -139,7 +140,7 @@ class Targets:
                 origin=scene.origin,
             )
             if not dataset.train:
-                raise OptionValueError(
+                raise FileFormatError(
                     f"{self.data}: all its {len(dataset.test)} views are held out, so there is nothing to"
                     " train on; ``test_every`` 0 holds none out"
                 )

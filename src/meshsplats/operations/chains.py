@@ -15,7 +15,7 @@ from typing import Any
 from meshsplats._common.kinds import as_path
 from meshsplats._files.atomic import replace_folder, write_json
 from meshsplats.conversion.gaps import without_gaps
-from meshsplats.errors import FileFormatError, OptionValueError
+from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.level_tables import TABLE, load_table
 from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
 from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
@@ -118,7 +118,7 @@ def make_chain(
         on_level: entered for each level that is made; what it gives is shown the progress.
 
     Raises Interrupted after Ctrl-C in a level, whose predecessors stay, FileExistsError for a ``folder`` that
-    is no chain, ValueError where levels of other splats are finished, and what ``plan_levels`` raises.
+    is no chain, FileFormatError where levels of other splats are finished, and what ``plan_levels`` raises.
     """
     folder = as_path("folder", folder)
     _older_levels(folder)  # an error before the work
@@ -140,7 +140,7 @@ def make_chain(
             write_json(records[-1], row | {"scene": digest})
         rows.append(json.loads(records[-1].read_text(encoding="utf-8")))
         if rows[-1].pop("scene", digest) != digest:
-            raise OptionValueError(
+            raise FileFormatError(
                 f"{unfinished}: level {number} was made of other splats: ``resume`` with the same, or begin"
                 " again with ``replace_old``"
             )

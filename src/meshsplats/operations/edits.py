@@ -22,7 +22,7 @@ from meshsplats.conversion.merging_views import simplify_for_views
 from meshsplats.conversion.surroundings import floaters
 from meshsplats.datasets.scene_files import SceneReading
 from meshsplats.datasets.scene_views import cameras_named
-from meshsplats.errors import FileFormatError, OptionValueError, StraysWarning
+from meshsplats.errors import FileFormatError, StraysWarning
 from meshsplats.evaluation.viewers import alpha_for_viewers
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
@@ -221,8 +221,8 @@ def bake_file(
 ) -> Baked:
     """Writes the mesh ``source`` with its filter, and where asked for its colours, as part of it.
 
-    ``place`` makes of it the mesh that is written; ``say`` gets a line about the views. ValueError where
-    there is nothing to bake.
+    ``place`` makes of it the mesh that is written; ``say`` gets a line about the views. FileFormatError
+    where there is nothing to bake.
     """
     source, output = as_path("source", source), as_path("output", output)
     check_mesh_suffix(output)
@@ -232,10 +232,10 @@ def bake_file(
     px2 = mesh.filter_px2 if options.filter_px2 is None else options.filter_px2
     degree = mesh.sh_degree if options.colors else 0
     if options.colors and not degree:
-        raise OptionValueError(f"{source}: its colours are the same from everywhere: leave out ``colors``")
+        raise FileFormatError(f"{source}: its colours are the same from everywhere: leave out ``colors``")
     if not (px2 or degree):
         more = "; ``colors`` bakes its colours" if mesh.sh_degree else ""
-        raise OptionValueError(
+        raise FileFormatError(
             f"{source}: the mesh has no filter, there is nothing to bake; ``filter_px2`` gives it one{more}"
         )
     cameras = options.views.make(mesh, source, count=FRAMING_VIEWS, side=FRAMING_PIXELS, say=say)

@@ -17,7 +17,7 @@ import numpy as np
 from meshsplats import __version__
 from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
-from meshsplats.errors import DataWarning, FileFormatError, OptionValueError, OverwritingError
+from meshsplats.errors import DataWarning, FileFormatError, OverwritingError
 from meshsplats.formats.splat_paths import subject_name
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.scene.origin import in_words
@@ -92,17 +92,17 @@ def start_facts(source: SplatStream, options: TileOptions) -> dict[str, Any]:
 
 
 def need_same_start(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
-    """OptionValueError, which says what differs, unless the unfinished run in ``folder`` with the facts
+    """FileFormatError, which says what differs, unless the unfinished run in ``folder`` with the facts
     ``before`` is the one of ``now``."""
     if before.get("version") != now["version"]:
-        raise OptionValueError(
+        raise FileFormatError(
             f"{folder} was begun by MeshSplats {before.get('version', 'of an earlier version')}, this is"
             f" {now['version']}: tiles of both would be mixed; ``resume`` with the version that began, or"
             " begin again with ``replace_old``"
         )
     for name, value in now.items():
         if before.get(name) != value:
-            raise OptionValueError(
+            raise FileFormatError(
                 f"{folder} was started with other {name}: {_difference(name, before.get(name), value)};"
                 " ``resume`` with the same, or begin again with ``replace_old``"
             )

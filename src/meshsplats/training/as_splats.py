@@ -16,6 +16,7 @@ from meshsplats.conversion.profiles import fit_profile
 from meshsplats.conversion.recovery import THICKNESS
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.finetuning.checkpoint import load_checkpoint
+from meshsplats.finetuning.config import LEAST_MINUTES
 from meshsplats.finetuning.gradients import Gradients
 from meshsplats.finetuning.journal import CHECKPOINT
 from meshsplats.finetuning.phases.blended import Blended
@@ -180,7 +181,7 @@ def _fitting(config: TrainConfig, mesh: SplatMesh, dataset: Dataset, threads: in
         config = replace(config, exposure=exposures_differ(mesh, views, threads))
     length: dict[str, float]
     if config.minutes is not None:
-        length = {"minutes": FITTED_SHARE * config.minutes}
+        length = {"minutes": max(LEAST_MINUTES, FITTED_SHARE * config.minutes)}
     else:
         length = {"steps": max(1, round(FITTED_SHARE * (config.total_steps(len(views)) or 0)))}
     return with_train_changes(

@@ -14,15 +14,20 @@ from meshsplats.datasets.colmap import image_names
 from meshsplats.datasets.image_files import Shelf
 from meshsplats.datasets.layouts import Layout, photographs_beneath
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.outputs import CONFIGURATION
 from meshsplats.training.poses import pair_of
 from meshsplats.training.suspects import shortened
 
 MATCHING = 15
 """Matches from which on two photographs show the same: COLMAP's own least."""
 _OTHERS = re.compile(
-    r"mask|depth|preview|thumb|confidence|normals?$|images_\d+$|.*-(frames|evaluation)$", re.IGNORECASE
+    r"mask|depth|preview|thumb|confidence|images_\d+$|.*-(frames|evaluation|compare|images|views)$"
+    r"|(.*[-_ ])?(masks?|depths?|previews?|thumb\w*|confidence|normals?|alphas?|renders?|renderings?"
+    r"|segmentations?|deleted|rejected)$",
+    re.IGNORECASE,
 )
-"""How names of folders begin whose images are no photographs, are copies, or were made here."""
+"""Names of folders whose images are no photographs, are copies, were sorted out, or were made here, for the
+most part under names that commands propose."""
 _NO_MATCH = (
     "Photographs must overlap by two thirds, be sharp and flat, not panoramas, and show a subject with"
     " texture that does not move"
@@ -41,15 +46,22 @@ def warn_of_inner_folders(photographs: Sequence[Path]) -> None:
     passed = []
     for inner, found in photographs_beneath(place).items():
         more = [name for name in found if name not in names and Path(name).suffix.lower() in kinds]
-        if more and not any(map(_OTHERS.match, PurePosixPath(inner).parts)):
+        if more and not _of_results(place, PurePosixPath(inner)):
             passed.append(f"{inner}/ ({len(more):,})")
     if passed:
         warnings.warn(
             f"{place}: there are more photographs in {shortened(passed)}, which are left out, as folders"
-            " inside are not searched: move them beside the others",
+            " inside are not searched: if they show the same subject, move them beside the others",
             DataWarning,
             stacklevel=3,
         )
+
+
+def _of_results(place: Path, inner: PurePosixPath) -> bool:
+    """Whether the folder ``inner`` of ``place`` has a name of other images than photographs, or is in the
+    result of a command, which has its configuration there."""
+    folders = [folder for folder in (inner, *inner.parents) if folder.name]
+    return any(_OTHERS.match(folder.name) or (place / folder / CONFIGURATION).is_file() for folder in folders)
 
 
 def say_what_has_no_camera(layout: Layout, say: Callable[[str], None]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshsplats._common.choices import Masks, Missing
-from meshsplats.errors import OptionsError, OptionValueError
+from meshsplats.errors import FileFormatError, OptionsError, OptionValueError
 from meshsplats.finetuning.config import BACKGROUNDS
 from meshsplats.finetuning.targets import check_cache
 from meshsplats.training.config import TrainConfig
@@ -83,8 +83,8 @@ class PhotographOptions:
         return folder
 
     def load(self, folder: Path, config: TrainConfig) -> tuple[Dataset, Background]:
-        """The photographs in ``folder``, over the background of the training, and that background. ValueError
-        if there are fewer than two to train on."""
+        """The photographs in ``folder``, over the background of the training, and that background.
+        FileFormatError if there are fewer than two to train on."""
         from meshsplats.datasets.folder import load_dataset
         from meshsplats.datasets.silhouettes import (
             has_silhouettes,
@@ -103,7 +103,7 @@ class PhotographOptions:
             masks=self.masks,
         )
         if len(dataset.train) < 2:
-            raise OptionValueError(
+            raise FileFormatError(
                 f"{folder}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
                 " are needed to train on (``test_every`` 0 holds none out)"
             )

@@ -29,6 +29,8 @@ TOLERATED = 0.08
 """Share of the verified pairs that may contradict the poses. Of 30 and more photographs in right places, 0 to
 0.076 do, most where a room is seen in wide steps; with 2 to 17 in wrong ones, 0.11 to 0.31. Of fewer, it
 tells less: 0.083 both of 7 right ones and of 8 with 5 wrong."""
+FEWEST_AGAINST = 2
+"""Pairs that must contradict a photograph for it to be left out: of a single one, either may be wrong."""
 OUTVOTED = 0.2
 """Share of the photographs, at most, that are left out because more pairs contradict than agree with them.
 Where they are more, it is not told which part of the photographs is wrong."""
@@ -78,7 +80,8 @@ class Poses:
     def without_outvoted(self) -> Poses:
         """These poses without those that more pairs contradict than agree with, unless they are too many;
         ``model`` is changed."""
-        images = [image for image, share in self._shares().items() if share > 0.5]
+        against = Counter(image for pair in self.contradicting for image in pair)
+        images = [i for i, share in self._shares().items() if share > 0.5 and against[i] >= FEWEST_AGAINST]
         if not 0 < len(images) <= OUTVOTED * self.model.num_reg_images():
             return self
         names = tuple(sorted(self.model.images[image].name for image in images))

@@ -18,7 +18,7 @@ from meshsplats._common.foreign import VIDEO_SUFFIXES, frames_of, is_a_video
 from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
 from meshsplats._files.atomic import write_json
-from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError, OptionValueError
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image
 from meshsplats.training.hdr import as_srgb, is_hdr
@@ -76,8 +76,8 @@ def photographs_of(
     """The folder of photographs at ``path``: of a video, one beside it, NAME-frames, which is made by
     ``save_frames`` with so many ``frames`` unless it is there; else ``path`` itself.
 
-    Raises ValueError for ``frames`` without a video, and for another number of them than are there, or those
-    of another video; otherwise errors are those of ``save_frames``.
+    Raises ValueError for ``frames`` without a video, FileFormatError for another number of them than are
+    there, and for those of another video; otherwise errors are those of ``save_frames``.
     """
     if not is_video(path):
         if frames is not None:
@@ -93,13 +93,13 @@ def photographs_of(
         wanted = made_of.get("wanted") if isinstance(made_of, dict) else None
         if not isinstance(made_of, dict) or made_of.get("sha256") != _digest(path):
             name = made_of.get("name") if isinstance(made_of, dict) else None
-            raise OptionValueError(
+            raise FileFormatError(
                 f"{folder} has the frames of another video ({name}): give {path.name} another name, or remove"
                 " the folder"
             )
     there = len(list((folder / IMAGES).glob("*.jpg")))
     if frames not in (None, there, wanted):
-        raise OptionValueError(
+        raise FileFormatError(
             f"{folder} has {there} frames, not {frames}: remove it, or keep them: leave out ``frames``"
         )
     say(f"the {there} frames of {path.name} that are in {folder}")
@@ -158,7 +158,7 @@ def save_frames(
                 if frame.interlaced_frame and can_mend and not interlaced:
                     say("the video is interlaced: frames are made of one of their two fields")
                 interlaced |= frame.interlaced_frame
-                field = _one_field(frame) if frame.interlaced_frame and can_mend else frame
+                field = _one_field(frame, video) if frame.interlaced_frame and can_mend else frame
                 pixels = _turned(_pixels(field, stored), frame.rotation)
                 save_image(made / IMAGES / f"{wanted[index] + 1:04d}.jpg", pixels)
             if index == chosen[-1]:
@@ -254,8 +254,11 @@ def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
                 raise FileFormatError(f"{video}: has no pictures, only sound")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            if stream.codec_context.width * stream.codec_context.height > MAX_PIXELS:
-                raise FileFormatError(f"{video}: frames have more than {MAX_PIXELS:,} pixels")
+            width, height = _shown_size(stream.codec_context, _ratio(stream))
+            if width * height > MAX_PIXELS:
+                raise FileFormatError(
+                    f"{video}: frames have more than {MAX_PIXELS:,} pixels, as they are shown"
+                )
             if (container.duration or 0) > LONG * av.time_base:
                 stream.codec_context.skip_frame = "NONKEY"
             for frame in container.decode(stream):
@@ -287,21 +290,27 @@ def _stored(video: Path) -> _Stored:
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
-        ratio = Fraction(stream.sample_aspect_ratio or 1)  # the file's own counts more than the codec's
-        if not Fraction(1, WIDEST) <= ratio <= WIDEST:
-            ratio = Fraction(1)
-        return _Stored(int(context.color_trc), int(context.color_primaries), ratio)
+        return _Stored(int(context.color_trc), int(context.color_primaries), _ratio(stream))
+
+
+def _ratio(stream: Any) -> Fraction:
+    """Width of a pixel of ``stream`` by its height; 1 where that cannot be."""
+    ratio = Fraction(stream.sample_aspect_ratio or 1)  # the file's own counts more than the codec's
+    return ratio if Fraction(1, WIDEST) <= ratio <= WIDEST else Fraction(1)
+
+
+def _shown_size(stored: Any, ratio: Fraction) -> tuple[int, int]:
+    """Width and height of frames of ``stored``'s with square pixels: the side is stretched that is too
+    short."""
+    if ratio > 1:
+        return round(stored.width * ratio), stored.height
+    return stored.width, round(stored.height / ratio)
 
 
 def _pixels(frame: Any, stored: _Stored) -> np.ndarray:
-    """(h, w, 3) float32 sRGB in [0, 1] of a frame, with square pixels: the side is stretched that is too
-    short."""
-    width, height = frame.width, frame.height
-    if stored.ratio > 1:
-        width = round(width * stored.ratio)
-    else:
-        height = round(height / stored.ratio)
-    given = {"dst_colorspace": RGB_MATRIX}
+    """(h, w, 3) float32 sRGB in [0, 1] of a frame, with square pixels."""
+    width, height = _shown_size(frame, stored.ratio)
+    given: dict[str, Any] = {"dst_colorspace": RGB_MATRIX}
     if (width, height) != (frame.width, frame.height):
         given |= {"width": width, "height": height, "interpolation": "BICUBIC"}
     if is_hdr(stored.transfer, stored.primaries):
@@ -316,8 +325,10 @@ def _can_deinterlace() -> bool:
     return DEINTERLACER in filters_available
 
 
-def _one_field(frame: Any) -> Any:
-    """An interlaced ``frame`` whose second field is made of the first, which was taken at another time."""
+def _one_field(frame: Any, video: Path) -> Any:
+    """An interlaced ``frame`` of ``video`` whose second field is made of the first, as both were taken at
+    different times. FileFormatError where the filter does not take its pixels."""
+    from av import FFmpegError
     from av.filter import Graph
 
     graph = Graph()
@@ -326,10 +337,16 @@ def _one_field(frame: Any) -> Any:
     middle, end = graph.add(DEINTERLACER, "mode=frame:deint=all"), graph.add("buffersink")
     begin.link_to(middle)
     middle.link_to(end)
-    graph.configure()
-    graph.push(frame)
-    graph.push(None)
-    return graph.pull()
+    try:
+        graph.configure()
+        graph.push(frame)
+        graph.push(None)
+        return graph.pull()
+    except FFmpegError as error:
+        raise FileFormatError(
+            f"{video}: is interlaced, and its frames of {frame.format.name} cannot be mended"
+            f" ({error.strerror}): deinterlace it first, with ffmpeg -vf bwdif, for one"
+        ) from None
 
 
 def _turned(pixels: np.ndarray, degrees: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.scene_files import PartOfScene, SceneReading
 from meshsplats.datasets.scene_views import MissingOfData, check_photographs
 from meshsplats.datasets.views import Dataset
-from meshsplats.errors import OptionsError
+from meshsplats.errors import FileFormatError, OptionsError
 from meshsplats.evaluation.backgrounds import choose_background
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.scene.base_mesh import BaseMesh
@@ -172,7 +172,7 @@ def _content(
     say: Callable[[str], object],
     threads: int | None,
 ) -> Content:
-    beside = None if options.surface is None else load_base(options.surface, origin=scene.origin)
+    beside = None if options.surface is None else _surface(options.surface, scene)
     try:
         if isinstance(scene, GaussianCloud):
             advice = "leave ``whole`` out, or make 'meshsplats tiles'"
@@ -193,6 +193,20 @@ def _content(
         return replace(content_of_mesh(scene, splats, threads, say), surface=beside)
     except TooManyTrianglesError as error:
         raise OptionsError(f"{error}: {advice}") from None
+
+
+def _surface(file: Path, scene: Shown) -> BaseMesh:
+    """The surface in ``file``, where ``scene`` stands; OptionsError for a mesh whose colours are none of a
+    surface."""
+    try:
+        return load_base(file, origin=scene.origin)
+    except FileFormatError:
+        raise
+    except ValueError as error:
+        raise OptionsError(
+            f"``surface``: {file} is no surface, as one of 'meshsplats surface' is, but perhaps a mesh of"
+            f" splats, whose colours depend on the view: {error}"
+        ) from None
 
 
 def _cameras(
