@@ -348,6 +348,14 @@ def test_frames_that_are_larger_once_stretched_are_refused(tmp_path, monkeypatch
     assert not (tmp_path / "wide-frames").exists()
 
 
+def test_interlaced_frames_that_the_filter_does_not_take_are_named(tmp_path):
+    """Those that lie on a GPU, for one."""
+    kind = av.VideoFormat("vaapi", 96, 64)
+    frame = SimpleNamespace(width=96, height=64, format=kind, time_base=None)
+    with pytest.raises(FileFormatError, match=r"tape\.mpg: is interlaced, .* of vaapi .* deinterlace it"):
+        module._one_field(frame, tmp_path / "tape.mpg")
+
+
 def test_the_frames_of_a_video_are_made_once(tmp_path):
     clip = write_video(tmp_path / "walk.mp4", passing([5 * i for i in range(20)]))
     said: list[str] = []

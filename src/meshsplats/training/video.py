@@ -326,18 +326,18 @@ def _can_deinterlace() -> bool:
 
 
 def _one_field(frame: Any, video: Path) -> Any:
-    """An interlaced ``frame`` of ``video`` whose second field is made of the first, as both were taken at
-    different times. FileFormatError where the filter does not take its pixels."""
+    """An interlaced ``frame`` of ``video`` whose second field is made of the first, which was taken at
+    another time. FileFormatError where the filter does not take its pixels."""
     from av import FFmpegError
     from av.filter import Graph
 
     graph = Graph()
     base = frame.time_base or Fraction(1, 25)
-    begin = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=base)
-    middle, end = graph.add(DEINTERLACER, "mode=frame:deint=all"), graph.add("buffersink")
-    begin.link_to(middle)
-    middle.link_to(end)
     try:
+        begin = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=base)
+        middle, end = graph.add(DEINTERLACER, "mode=frame:deint=all"), graph.add("buffersink")
+        begin.link_to(middle)
+        middle.link_to(end)
         graph.configure()
         graph.push(frame)
         graph.push(None)
