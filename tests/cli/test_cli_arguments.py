@@ -200,6 +200,7 @@ def test_the_stand_in_has_the_encoding_of_its_stream(name, monkeypatch):
     assert Captured().isatty() is True
 
 
+@pytest.mark.skipif(tyro.__version__.startswith("0."), reason="this tyro draws lines on every stream")
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 def test_help_is_legible_on_streams_without_lines(encoding):
     call = [sys.executable, "-m", "meshsplats", "convert", "--help"]
