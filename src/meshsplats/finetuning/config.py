@@ -18,6 +18,7 @@ BackgroundMode = Literal["mixed", "random", "white", "black"]
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 LEAST_MINUTES = 1e-4
+"""Shortest length of a run in minutes."""
 CUTTING = (
     *("opacity", "cutoff", "anneal_share", "expected_share", "settle_share"),
     *("hidden_hits", "opaque_share", "soft_share", "soft_phase"),

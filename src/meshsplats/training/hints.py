@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import sqlite3
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from pathlib import Path, PurePosixPath
 
 from meshsplats._common.words import plural
@@ -15,11 +13,9 @@ from meshsplats.datasets.image_files import Shelf
 from meshsplats.datasets.layouts import Layout, photographs_beneath
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.outputs import CONFIGURATION
-from meshsplats.training.poses import pair_of
+from meshsplats.training.poses import verified_pairs
 from meshsplats.training.suspects import shortened
 
-MATCHING = 15
-"""Matches from which on two photographs show the same: COLMAP's own least."""
 _OTHERS = re.compile(
     r"mask|depth|preview|thumb|confidence|images_\d+$|.*-(frames|evaluation|compare|images|views)$"
     r"|(.*[-_ ])?(masks?|depths?|previews?|thumb\w*|confidence|normals?|alphas?|renders?|renderings?"
@@ -85,10 +81,7 @@ def say_what_has_no_camera(layout: Layout, say: Callable[[str], None]) -> None:
 
 def matching_images(database: Path) -> int:
     """Number of images in COLMAP's ``database`` that match another one."""
-    query = "select pair_id from two_view_geometries where rows >= ?"
-    with closing(sqlite3.connect(database)) as connection:
-        rows = connection.execute(query, (MATCHING,)).fetchall()
-    return len({image for (number,) in rows for image in pair_of(number)})
+    return len({image for pair in verified_pairs(database) for image in pair})
 
 
 def why_none(placed: int, matching: int, count: int, fewest: int) -> str:

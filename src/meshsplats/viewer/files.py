@@ -32,7 +32,7 @@ from meshsplats.viewer.content import (
     measured,
 )
 from meshsplats.viewer.page import Page, PageOptions
-from meshsplats.viewpoints.showing import cameras_given, default_views, opening_beside
+from meshsplats.viewpoints.showing import cameras_recorded, default_views, opening_beside
 
 FOUND_VIEWS = 12
 """Viewpoints of a place, where the input has none."""
@@ -227,7 +227,7 @@ def _cameras(
     if beside is not None:
         return [*first, *beside]
     # As many as splats are merged for, where views are looked for: once is enough.
-    given = cameras_given(source, scene.origin) or ()
+    given = cameras_recorded(source, scene.origin) or ()
     searched = isinstance(scene, GaussianCloud) and not given
     count, up = max(FOUND_VIEWS, VIEWS) if searched else FOUND_VIEWS, optional_up(options.up)
     if isinstance(scene, GaussianCloud):

@@ -74,12 +74,18 @@ def opened_with(
 
 
 def cameras_given(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
-    """The training cameras of ``source``, relative to ``origin``: those of the record ``NAME.cameras.json``
-    beside the file NAME, as ``train`` writes it, or of a model folder (``cameras_beside``). None where there
-    are none; a DataWarning says where they cannot be read, and where the record is of an older file NAME."""
+    """The training cameras of ``source``, relative to ``origin``: ``cameras_recorded`` where there is a
+    record, else those of a model folder (``cameras_beside``). None where there are none."""
+    return cameras_beside(source, origin) if _record_of(source) is None else cameras_recorded(source, origin)
+
+
+def cameras_recorded(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
+    """The cameras in the record ``NAME.cameras.json`` beside the file ``source``, NAME, as ``train`` writes
+    it, relative to ``origin``. None where there is none; a DataWarning says where it cannot be read, and
+    where it is older than the file."""
     record = _record_of(source)
     if record is None:
-        return cameras_beside(source, origin)
+        return None
     try:
         if os.stat(record).st_mtime < os.stat(source).st_mtime - _OLDER:
             said = f"{record} is older than {source.name} and may be of another: save it anew, or delete it"
