@@ -50,7 +50,7 @@ def misuse(words: Sequence[str], usage: Usage) -> str:
         after_flag = True
         name, equals, value = _name_of(word), *word.partition("=")[1:]
         if (kind := usage.kinds.get(name)) is None:
-            positive = "--" + name.removeprefix("--no-")
+            positive = _positive(name)
             if name != positive and usage.kinds.get(positive) is bool:
                 if usage.negatable:
                     continue
@@ -85,10 +85,15 @@ def _name_of(word: str) -> str:
     return word.partition("=")[0].replace("_", "-")
 
 
+def _positive(name: str) -> str:
+    """The flag that ``name`` clears, where it begins with no-; else the flag itself, with two dashes."""
+    return "--" + name.removeprefix("--").removeprefix("no-")
+
+
 def _is_known(word: str, usage: Usage) -> bool:
     """Whether ``word`` is an option, or meant as one."""
     name = _name_of(word)
-    return name in usage.kinds or "--" + name.removeprefix("--no-") in usage.kinds or word[:2] == "--"
+    return name in usage.kinds or _positive(name) in usage.kinds or word[:2] == "--"
 
 
 def _may_begin_with_dash(kind: Any) -> bool:
