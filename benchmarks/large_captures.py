@@ -5,9 +5,9 @@
 Each command runs in a process of its own. Columns: processor seconds, seconds by the clock and the share of
 the processors that other programs took meanwhile, peak memory, triangles, size. dB: four views, of a place
 those that are found in it first, of an object from around it, 800 x 800 pixels, on white, against the splats
-with all degrees, look 'area'. *sorted*: triangles sorted at every sample; *viewer*: a blended or masked .glb
-as three.js draws it with MSAA (`viewer_images`). Of a page, its fine mesh as the page has it; of tiles, those
-with an error of a pixel at most; of splats, those left.
+with all degrees, look 'area'. *sorted*: triangles sorted at every sample; *viewer*: a .glb that is blended,
+masked or in an order as three.js draws it with MSAA (`viewer_images`, `ordered_image`). Of a page, its fine
+mesh as the page has it; of tiles, those with an error of a pixel at most; of splats, those left.
 
 --copies N: first makes a cloud of N copies of each file, side by side, turned and in other shades. --blender:
 a Python with bpy and meshsplats, for the purpose 'blender'.
@@ -32,7 +32,8 @@ import numpy as np
 from _common import Report, areas, arguments, images, mean_psnr, run
 
 import meshsplats as ms
-from meshsplats.rendering.viewers import viewer_images
+from meshsplats.formats.gltf.reader import listed_order
+from meshsplats.rendering.viewers import ordered_image, viewer_images
 from meshsplats.viewer.unpacking import unpack_mesh
 from meshsplats.viewpoints.showing import default_views
 
@@ -42,6 +43,8 @@ PURPOSES = {
     "page": ["view {input} -o page.html"],
     "phone page": ["view {input} -o phone.html --max-triangles 300000"],
     "web": ["convert {input} -o web.glb --max-triangles 1000000"],
+    "web in order": ["convert {input} -o ordered.glb --max-triangles 1000000 --alpha ordered"],
+    "web tuned": ["finetune {input} -o web_tuned.glb --order file --minutes {minutes:g}"],
     "phone": ["convert {input} -o phone.glb --max-triangles 300000"],
     "engine": ["finetune {input} -o engine.glb --opacity cutoff --soft-share 0.05 --minutes {minutes:g}"],
     "engine of fewer": [
@@ -170,7 +173,7 @@ def truth(path: Path) -> tuple[list[ms.Camera], list[np.ndarray]]:
 
 
 def scored(path: Path, result: Path) -> tuple[int, list[float]]:
-    """Number of triangles, and dB: sorted, and of a .glb that is blended or masked also in a web viewer."""
+    """Number of triangles, and dB: sorted, and of a .glb that is not opaque also in a web viewer."""
     if result.suffix == ".png":
         return 0, []
     cameras, truths = truth(path)
@@ -184,7 +187,9 @@ def scored(path: Path, result: Path) -> tuple[int, list[float]]:
     mesh = page_mesh(result) if result.suffix == ".html" else ms.load_mesh(result)
     samples = ms.needed_samples(mesh, cameras)
     scores = [mean_psnr(images(mesh, cameras, samples=samples), truths)]
-    if result.suffix == ".glb" and (cutoffs := drawn_cutoffs(result)):
+    if result.suffix == ".glb" and (order := listed_order(result, mesh)) is not None:
+        scores.append(mean_psnr((ordered_image(mesh, order, camera) for camera in cameras), truths))
+    elif result.suffix == ".glb" and (cutoffs := drawn_cutoffs(result)):
         shown = [viewer_images(mesh, camera, cutoffs)[0] for camera in cameras]
         scores.append(mean_psnr(shown, truths))
     return len(mesh.faces), scores

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshsplats.cameras.files import cameras_beside, load_cameras, model_folder, save_cameras
+from meshsplats.cameras.files import load_cameras, model_folder, save_cameras
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cameras.viewer_settings import start_camera
 from meshsplats.errors import FileFormatError
+from meshsplats.viewpoints.beside import cameras_beside
 
 POSE = {"position": [1.0, 2.0, -3.0], "target": [1.0, 2.0, 5.0], "fov": 60}
 SECOND = {"version": 2, "cameras": [{"initial": POSE}, {"initial": {}}], "startMode": "default"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from _balls import cameras_around
@@ -10,7 +12,7 @@ from _photographs import write_photographs
 from meshsplats.cameras.files import save_cameras
 from meshsplats.datasets.views import WHITE
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import FileFormatError, OptionsError
+from meshsplats.errors import DataWarning, FileFormatError, OptionsError
 from meshsplats.finetuning.targets import Targets
 from meshsplats.scene.mesh import SplatMesh
 
@@ -38,6 +40,18 @@ def test_cameras_of_the_model_folder_are_taken_unless_cameras_are_placed(tmp_pat
     assert taken()
     assert taken(cameras=tmp_path / "cameras.json", placement="object")
     assert not taken(placement="object")
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_cameras_of_a_record_are_taken_where_they_see_the_scene(tmp_path, sees):
+    (tmp_path / "s.ply").touch()
+    cameras = [camera if sees else camera.relative_to((1e4, 0, 0)) for camera in cameras_around(9)]
+    save_cameras(cameras, tmp_path / "s.ply.cameras.json")
+    targets = Targets(views=4, held_out=1, width=24)
+    with nullcontext() if sees else pytest.warns(DataWarning, match="none of the 9 cameras beside the file"):
+        data = targets.make(CLOUD, tmp_path / "s.ply", WHITE, 1)
+    given = {tuple(np.round(c.center, 3)) for c in cameras}
+    assert ({tuple(np.round(view.camera.center, 3)) for view in data.train} <= given) == sees
 
 
 def test_photographs_that_are_all_held_out_leave_nothing_to_train_on(tmp_path):

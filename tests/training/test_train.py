@@ -69,7 +69,7 @@ from meshsplats.training.patches import Patches, flat_splats
 from meshsplats.training.result_cameras import camera_files, save_result_cameras
 from meshsplats.training.run import COVERAGE, SO_FAR, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
-from meshsplats.viewpoints.showing import cameras_given
+from meshsplats.viewpoints.beside import cameras_beside
 
 LAYERS = ("color", "alpha")
 SMALL = {"start_splats": 150, "max_splats": 600, "growth_events": 3}
@@ -1097,7 +1097,7 @@ def test_the_result_opens_from_where_it_was_photographed(ball, start, tmp_path, 
     assert "4 photographs to train on" in told.err
     shown, given = load_cameras(record), [view.camera for view in views]
     np.testing.assert_allclose([c.center for c in shown], [c.center for c in given], atol=1e-6)
-    assert [c.name for c in cameras_given(out)] == [c.name for c in shown]
+    assert [c.name for c in cameras_beside(out)] == [c.name for c in shown]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from meshsplats.formats.base_meshes import load_vertex_colored, save_base
 from meshsplats.scene.base_mesh import BaseMesh
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
-from meshsplats.viewpoints import showing
+from meshsplats.viewpoints import beside, showing
 from meshsplats.viewpoints.finding import FoundCameras
 from meshsplats.viewpoints.opening import opening_camera
 from meshsplats.viewpoints.showing import default_views, opening_beside
@@ -187,7 +187,7 @@ def test_a_record_that_cannot_be_opened_ends_nothing(kind, tmp_path, monkeypatch
     file = tmp_path / "scene.npz"
     file.write_bytes(b"")
     save_cameras(views(3), tmp_path / "scene.npz.cameras.json")
-    monkeypatch.setattr(showing, "load_cameras", refuse)
+    monkeypatch.setattr(beside, "load_cameras", refuse)
     with pytest.warns(DataWarning, match="Permission denied"):
         assert heights(default_views(fans(), file, 5)[0]) == {2.0}
 

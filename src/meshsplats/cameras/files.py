@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from meshsplats._common.kinds import need_all, need_path
 from meshsplats._files.atomic import write_text
 from meshsplats.cameras.camera_path import cameras_of_path, is_camera_path
 from meshsplats.cameras.viewer_settings import start_camera
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import FileFormatError
 from meshsplats.scene.camera import Camera
 
 MAX_CAMERAS = 20_000
@@ -82,19 +81,6 @@ def model_folder(source: Path) -> Path | None:
     elif folder != source:
         return None
     return folder if (folder / "cameras.json").is_file() else None
-
-
-def cameras_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
-    """The training cameras of the ``model_folder`` of ``source``, relative to ``origin``; None where there
-    are none. A DataWarning says where they cannot be read."""
-    folder = model_folder(source)
-    if folder is None:
-        return None
-    try:
-        return load_cameras(folder, origin=origin)
-    except FileFormatError as error:
-        warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
-        return None
 
 
 def _file_in(folder: Path) -> Path:

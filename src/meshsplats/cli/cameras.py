@@ -48,11 +48,12 @@ class Cameras(Command):
 
     def execute(self) -> None:
         from meshsplats._files.atomic import together
-        from meshsplats.cameras.files import cameras_beside, model_folder, save_cameras
+        from meshsplats.cameras.files import model_folder, save_cameras
         from meshsplats.cameras.framing import guess_up
         from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
         from meshsplats.images.writing import save_image
         from meshsplats.scene.gaussians import GaussianCloud
+        from meshsplats.viewpoints.beside import cameras_beside, record_of
         from meshsplats.viewpoints.finding import find_cameras
         from meshsplats.viewpoints.sheet import contact_sheet
         from meshsplats.viewpoints.showing import opened_with
@@ -68,8 +69,8 @@ class Cameras(Command):
         up = optional_up(self.up)
         given = cameras_beside(self.input, scene.origin)
         if given is not None:
-            folder = model_folder(self.input)
-            say(f"{folder} has {len(given)} cameras of its own, which --cameras {folder} takes")
+            where = record_of(self.input) or model_folder(self.input)
+            say(f"{where} has {len(given)} training cameras, which --cameras {where} takes")
             up = guess_up(scene, given) if up is None else up
         side = self.width, self.width if self.height is None else self.height
         self.reading.tell_of("looking for views of", len(scene))

@@ -173,9 +173,10 @@ class SceneViews:
 
         Raises ValueError for values out of range, FileFormatError and OSError for files that cannot be read.
         """
-        from meshsplats.cameras.files import cameras_beside, load_cameras
+        from meshsplats.cameras.files import load_cameras
         from meshsplats.cameras.framing import guess_up
         from meshsplats.cameras.trajectories import dome, look_around, orbit
+        from meshsplats.viewpoints.beside import cameras_beside
         from meshsplats.viewpoints.opening import opening_azimuth
         from meshsplats.viewpoints.showing import default_views
 

@@ -122,11 +122,12 @@ class Targets:
         do.
         """
         from meshsplats._common.kinds import need
-        from meshsplats.cameras.files import cameras_beside, load_cameras
+        from meshsplats.cameras.files import load_cameras
         from meshsplats.datasets.folder import load_dataset
         from meshsplats.datasets.splat_targets import splat_dataset
         from meshsplats.scene.gaussians import GaussianCloud
         from meshsplats.scene.mesh import SplatMesh
+        from meshsplats.viewpoints.beside import cameras_beside, that_see
 
         if self.data is not None:
             dataset = load_dataset(
@@ -155,7 +156,7 @@ class Targets:
             cameras: list[Camera] | None = load_cameras(self.cameras, origin=scene.origin)
         else:
             placed = not set(PLACING).isdisjoint(changed(self))
-            cameras = None if placed else cameras_beside(source, scene.origin)
+            cameras = None if placed else that_see(cameras_beside(source, scene.origin), scene)
         return splat_dataset(
             scene,
             placement=self.placement,

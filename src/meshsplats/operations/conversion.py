@@ -15,7 +15,6 @@ import numpy as np
 from meshsplats._common.choices import Look
 from meshsplats._common.words import plural
 from meshsplats._files.atomic import in_words, together
-from meshsplats.cameras.files import cameras_beside
 from meshsplats.cameras.framing import unit_up
 from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.gaps import with_usual_look
@@ -41,6 +40,7 @@ from meshsplats.scene.camera import Camera
 from meshsplats.scene.draw_order import DrawOrder
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
+from meshsplats.viewpoints.beside import cameras_beside, that_see
 from meshsplats.viewpoints.showing import default_views
 
 LARGE_BYTES = 1_000_000_000
@@ -103,7 +103,7 @@ class Converter:
     def _mesh(self, job: Job, cameras: Sequence[Camera] | None) -> dict[str, Any]:
         product, start = self.product, time.perf_counter()
         cloud = self.callbacks.load(job.source)
-        seen = seen_from(cameras, job.source, cloud.origin)
+        seen = seen_from(cameras, job.source, cloud.origin, cloud)
         read = time.perf_counter()
         options = product.conversion
         if product.preset == "default" and not seen and not product.merges:
@@ -253,7 +253,7 @@ class Converter:
             min_opacity=options.min_opacity,
             max_splats=None if merging else count,
         )
-        seen = seen_from(cameras, job.source, kept.origin)
+        seen = seen_from(cameras, job.source, kept.origin, kept)
         if merging and count is not None:
             kept = simplify_for_views(kept, count, seen, up=product.direction, threads=self.threads)
         result = self.callbacks.place(scaled(kept, product.scale))
@@ -297,11 +297,14 @@ def _no_splats(job: Job) -> str:
     return f"{job.source}: a mesh, not splats: {why}"
 
 
-def seen_from(cameras: Sequence[Camera] | None, source: Path, origin: np.ndarray) -> list[Camera]:
-    """``cameras``, which are in the world, relative to ``origin``; None: those of the model folder
-    ``source``, if it is one."""
+def seen_from(
+    cameras: Sequence[Camera] | None, source: Path, origin: np.ndarray, cloud: GaussianCloud | None = None
+) -> list[Camera]:
+    """``cameras``, which are in the world, relative to ``origin``; None: those ``cameras_beside`` the
+    ``source``, if there are any, that see some of ``cloud``, if it is given."""
     if cameras is None:
-        return cameras_beside(source, origin) or []
+        beside = cameras_beside(source, origin)
+        return (beside if cloud is None else that_see(beside, cloud)) or []
     return [camera.relative_to(origin) for camera in cameras]
 
 

@@ -13,7 +13,6 @@ from typing import Any
 from meshsplats._common.kinds import as_path
 from meshsplats._common.words import plural
 from meshsplats._files.atomic import together
-from meshsplats.cameras.files import cameras_beside
 from meshsplats.conversion import bake_filter
 from meshsplats.conversion.cleaning import Findings, find, remove, save_strip
 from meshsplats.conversion.cleaning_rules import FLOATERS, CleaningRules
@@ -41,6 +40,7 @@ from meshsplats.rendering.plain_colors import plain_colors_of
 from meshsplats.scene.camera import Camera
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
+from meshsplats.viewpoints.beside import cameras_beside, that_see
 from meshsplats.viewpoints.showing import default_views
 
 Place = Callable[[Any], Any]
@@ -176,7 +176,7 @@ def simplify_file(
     cloud = reading.load(source, threads=threads)
     cameras = cameras_named(options.cameras, options.data, options.missing, cloud.origin)
     if cameras is None:
-        cameras = cameras_beside(source, cloud.origin)
+        cameras = that_see(cameras_beside(source, cloud.origin), cloud) or []
     start, wanted = time.perf_counter(), options.wanted(len(cloud))
     reading.tell_of("merging", len(cloud), f" to {wanted:,}")
     kept = simplify_for_views(cloud, wanted, cameras, threads=threads)

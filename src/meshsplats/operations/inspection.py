@@ -13,7 +13,7 @@ import numpy as np
 from meshsplats._common.json_files import read_json
 from meshsplats._common.kinds import as_path
 from meshsplats.cameras.camera_path import is_camera_path
-from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds, warn_of_strays_in, warn_of_unseen
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import load_dataset
@@ -31,6 +31,7 @@ from meshsplats.scene.gaussians import LEAST_OPACITY, GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
 from meshsplats.scene.origin import choose_origin
 from meshsplats.tiles import is_tileset
+from meshsplats.viewpoints.beside import cameras_beside
 
 SAMPLE = 4000
 """Number of splats that are converted to estimate the size of the mesh."""

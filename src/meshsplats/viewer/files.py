@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._common.words import optional_color, optional_up
-from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cameras.files import load_cameras
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.conversion.merging_views import VIEWS
 from meshsplats.datasets.folder import load_dataset
@@ -32,7 +32,8 @@ from meshsplats.viewer.content import (
     measured,
 )
 from meshsplats.viewer.page import Page, PageOptions
-from meshsplats.viewpoints.showing import cameras_recorded, default_views, opening_beside
+from meshsplats.viewpoints.beside import cameras_beside, record_of
+from meshsplats.viewpoints.showing import default_views, opening_beside
 
 FOUND_VIEWS = 12
 """Viewpoints of a place, where the input has none."""
@@ -224,15 +225,14 @@ def _cameras(
     beside = cameras_beside(source, scene.origin)
     opening = opening_beside(source, scene.origin) if isinstance(scene, GaussianCloud) else None
     first = [] if opening is None else [opening]
-    if beside is not None:
+    if beside is not None and record_of(source) is None:
         return [*first, *beside]
     # As many as splats are merged for, where views are looked for: once is enough.
-    given = cameras_recorded(source, scene.origin) or ()
-    searched = isinstance(scene, GaussianCloud) and not given
+    searched = isinstance(scene, GaussianCloud) and not beside
     count, up = max(FOUND_VIEWS, VIEWS) if searched else FOUND_VIEWS, optional_up(options.up)
     if isinstance(scene, GaussianCloud):
         options.reading.tell_of("looking for views of", len(scene))
-    found = default_views(scene, source, count, up=up, given=given, threads=threads)
+    found = default_views(scene, source, count, up=up, given=beside or (), threads=threads)
     if found is None:
         return first
     say(found[1])

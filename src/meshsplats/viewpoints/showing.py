@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,14 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._common.arrays import subsample
 from meshsplats._common.json_files import read_json
-from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.cameras.viewer_settings import NAME, start_camera
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.gltf.cameras import cameras_in_gltf, cameras_in_mesh
-from meshsplats.formats.outputs import CAMERAS, beside
 from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.formats.splat_paths import files_named
 from meshsplats.formats.usd.cameras import cameras_in_usd
@@ -25,6 +21,7 @@ from meshsplats.scene.base_mesh import BaseMesh
 from meshsplats.scene.camera import Camera
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
+from meshsplats.viewpoints.beside import cameras_beside, that_see
 from meshsplats.viewpoints.finding import find_cameras, worth_a_look
 from meshsplats.viewpoints.kind import kind_from_outside, surely_object
 from meshsplats.viewpoints.mesh_splats import splats_to_look_at
@@ -33,10 +30,6 @@ from meshsplats.viewpoints.walking import keys_of, walk
 
 _ROUND = 4
 """Fewest cameras of a mesh's file that a round leads through."""
-_OLDER = 60.0
-"""Seconds by which a record of cameras may be older than its file: copies are made in any order."""
-_POINTS = 10_000
-"""Points of a scene, at most, that cameras are asked for."""
 
 
 def opening_beside(source: Path | None, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> Camera | None:
@@ -73,56 +66,6 @@ def opened_with(
     return [*first, *cameras][: len(cameras)]
 
 
-def cameras_given(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
-    """The training cameras of ``source``, relative to ``origin``: ``cameras_recorded`` where there is a
-    record, else those of a model folder (``cameras_beside``). None where there are none."""
-    return cameras_beside(source, origin) if _record_of(source) is None else cameras_recorded(source, origin)
-
-
-def cameras_recorded(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0)) -> list[Camera] | None:
-    """The cameras in the record ``NAME.cameras.json`` beside the file ``source``, NAME, as ``train`` writes
-    it, relative to ``origin``. None where there is none; a DataWarning says where it cannot be read, and
-    where it is older than the file."""
-    record = _record_of(source)
-    if record is None:
-        return None
-    try:
-        if os.stat(record).st_mtime < os.stat(source).st_mtime - _OLDER:
-            said = f"{record} is older than {source.name} and may be of another: save it anew, or delete it"
-        else:
-            return load_cameras(record, origin=origin)
-    except (FileFormatError, OSError) as error:
-        said = str(error)
-    warnings.warn(f"{said}; the cameras beside the file are not used", DataWarning, stacklevel=2)
-    return None
-
-
-def _record_of(source: Path) -> Path | None:
-    """The record of cameras beside the file ``source``; None if there is none."""
-    if not source.is_file():
-        return None
-    record = beside(source, CAMERAS)
-    return record if os.path.isfile(record) else None  # which bears names that are too long
-
-
-def _that_see(
-    cameras: Sequence[Camera] | None, scene: GaussianCloud | SplatMesh | BaseMesh
-) -> Sequence[Camera] | None:
-    """Those of the ``cameras`` that see some of ``scene``. A DataWarning says that none does."""
-    if not cameras:
-        return cameras
-    points = subsample(scene.means if isinstance(scene, GaussianCloud) else scene.vertices, _POINTS)
-    with np.errstate(all="ignore"):  # a camera may be anywhere
-        seeing = [camera for camera in cameras if camera.sees(points).any()]
-    if not seeing:
-        warnings.warn(
-            f"none of the {len(cameras)} cameras beside the file sees anything of it: they are not used",
-            DataWarning,
-            stacklevel=3,
-        )
-    return seeing
-
-
 def default_views(
     scene: GaussianCloud | SplatMesh | BaseMesh,
     source: Path | None,
@@ -137,7 +80,7 @@ def default_views(
     """Up to ``count`` views of a scene that is no object, and a line that says where they come from. None for
     objects, which are seen from all around, and for meshes that do not know their splats and have no cameras.
 
-    The cameras inside a glTF or USD file of a mesh come first, then those of ``cameras_given``, then those
+    The cameras inside a glTF or USD file of a mesh come first, then those of ``cameras_beside``, then those
     that ``find_cameras`` finds in the splats, or in those that a mesh was made of. A start camera
     (``opening_beside``) is the first of these, and of an object, too, where one view of splats is asked for.
 
@@ -146,7 +89,7 @@ def default_views(
         side: width and height of the images, pixels.
         up: (3,) direction, where the user names it.
         film: the views are on a smooth round.
-        given: cameras relative to the scene's origin, in place of those of ``cameras_given``.
+        given: cameras relative to the scene's origin, in place of those of ``cameras_beside``.
         threads: at most this many; all processors by default.
     """
     cloud: GaussianCloud | None
@@ -164,8 +107,8 @@ def default_views(
             return None  # at a glance, as most meshes are
         source = source if source is not None and source.is_file() else None
     if given is None and source is not None:
-        given = cameras_given(source, scene.origin)
-    given = _that_see(given, scene)
+        given = cameras_beside(source, scene.origin)
+    given = that_see(given, scene)
     if cloud is None:
         toward = guess_up(None, given) if up is None else unit_up(up)
         return _of_given(scene, given, count, side, toward, film) if given else None
