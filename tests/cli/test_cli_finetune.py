@@ -528,22 +528,23 @@ def test_dense_clouds_begin_as_their_conversion(splats, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_timed_run_is_resumed_with_the_mesh_that_it_began_with(splats, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("kind", [("--opacity", "cutoff"), ("--order", "file")])
+def test_a_timed_run_is_resumed_with_the_mesh_that_it_began_with(splats, tmp_path, capsys, monkeypatch, kind):
     """Though the machine is as fast as a hundred by then."""
-    slow, fast = Pace(1e-4, 1e-5, 1e-9), Pace(1e-6, 1e-9, 1e-9)
+    slow, fast = Pace(1e-4, 1e-4, 1e-9), Pace(1e-6, 1e-9, 1e-9)
     monkeypatch.setattr("meshsplats.finetuning.on_splats.TIMED_SPLATS", 1)
     monkeypatch.setattr("meshsplats.finetuning.pace.FEWEST_SPLATS", 50)
     monkeypatch.setattr("meshsplats.finetuning.pace.FEWEST_STEPS", 1000)
     monkeypatch.setattr("meshsplats.finetuning.on_splats.measure_pace", lambda *_, **__: slow)
-    words = (splats, "-o", tmp_path / "t.glb", *SMALL, "--opacity", "cutoff", "--json", "--force")
-    assert run(*words, "--minutes", "0.03") == 0
+    words = (splats, "-o", tmp_path / "t.glb", *SMALL, *kind, "--json", "--force")
+    assert run(*words, "--minutes", "0.08") == 0
     record = json.loads((tmp_path / "t.glb.run" / "start.json").read_text())
     assert 50 <= record["max_splats"] < 300
     monkeypatch.setattr("meshsplats.finetuning.on_splats.measure_pace", lambda *_, **__: fast)
     capsys.readouterr()
-    assert run(*words, "--minutes", "0.05", "--resume") == 0
+    assert run(*words, "--minutes", "0.1", "--resume") == 0
     assert json.loads((tmp_path / "t.glb.run" / "start.json").read_text()) == record
-    assert run(*words, "--minutes", "0.03") == 0
+    assert run(*words, "--minutes", "0.08") == 0
     assert json.loads((tmp_path / "t.glb.run" / "start.json").read_text())["max_splats"] is None
 
 
@@ -615,6 +616,17 @@ def test_a_file_that_is_tuned_through_its_order(splats, tmp_path, capsys):
     assert 'order = "file"' in (tmp_path / "ordered.glb.config.toml").read_text()
     lines = (tmp_path / "ordered.glb.run/metrics.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["psnr"] > 10
+
+
+def test_a_file_tuned_through_its_order_is_small_unless_asked_otherwise(splats, tmp_path, monkeypatch):
+    monkeypatch.setattr("meshsplats.finetuning.on_splats.FILE_TRIANGLES", 800)
+    words = (splats, "--steps", "2", *SMALL, "-o")
+    assert run(*words, tmp_path / "a.glb", "--order", "file") == 0
+    assert len(load_mesh(tmp_path / "a.glb").faces) == 800
+    assert run(*words, tmp_path / "b.glb", "--order", "file", "--max-triangles", "2000") == 0
+    assert len(load_mesh(tmp_path / "b.glb").faces) == 2000
+    assert run(*words, tmp_path / "c.npz") == 0
+    assert len(load_mesh(tmp_path / "c.npz").faces) > 800
 
 
 def test_what_has_no_order_of_its_own_is_refused_before_the_work(splats, tmp_path, capsys):

@@ -67,6 +67,9 @@ SAVE_SECONDS = 2e-6
 TIMED_SPLATS = 10_000
 """Steps are timed for clouds from this size on."""
 
+FILE_TRIANGLES = 4_000_000
+"""Most triangles by default of a file that is tuned in its order: 200 MB, for viewers."""
+
 
 @dataclass(frozen=True)
 class SplatRun:
@@ -279,11 +282,13 @@ class SplatTuning:
         timed = seconds is not None and count >= TIMED_SPLATS
         if not limited:
             count = min(count, most_splats(available_memory()) or count)
+            if config.order == "file":
+                count = min(count, FILE_TRIANGLES // usual_triangles_each())
         if timed:
             self._setup.phase("timing steps")
             pace = measure_pace(run.cloud, dataset, config, self._options, run.threads, run.device)
             left = (1 - SETUP_SHARE) * (seconds or 0)
-            if config.cuts and not limited:
+            if (config.cuts or config.order == "file") and not limited:
                 count = pace.splats(count, worthwhile_steps(config), left)
             steps = pace.steps(self._limited(count), left)
         brief = may_be_brief and steps is not None and is_brief(self._limited(count), pixels, steps, timed)

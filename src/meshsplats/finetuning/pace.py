@@ -1,7 +1,9 @@
 """What a run of given length has time for, by the measured speed of this machine.
 
 With few steps for its triangles, a mesh is worse than its conversion, unless it begins as such and takes
-small steps. Opaque meshes need many steps: they begin with fewer splats, merged.
+small steps. Opaque meshes and those in the order of a file need many steps: they begin with fewer splats,
+merged. A landscape of 4.2 million, three minutes in the order of a file, as viewers draw it: 4.0 million
+triangles and 67 steps 20.9 dB, 1.0 million and 226 steps 21.6.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from meshsplats.rendering.ordering import drawing_order
 from meshsplats.scene.gaussians import GaussianCloud
 
 FEWEST_STEPS = 150
-"""Steps that a run for opaque triangles should have."""
+"""Steps that a run for opaque triangles, or for the order of a file, should have."""
 STEPS_A_MINUTE = 30
 """The same for each minute, in runs where this is more."""
 BRIEF_STEPS, DENSE_STEPS = 100, 150
@@ -114,7 +116,8 @@ class StartRecord:
 
 
 def worthwhile_steps(config: FinetuneConfig) -> float:
-    """Steps that a run for opaque triangles of this length, in minutes, should have at least."""
+    """Steps that a run of this length, in minutes, for opaque triangles or the order of a file should have at
+    least."""
     return max(FEWEST_STEPS, STEPS_A_MINUTE * (config.minutes or 0))
 
 
