@@ -3,11 +3,14 @@ memory."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import math
 import signal
+import struct
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -305,6 +308,23 @@ def test_what_a_container_keeps_of_files_is_free(tmp_path, folder, limit, used, 
     (tmp_path / "proc").mkdir()
     (tmp_path / "proc/meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    2000 kB\n")
     assert memory.available_memory(tmp_path) == 2000 << 10
+
+
+@pytest.mark.parametrize(
+    ("physical", "commit", "free"), [(8, 3, 3), (2, 5, 2)]
+)
+def test_memory_that_windows_tells(physical, commit, free):
+    """MEMORYSTATUSEX: 64 bytes, its own length in the first four; available physical memory at byte 16, what
+    may still be committed at 32."""
+
+    def status(place):
+        raw = (ctypes.c_char * 64).from_address(ctypes.addressof(place._obj))
+        assert struct.unpack_from("<I", raw) == (64,)
+        struct.pack_into("<QQQQ", raw, 8, 16, physical, 20, commit)
+        return 1
+
+    assert memory._of_windows(SimpleNamespace(GlobalMemoryStatusEx=status)) == free
+    assert memory._of_windows(SimpleNamespace(GlobalMemoryStatusEx=lambda _: 0)) is None
 
 
 def test_splats_that_targets_are_drawn_from_count():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from pathlib import Path
+from typing import Any
 
 from meshsplats.cluster import memory_of_task
 from meshsplats.datasets.splat_targets import RenderedSplats
@@ -66,6 +69,32 @@ def estimate_bytes(vertices: int, faces: int, dataset: Dataset, cache_bytes: int
 def available_memory(system: Path = Path("/")) -> int | None:
     """Bytes that this process may still allocate, by the system, the container and its Dask worker; None if
     unknown. ``system``: the root of the file system."""
+    if sys.platform == "win32":
+        found = _of_windows(ctypes.windll.kernel32)
+        return min(filter(None, [found, memory_of_task()]), default=None)
+    return _of_linux(system)
+
+
+class _MemoryStatus(ctypes.Structure):
+    """MEMORYSTATUSEX of the Windows API."""
+
+    _fields_ = (
+        ("length", ctypes.c_uint32),
+        ("load", ctypes.c_uint32),
+        *((name, ctypes.c_uint64) for name in ("physical", "free_physical", "page_file", "free_page_file")),
+        *((name, ctypes.c_uint64) for name in ("virtual", "free_virtual", "free_extended")),
+    )
+
+
+def _of_windows(kernel32: Any) -> int | None:
+    """Free bytes of physical memory, at most those that the system would still commit to this process."""
+    status = _MemoryStatus(length=ctypes.sizeof(_MemoryStatus))
+    if not kernel32.GlobalMemoryStatusEx(ctypes.byref(status)):
+        return None
+    return min(status.free_physical, status.free_page_file)
+
+
+def _of_linux(system: Path) -> int | None:
     found = []
     try:
         for line in (system / "proc/meminfo").read_text().splitlines():
