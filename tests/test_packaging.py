@@ -36,7 +36,7 @@ class OnlyNumpy:
     def find_spec(self, name, path=None, target=None):
         top = name.partition(".")[0]
         if top not in sys.stdlib_module_names and top not in ("numpy", "meshsplats"):
-            raise ImportError(f"{name} is not needed for this")
+            raise ModuleNotFoundError(f"{name} is not needed for this")
 sys.meta_path.insert(0, OnlyNumpy())
 """
 

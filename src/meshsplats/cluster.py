@@ -166,7 +166,7 @@ def _importing_safely() -> Iterator[None]:
 def _dask() -> Any:
     try:
         return importlib.import_module("distributed")
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingDependencyError(
             "a cluster needs Dask: pip install 'meshsplats[cluster]' (or: pip install distributed)"
         ) from None

@@ -604,7 +604,7 @@ def test_heif_without_its_library_names_it(tmp_path, monkeypatch):
 
     def without(name, *rest, **more):
         if name == "pillow_heif":
-            raise ImportError(name)
+            raise ModuleNotFoundError(name)
         return real(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", without)

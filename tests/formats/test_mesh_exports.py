@@ -101,7 +101,7 @@ def test_usd_of_a_lit_mesh_without_normals_has_some(tmp_path):
 def test_without_usd_core_the_error_names_the_extra(tmp_path, monkeypatch):
     def no_pxr(name, *args, **kwargs):
         if name.startswith("pxr"):
-            raise ImportError(name)
+            raise ModuleNotFoundError(name)
         return importer(name, *args, **kwargs)
 
     importer = builtins.__import__

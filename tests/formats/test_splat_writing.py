@@ -389,7 +389,7 @@ def test_version_4_needs_zstandard(tmp_path, monkeypatch):
     from meshsplats.formats.splats import _spz_layout
 
     def missing(name):
-        raise ImportError(name)
+        raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(_spz_layout.importlib, "import_module", missing)
     with pytest.raises(MissingDependencyError, match=r"a\.spz: SPZ version 4 needs the extra 'formats'"):

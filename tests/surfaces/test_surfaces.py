@@ -40,6 +40,7 @@ from meshsplats.formats.outputs import placed
 from meshsplats.prior import bind
 from meshsplats.surfaces import files as surface_files
 from meshsplats.surfaces import make_surface, making, views
+from meshsplats.surfaces.atlas import unwrap
 from meshsplats.surfaces.files import SurfaceFileOptions, SurfaceRun
 from meshsplats.surfaces.fusion import TRUNCATION, close_gaps, collapsed, grid_of, isosurface
 from meshsplats.surfaces.holes import close_holes
@@ -159,6 +160,16 @@ def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setattr("meshsplats.surfaces.fusion.render", None)  # refused up front
     with pytest.raises(MissingDependencyError, match=r"extra 'base': pip install scikit-image"):
         make_surface(ball(), resolution=8, views=4)
+
+
+def test_a_library_that_does_not_load_is_not_said_to_be_missing(tmp_path, monkeypatch):
+    """To install it again does not help."""
+    (tmp_path / "uvunwrap.py").write_text("raise ImportError('DLL load failed while importing uvunwrap')")
+    monkeypatch.delitem(sys.modules, "uvunwrap", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ImportError, match="DLL load failed while importing uvunwrap") as found:
+        unwrap(np.eye(3), np.array([[0, 1, 2]]), 64)
+    assert not isinstance(found.value, MissingDependencyError)
 
 
 @needs_extra

@@ -56,7 +56,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
 
     def without(name, *rest, **more):
         if name == "pycolmap":
-            raise ImportError(name)
+            raise ModuleNotFoundError(name)
         return real(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", without)

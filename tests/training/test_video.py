@@ -480,7 +480,7 @@ def test_without_its_library_the_extra_is_named(tmp_path, monkeypatch):
 
     def without(name, *rest):
         if name == "av":
-            raise ImportError(name)
+            raise ModuleNotFoundError(name)
         return real(name, *rest)
 
     clip = write_video(tmp_path / "walk.mp4", passing([0, 5]))

@@ -279,7 +279,7 @@ def _files(weights: Paths | Sequence[Paths], network: Network) -> list[Path]:
 def _tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         import torch
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError(f"LPIPS needs torch; {GET_TORCH}") from error
     try:
         if path.suffix == ".safetensors":

@@ -21,7 +21,7 @@ from meshsplats.finetuning.loss import Loss, Target, loss_name
 
 try:
     import torch
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise MissingDependencyError(f"meshsplats.finetuning.losses needs torch; {GET_TORCH}") from error
 
 SSIM_WEIGHT = 0.4

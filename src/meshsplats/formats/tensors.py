@@ -227,7 +227,7 @@ def gaussians_to_tensors(
         return arrays
     try:
         import torch as library
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError(f"torch tensors need torch; {GET_TORCH}") from error
     return {name: library.from_numpy(array) for name, array in arrays.items()}
 

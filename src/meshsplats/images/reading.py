@@ -243,7 +243,7 @@ def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...
         return FORMATS
     try:
         from pillow_heif import register_heif_opener
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingDependencyError(
             f"{path}: a HEIF image (.heic), which needs the library pillow-heif: pip install"
             " 'meshsplats[heic]'; or convert it to JPEG"
@@ -262,7 +262,7 @@ def _reads_avif() -> bool:
 def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:
     try:
         from PIL import Image
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingDependencyError("reading images needs Pillow: pip install pillow") from None
     try:
         formats = _formats(path, data)

@@ -104,7 +104,7 @@ def rasterize(
         need_all(Camera, cameras=cameras)
     try:
         from meshsplats.rendering.torch_operator import Optional, Scene, images_of
-    except ImportError as error:
+    except MissingDependencyError as error:
         raise MissingDependencyError(f"rasterize needs torch; {GET_TORCH}") from error
 
     single = isinstance(cameras, Camera)

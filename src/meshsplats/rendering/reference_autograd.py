@@ -21,7 +21,7 @@ from meshsplats.scene.order import Order
 
 try:
     import torch
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise MissingDependencyError(
         "meshsplats.rendering.reference_autograd needs torch: pip install 'meshsplats[torch]'"
     ) from error

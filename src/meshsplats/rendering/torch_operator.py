@@ -21,7 +21,7 @@ from meshsplats.scene.spherical_harmonics import TERMS
 try:
     import torch
     from torch.autograd.function import once_differentiable
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise MissingDependencyError(f"meshsplats.rendering.torch_operator needs torch; {GET_TORCH}") from error
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]

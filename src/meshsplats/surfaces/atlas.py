@@ -22,7 +22,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
     """
     try:
         import uvunwrap
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError(
             "textures need the extra 'base', with Python 3.11 or newer: pip install uvunwrap. Without it,"
             " texture=0 (--texture 0) gives colours of vertices"

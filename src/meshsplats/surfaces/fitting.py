@@ -45,7 +45,7 @@ class SmoothSteps:
         try:
             from scipy import sparse
             from scipy.sparse.linalg import splu
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise MissingDependencyError("a surface needs the extra 'base': pip install scipy") from error
         count = len(vertices)
         tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()

@@ -210,7 +210,7 @@ def libraries() -> tuple[Callable[..., Any], ...]:
     try:
         from fast_simplification import simplify
         from skimage.measure import label, marching_cubes
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError(
             "a surface needs the extra 'base': pip install scikit-image fast-simplification uvunwrap scipy"
         ) from error

@@ -259,7 +259,7 @@ def _imported() -> Any:
         import_module("PIL.Image")  # first: loaded after pycolmap, it ends the process where it writes PNG
     try:
         import pycolmap
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingDependencyError(NEEDS) from None
     if threading.current_thread() is threading.main_thread():
         handler = signal.getsignal(signal.SIGTERM)

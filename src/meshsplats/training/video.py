@@ -245,7 +245,7 @@ def _decoded(video: Path, warn: bool = False) -> Iterator[Any]:
     """The frames of ``video``; with ``warn``, a DataWarning says where it cannot be read on."""
     try:
         import av
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingDependencyError(NEEDS) from None
     count = 0
     try:

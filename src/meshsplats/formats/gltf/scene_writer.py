@@ -184,7 +184,7 @@ def png_of(pixels: np.ndarray) -> bytes:
     Pillow."""
     try:
         from PIL import Image
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError("textures need the package pillow: pip install pillow") from error
     opaque = (pixels[..., 3] == 255).all()
     out = io.BytesIO()

@@ -156,7 +156,7 @@ def zstandard_modules(where: object) -> tuple[Any, Any]:
         pass
     try:
         return None, importlib.import_module("zstandard")
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingDependencyError(
             f"{where}: SPZ version 4 needs the extra 'formats': pip install zstandard"
         ) from None

@@ -229,7 +229,7 @@ def _hull(points: np.ndarray, thick: float) -> tuple[Hull, float]:
     """The convex hull of ``points`` (n, 3), where they are flat that of ``_thickened``, and its volume."""
     try:
         from scipy.spatial import ConvexHull, QhullError
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError("convex parts need the extra 'base': pip install scipy") from error
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
     try:

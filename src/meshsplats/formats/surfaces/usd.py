@@ -34,7 +34,7 @@ def write_surface_usd(
     """Writes ``base`` to ``path``, which will be ``target``: see ``save_base``."""
     try:
         import pxr  # noqa: F401
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
     stem = target.stem if target.suffix.lower() != ".usdz" else "surface"
     pictures: dict[str, bytes] = {}

@@ -33,7 +33,7 @@ def write_scene_usd(parts: SceneParts, path: Path, where: Path, *, lit: bool) ->
     """
     try:
         from pxr import Kind, Sdf, Usd
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError(
             f"{where}: writing USD needs the extra 'usd': pip install usd-core"
         ) from error

@@ -42,7 +42,7 @@ def write_usd_splats(cloud: GaussianCloud, path: Path, writing: Writing) -> None
     """Writes ``cloud``; see ``save_gaussians``. MissingDependencyError without usd-core."""
     try:
         import pxr  # noqa: F401
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError(
             f"{writing.where}: writing USD needs the extra 'usd': pip install usd-core"
         ) from error

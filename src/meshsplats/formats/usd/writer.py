@@ -34,7 +34,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     """
     try:
         import pxr  # noqa: F401
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
     stage = mesh_stage(mesh, lit=lit)  # its layer does not outlive it
     if not stage.GetRootLayer().Export(str(path)):
