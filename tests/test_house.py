@@ -51,6 +51,21 @@ def too_many_parameters(text: str) -> list[str]:
     return found
 
 
+def with_line_ends_of_the_system(text: str) -> list[str]:
+    """Calls that write text to files, with \\r\\n on Windows."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Call) or {key.arg for key in node.keywords} & {"newline", "force_zip64"}:
+            continue
+        called = ast.unparse(node.func)
+        values = [*node.args, *(key.value for key in node.keywords)]
+        modes = {value.value for value in values if isinstance(value, ast.Constant)}
+        opened = called.rpartition(".")[2] in ("open", "fdopen") and modes & {"a", "w", "x"}
+        if (opened or called.endswith(".write_text")) and "devnull" not in ast.unparse(node):
+            found.append(ast.unparse(node))
+    return found
+
+
 def test_files_are_short():
     longer = [name for name, text in sources().items() if len(text.splitlines()) > LONGEST_FILE]
     assert longer == []
@@ -85,6 +100,18 @@ def test_parameters_are_counted_without_self():
     few = f"class A:\n    def f(self, {', '.join(names)}): ..."
     assert too_many_parameters(few) == []
     assert too_many_parameters(few.replace("p0", "p0, *, more")) == ["f"]
+
+
+def test_text_has_the_same_line_ends_on_every_system():
+    assert len(with_line_ends_of_the_system("p.write_text(a)\nopen(p, 'a')\np.open(mode='w')")) == 3
+    assert (
+        with_line_ends_of_the_system("open(p, 'wb')\nopen(p)\nwrite_text(p, a)\nopen(p, 'x', newline='')")
+        == []
+    )
+    written = {
+        name: with_line_ends_of_the_system(text) for name, text in sources().items() if name[-3:] == ".py"
+    }
+    assert {name: calls for name, calls in written.items() if calls} == {}
 
 
 def test_the_command_line_is_thin():

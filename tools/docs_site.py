@@ -214,7 +214,7 @@ def write_sources(folder: Path, scene: bool) -> None:
     texts["index.md"] = index + navigation([place.removesuffix(".md") for place in [*texts, "index.md"]])
     for place, text in texts.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
-        (folder / place).write_text(text, encoding="utf-8")
+        (folder / place).write_text(text, encoding="utf-8", newline="\n")
     shutil.copytree(ROOT / "docs/images", folder / "docs/images")
 
 

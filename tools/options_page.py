@@ -135,4 +135,4 @@ def _table(rows: Iterable[list[str]], defaults: tuple[str, ...], more: str = "")
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8", newline="\n")

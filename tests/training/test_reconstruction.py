@@ -27,6 +27,7 @@ from meshsplats.scene.camera import Camera
 from meshsplats.training import poses, reconstruction
 from meshsplats.training.feature_masks import FeatureMasks
 from meshsplats.training.photographs import PhotographOptions
+from meshsplats.training.pycolmap_input import for_pycolmap
 from meshsplats.training.reconstruction import bare_photographs, ensure_cameras, find_cameras
 
 
@@ -49,6 +50,25 @@ def test_bare_photographs_lie_in_the_folder_or_in_images(tmp_path):
 def test_too_few_photographs_are_refused(tmp_path):
     with pytest.raises(ValueError, match="2 photographs without cameras; at least 3"):
         find_cameras(photographs(tmp_path, 2))
+
+
+@pytest.mark.parametrize("allowed", [("symlink", "link"), ("link",), ()])
+def test_photographs_with_blanks_in_their_names_are_linked_or_copied(tmp_path, monkeypatch, allowed):
+    """And copied where it does not: they may be many gigabytes."""
+
+    def refuse(*_):
+        raise OSError(1314, "A required privilege is not held by the client")
+
+    photograph, work = tmp_path / "IMG (1).jpg", tmp_path / "work"
+    Image.new("RGB", (8, 6)).save(photograph)
+    work.mkdir()
+    for name in {"symlink", "link"} - set(allowed):
+        monkeypatch.setattr(os, name, refuse)
+    (file,) = for_pycolmap({photograph: read_shot(photograph)}, work, 1)
+    assert " " not in file.name
+    assert file.read_bytes() == photograph.read_bytes()
+    assert file.samefile(photograph) == bool(allowed)
+    assert file.is_symlink() == ("symlink" in allowed)
 
 
 def test_a_missing_library_is_named(tmp_path, monkeypatch):

@@ -189,7 +189,7 @@ def begun(
             "outputs": list(temporary),
             "attempts": EEVEE_ATTEMPTS if options.engine == "eevee" else 1,
         }
-        (folder / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
+        (folder / "plan.json").write_bytes(json.dumps(plan).encode())
         process = _start(start, folder, lock)
         try:
             yield Job(process, folder, options, images, blend, temporary)

@@ -123,7 +123,7 @@ class Journal:
         now = datetime.now().astimezone().isoformat(timespec="seconds")
         line = json.dumps({"step": step, **values, "time": now}, allow_nan=False) + "\n"
         try:
-            with open(self.folder / METRICS, "a", encoding="utf-8") as file:
+            with open(self.folder / METRICS, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line)
         except OSError as error:  # of a full disk, for instance, which names no file
             raise OSError(error.errno, error.strerror, str(self.folder / METRICS)) from None

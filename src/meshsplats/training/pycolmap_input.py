@@ -3,9 +3,11 @@ that pycolmap reads."""
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +70,11 @@ def for_pycolmap(shots: dict[Path, Shot], work: Path, threads: int) -> list[Path
         if needs_copy(shot):
             return _copied(path, folder / f"{i:06d}.jpg")
         file = folder / f"{i:06d}{path.suffix}"
-        try:
-            file.symlink_to(path.absolute())
-        except OSError:  # Windows lets only some users make links
-            shutil.copyfile(path, file)
+        for link in (os.symlink, os.link):  # Windows lets only some users make the first kind
+            with suppress(OSError):
+                link(path.absolute(), file)
+                return file
+        shutil.copyfile(path, file)
         return file
 
     with ThreadPoolExecutor(min(threads, COPIED_AT_ONCE)) as pool:

@@ -366,7 +366,7 @@ def _match(
     pairs = alike_pairs(_descriptors(database, names))
     say(f"finding the cameras: {len(pairs):,} pairs of photographs that look alike")
     chosen = database.parent / "pairs.txt"
-    chosen.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
+    chosen.write_bytes("".join(f"{names[i]} {names[j]}\n" for i, j in pairs).encode("utf-8"))
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = chosen
     pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu, **given)
