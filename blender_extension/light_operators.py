@@ -250,7 +250,7 @@ def bake(operator, context, names, fast):
 
 
 class BakeLight(Modal, bpy.types.Operator):
-    """Gather the light of the scene on its lit splat meshes, which then show it without noise. Do so again
+    """Bake the light of the scene onto its lit splat meshes, which then show it without noise. Bake again
     after lamps, sky or other objects have changed"""
 
     bl_idname = "scene.meshsplats_bake_light"
@@ -308,7 +308,7 @@ class BakeLight(Modal, bpy.types.Operator):
         if renewed:
             self.report({"INFO"}, f"MeshSplats: made for their shape as it is now: {', '.join(renewed)}")
         if not count:
-            self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
+            self.report({"WARNING"}, "MeshSplats: nothing baked: nothing is solid, or splats follow a base")
 
 
 register, unregister = bpy.utils.register_classes_factory((SetShading, SetUpRender, SetUpStage, BakeLight))

@@ -39,9 +39,9 @@ def light_warning(scene, obj):
     from meshsplats.blender.inside import baking, stand_ins
 
     if not stand_ins.is_current(obj, counts_only=True):
-        return "Light was made for other splats: Bake Light"
+        return "Baked light belongs to other splats: Bake Light again"
     if baking.is_older(scene, obj):
-        return "Light is older than the scene: Bake Light"
+        return "Baked light is out of date: Bake Light again"
     return ""
 
 

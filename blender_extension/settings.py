@@ -83,7 +83,7 @@ class SceneChoice:
     set_up_scene: BoolProperty(
         name="Set up Render",
         description="Set bounce limits and colour management for these meshes. In a saved file with other"
-        " objects, unless it is chosen anew, only the layers that rays pass",
+        " objects, only the transparent bounces, unless this is ticked again",
         default=True,
     )
     use_cycles: BoolProperty(

@@ -205,8 +205,8 @@ class _DaskWorkers(Workers):
                     running.add(new)
         except dask.KilledWorker as error:
             raise ClusterError(
-                "a task ended its workers, one after the other, perhaps for want of memory: give each worker"
-                f" more of it, or smaller tasks ({error})"
+                "a task killed one worker after another, perhaps by running out of memory: give each worker"
+                f" more memory, or make the tasks smaller ({error})"
             ) from None
         except dask.CancelledError as error:
             raise ClusterError(f"the scheduler was lost: {error}") from None

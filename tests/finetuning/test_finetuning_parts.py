@@ -310,9 +310,7 @@ def test_what_a_container_keeps_of_files_is_free(tmp_path, folder, limit, used, 
     assert memory.available_memory(tmp_path) == 2000 << 10
 
 
-@pytest.mark.parametrize(
-    ("physical", "commit", "free"), [(8, 3, 3), (2, 5, 2)]
-)
+@pytest.mark.parametrize(("physical", "commit", "free"), [(8, 3, 3), (2, 5, 2)])
 def test_memory_that_windows_tells(physical, commit, free):
     """MEMORYSTATUSEX: 64 bytes, its own length in the first four; available physical memory at byte 16, what
     may still be committed at 32."""

@@ -40,7 +40,7 @@ _POINTS = (
 )
 _SCENE = "export it as .glb"
 _PRINT = f"which is not read: {_SCENE} or .obj; 'meshsplats surface' makes .glb of splats, too"
-_CODE = "which could run anything when it is opened, and is not read"
+_CODE = "which can run arbitrary code when it is loaded, and is not read"
 _PICKLE = f"a pickle of Python, {_CODE}: save the splats as .ply"
 _VIDEO = "a video: 'meshsplats train VIDEO -o mesh.npz' makes a mesh of its sharpest frames"
 _KINDS: Sequence[_Kind] = (

@@ -169,7 +169,7 @@ def _of_places(plain: Sequence[str], runs: Sequence[str], given: Collection[str]
     if len(plain) > len(usage.places) and not endless:
         if all(word.lower().endswith(IMAGE_SUFFIXES) for word in plain):
             return "give the folder of the photographs, not the photographs themselves"
-        return f"{short(plain[len(usage.places)])} is one word too many"
+        return f"unexpected argument {short(plain[len(usage.places)])}"
     if endless and len(runs) > 1:
         return f"{short(runs[1])} comes after an option: give all inputs before the options"
     found = {*given, *usage.places[: len(plain)]}

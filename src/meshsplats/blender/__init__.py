@@ -197,9 +197,9 @@ def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: Scen
     if share < 5e-5:  # would read 0.00 %
         return
     warnings.warn(
-        f"up to {layers} triangles lie behind each other, and Cycles follows a ray through {MAX_LAYERS}:"
-        f" beyond, it is black ({share:.2%} of the pixels of a view are touched); draw fewer, with"
-        " --max-triangles on conversion, or a smaller part",
+        f"up to {layers} transparent triangles overlap, and Cycles has at most {MAX_LAYERS} transparent"
+        f" bounces: deeper ones are black ({share:.2%} of the pixels of a view are affected); use fewer"
+        " triangles (--max-triangles on conversion) or a smaller part",
         DataWarning,
         stacklevel=4,
     )

@@ -260,7 +260,7 @@ def warn_of_unseen(cloud: GaussianCloud) -> None:
     else:
         sizes = f"usually {np.median(scales):.2g} units, in a scene of {bounds.radius:.2g}"
         why = f"so small for their distances ({sizes})"
-        cure = "it looks like a scan of points, which has to be written with larger ones"
+        cure = "it looks like a point cloud: write it with larger splats"
     warnings.warn(
         f"hardly anything can be seen: the splats are {why} that they cover about {100 * shares[0]:.1g}% of"
         f" the pictures; {cure}",

@@ -30,10 +30,10 @@ COMMANDS = {
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, images side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),
     "train": ("meshsplats.cli.train:Train", "photographs to a mesh, without splats"),
-    "cameras": ("meshsplats.cli.cameras:Cameras", "from where a scene is to be seen, found from its splats"),
+    "cameras": ("meshsplats.cli.cameras:Cameras", "cameras that see a scene well, found from its splats"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
     "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
-    "tiles": ("meshsplats.cli.tiles:Tiles", "a 3D Tiles tileset of splats of any number"),
+    "tiles": ("meshsplats.cli.tiles:Tiles", "a 3D Tiles tileset of any number of splats"),
     "bake": ("meshsplats.cli.bake:Bake", "a mesh with its low-pass filter applied, for other programs"),
     "surface": ("meshsplats.cli.surface:Surface", "a light, textured mesh of the surface that splats form"),
     "prior": ("meshsplats.cli.prior:Prior", "splats bound to a classical mesh, trained and edited with it"),
@@ -164,7 +164,7 @@ def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
     if len(places) > 1:
         raise UsageError("- is standard input, which can be read once")
     if sys.stdin is None or sys.stdin.isatty():
-        raise UsageError("- reads standard input: redirect a file there, < scene.ply say")
+        raise UsageError("- reads standard input, a terminal here: redirect a file to it, as by < scene.ply")
     import shutil
     import tempfile
 

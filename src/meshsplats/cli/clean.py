@@ -29,9 +29,9 @@ class RuleOptions(CleaningRules):
 class Clean(Command):
     """Removes floaters: splats that are faint, far away, alone, or in small separate parts.
 
-    By default, walls and skies of a place stay, which the rules alone would take for floaters: it is looked
-    at from within. Prints what each rule removes. NAME.preview.png beside the result NAME shows before |
-    removed, in red | after.
+    By default, the walls and sky of a place stay, which the rules alone would take for floaters: panoramas
+    from inside tell them apart. Prints what each rule removes. NAME.preview.png beside the result NAME shows
+    before | removed, in red | after.
     """
 
     input: tyro.conf.Positional[Path]

@@ -117,7 +117,7 @@ def resumable(record: Path, *, force: bool) -> Iterator[None]:
     except (KeyboardInterrupt, Terminated, OSError, ClusterError) as error:
         if record.is_file() and not isinstance(error, FileExistsError):  # which says what to do itself
             how = "--resume in place of --force" if force else "--resume"
-            say(f"what is done stays: the same command with {how} continues")
+            say(f"finished work is kept: run the same command with {how} to continue")
         raise
 
 
@@ -165,7 +165,7 @@ def draw_preview(
     camera = camera or opening_camera(scene, how.get("threads"))
     if not save_preview(scene, path, camera, **how):
         count = layers(scene, camera)
-        say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
+        say(f"no preview: about {count:,.0f} layers overlap at each pixel, too slow to render")
 
 
 def named(path: Path) -> str:

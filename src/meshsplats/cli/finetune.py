@@ -96,7 +96,7 @@ class Finetune(TrainingCommand):
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
         """The command that scores the result on held-out views, or one that renders it if there are none."""
         if config.order == "file":
-            return ["web viewers and engines that cull back sides show this file; our own commands sort it"]
+            return ["for web viewers and engines with back-face culling; our own commands sort it"]
         target, dataset = self.target, plan.dataset
         if self.begin.conversion.crop is not None or (target.data is None and not dataset.test):
             return self.rendering_next()

@@ -25,8 +25,8 @@ class TileArguments(TilingOptions):
 
 @dataclass(frozen=True)
 class Tiles(Command):
-    """A 3D Tiles tileset of splats of any number: an octree of .glb files, fine ones for near and merged ones
-    for far, that viewers and engines (CesiumJS, Unreal, Unity, Omniverse) load as they need them.
+    """A 3D Tiles tileset of any number of splats: an octree of .glb files, fine ones nearby and merged ones
+    far away, that viewers and engines (CesiumJS, Unreal, Unity, Omniverse) load as they need them.
 
     Memory stays below 2 GB for any number of splats in most formats (not SOG, glTF, USD, zipped SPZ: see
     docs/tiles.md). An interrupted run is continued by --resume.

@@ -140,7 +140,7 @@ class TrainingCommand(Command):
             threads = None if self.device == "gpu" else thread_count(self.threads)
             factor = worthwhile_downscale(folder, minutes, threads, target.missing, target.masks)
             if factor > 1:
-                say(f"images: 1/{factor} of the photographs' sides, as time allows (--downscale 1: whole)")
+                say(f"images: downscaled by {factor}, to suit the time (--downscale 1: full resolution)")
         return replace(self, target=replace(target, downscale=factor))
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
@@ -196,7 +196,7 @@ class TrainingCommand(Command):
         try:
             self.save_more(files, plan, trained)  # which may fail: the mesh is there by now
         except Interrupted as stop:
-            say(f"stopped: {files.mesh} is there, the rest is not; --resume --force goes on to it")
+            say(f"stopped: {files.mesh} is written, the rest is not; add --resume --force to write it")
             return 128 + (stop.signal or signal.SIGINT)
         most = SCORED_VIEWS if self.has_photographs else self.target.held_out
         result = RunResult(files, trained, time.perf_counter() - start, scored, most, earlier)

@@ -35,8 +35,8 @@ class View(Command):
     """Shows splats or a mesh in the browser, exactly, the splats beside it for comparison; or a textured
     surface; or writes a page that anyone can open with a double click (-o scene.html).
 
-    Splats are converted to a mesh first, with default settings; very many are merged before. Nothing leaves
-    this machine: the browser gets the scene from 127.0.0.1 until Ctrl-C.
+    Splats are converted to a mesh first, with default settings; very large clouds are simplified before that.
+    Nothing leaves this machine: the browser loads the scene from 127.0.0.1 until Ctrl-C.
     """
 
     EXCLUSIVE = EXCLUSIVE

@@ -38,7 +38,7 @@ _WORDS = {
     "max_distance": "farther than {:g} radii",
     "max_size": "longer than {:g} radii",
     "sparse": "fewer than {:.1%} of the usual neighbours",
-    "min_part": "in parts below {:.1%} of all opacity",
+    "min_part": "in components below {:.1%} of all opacity",
     "all": "together",
     "surroundings": "kept, as they surround the place",
 }
@@ -140,8 +140,8 @@ def find(
         if most is not None and name in gone and count["opacity"] > most:
             gone[name] = np.zeros_like(gone[name])
             warnings.warn(
-                f"splats {_WORDS[name].format(vars(rules)[name])} have {count['opacity']:.0%} of it all: they"
-                f" are the scene, and stay; ``{name}`` removes them all the same",
+                f"splats {_WORDS[name].format(vars(rules)[name])} have {count['opacity']:.0%} of all opacity:"
+                f" they seem to be the scene itself and are kept; give ``{name}`` to remove them",
                 DataWarning,
                 stacklevel=3,
             )

@@ -27,8 +27,8 @@ class CleaningRules:
     """Fewer neighbours than this share of the median. 0.05 removes single floaters and thin
     clouds."""
     min_part: Annotated[float | None, Range(0, 1)] = None
-    """In a part that touches nothing else and has less than this share of all opacity. 0.01 removes
-    clumps in the air."""
+    """In a connected component with less than this share of all opacity. 0.01 removes clumps in the
+    air."""
 
     def __post_init__(self) -> None:
         check_options(self)

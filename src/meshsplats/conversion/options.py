@@ -140,7 +140,7 @@ class ConversionOptions:
             raise ValueError(f"sides must be even in mode 'crossed', got {self.sides}")
         if self.detail == "cameras":
             if not has_cameras:
-                raise ValueError("detail='cameras' needs cameras: give some, or choose even")
+                raise ValueError("detail='cameras' needs cameras: give some, or detail='even'")
             if self.mode != "flat" or self.rings != 1:
                 raise ValueError(
                     f"detail='cameras' needs mode 'flat' and rings 1, got mode {self.mode!r} and"

@@ -15,8 +15,8 @@ struct Neighbour {
     float weight;  // positive: it should lie before the one to be placed
 };
 
-// Behind the first k neighbours by their keys, the sum of their weights is right: the best place has the
-// greatest sum. Only those ranges of keys are sorted where it can be.
+// A unit that is placed after its first k neighbours, by their keys, satisfies the sum of their weights: the
+// best place has the greatest prefix sum. Only those ranges of keys are sorted in which it can lie.
 class Insertion {
   public:
     void clear() { all_.clear(); }

@@ -1,4 +1,5 @@
-// Rasterizes a mesh into one tile by the fragment: emits fragments in exact depth order at every sample.
+// Rasterizes a mesh into one tile with per-fragment sorting: emits fragments in exact depth order at every
+// sample.
 //
 // The groups of the tile list come nearest first. Fragments wait in one queue per block until they are nearer
 // than everything still to come. So the result does not depend on the order in which triangles arrive.

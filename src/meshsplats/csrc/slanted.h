@@ -1,5 +1,6 @@
-// Slanted windows (Bleyer, Rhemann and Rother 2011): each pixel has a plane, inverse depth and its slope in
-// the image, which is improved by the planes of others nearby and by small random changes.
+// PatchMatch stereo with slanted support windows (Bleyer, Rhemann and Rother 2011): each pixel has a plane,
+// inverse depth and its slope in the image, improved by propagation from pixels nearby and by small random
+// perturbations.
 #pragma once
 
 #include "parallel.h"

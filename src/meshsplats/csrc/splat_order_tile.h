@@ -1,5 +1,5 @@
-// Rasterizes a mesh into one tile by the splat, or as its triangles are listed: blends whole groups in the
-// order of the tile list.
+// Rasterizes a mesh into one tile with per-splat sorting, or in the order of a file (DrawOrder): blends whole
+// groups in the order of the tile list.
 //
 // The triangles of a group are blended from the last to the first, as if splats were painted far to near,
 // each triangle over those before it. Nothing waits: what arrives lies behind everything that is blended.

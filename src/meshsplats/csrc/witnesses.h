@@ -1,4 +1,5 @@
-// What depth maps of several views say of each other's depths and of points, and depths between known ones.
+// Geometric consistency of the depth maps of several views, with each other and with points; and filling of
+// the gaps between known depths.
 #pragma once
 
 #include "photos.h"

@@ -367,8 +367,8 @@ class Album:
         near = self._near() if self.missing else ""
         for names, text in (
             (self.missing, f"images are missing{near}; their views are left out"),
-            (self.renamed, "images have another name than the file gives them, and are taken"),
-            (self.no_mask, "images have no mask and count wholly"),
+            (self.renamed, "images were found under other names than the file gives, and are used"),
+            (self.no_mask, "images have no mask, so all their pixels count"),
             (
                 self.unclear,
                 "masks are of photographs taken upside down, or of turned square ones, and are used as these"

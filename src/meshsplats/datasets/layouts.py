@@ -213,7 +213,7 @@ def what_is_there(path: Path) -> str:
     if "sparse" in names:
         return "sparse/ holds no cameras and images, .bin or .txt: was the reconstruction finished?"
     if "database.db" in names:
-        return "COLMAP's data base without a sparse model: run its mapper first"
+        return "a COLMAP database without a sparse model: run the mapper first (colmap mapper)"
     if any(name.startswith("point_cloud") for name in names):
         return "a trained model, not the photographs it was trained on"
     if path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent):

@@ -383,7 +383,7 @@ def check_shape(lens: Lens, header: Header, path: Path) -> None:
     width, height = header.width, header.height
     turned = ""
     if abs(_stretch(lens, header) / (width / height) ** 2 - 1) < 0.05:
-        turned = ". It is turned: cameras belong to images as they are stored, before any rotation"
+        turned = ". It is rotated: cameras belong to images as stored, before their EXIF orientation"
     raise FileFormatError(
         f"{path}: {width} x {height} pixels do not fit its camera, which took {lens.width} x"
         f" {lens.height}{turned}"

@@ -106,7 +106,7 @@ def with_clear_pixels_masked(dataset: Dataset) -> Dataset:
     if not odd:
         return dataset
     warnings.warn(
-        f"{len(odd)} of {len(dataset.views)} photographs have clear pixels, though no subject is cut out:"
+        f"{len(odd)} of {len(dataset.views)} photographs have transparent pixels, but no cut-out subject:"
         f" {', '.join(odd[:SHOWN])}{', ...' if len(odd) > SHOWN else ''}. These pixels do not count",
         DataWarning,
         stacklevel=3,

@@ -67,8 +67,8 @@ def read_transforms(path: Path) -> Transforms:
         moved = [f"{a}: {b}" for a, b in pairs if b and leads_out(a) and not leads_out(b)]
         if moved:
             warnings.warn(
-                f"{path}: {len(moved)} {what} have paths of another place, and are taken from this folder by"
-                f" the last parts of these ({moved[0][:200]})",
+                f"{path}: {len(moved)} {what} have paths of another machine; files of this folder that end in"
+                f" the same parts are used instead ({moved[0][:200]})",
                 DataWarning,
                 stacklevel=2,
             )

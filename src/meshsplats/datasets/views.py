@@ -37,8 +37,8 @@ class ViewImage:
     """The image of one view. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
 
     color: np.ndarray
-    """(h, w, 3) RGB as it is on black, so times alpha where there is one (the straight RGB of a .png file is
-    not, and refused): uint8 (255 is 1), or float16 or float32 in units of 1."""
+    """(h, w, 3) RGB, premultiplied by alpha where there is one (straight RGB, as of a .png file, is refused):
+    uint8 (255 is 1), or float16 or float32 with white at 1."""
     alpha: np.ndarray | None = None
     """(h, w) opacity, of the same type; None: opaque, as photographs are."""
     mask: np.ndarray | None = None
@@ -263,8 +263,8 @@ def check_counting(views: Sequence[View]) -> None:
     """ValueError if no pixel of any of ``views`` counts. Reads those with masks, up to one that has some."""
     if views and not any(map(_counts, views)):
         raise ValueError(
-            f"no pixel of the {len(views)} training views counts: their masks are dark throughout, and light"
-            " pixels count (128 of 255 or more)"
+            f"all pixels of the {len(views)} training views are masked out: their masks are black throughout,"
+            " and only white pixels (128 of 255 or more) count"
         )
 
 
@@ -314,8 +314,8 @@ def _check_premultiplied(color: np.ndarray, alpha: np.ndarray) -> None:
     bright = (colors > most[:, None]).any(axis=1)
     if bright.sum() > _MOST_BRIGHT * len(faint):
         raise ValueError(
-            "color must be times alpha (premultiplied), as it is on black, but is bright where alpha is about"
-            " 0: give color * alpha[..., None], of bytes divided by 255"
+            "color must be premultiplied by alpha, but is bright where alpha is near 0: give"
+            " color * alpha[..., None], where bytes are divided by 255 first"
         )
 
 

@@ -176,7 +176,7 @@ def evaluate(
     """Scores meshes, splats and images on the held-out views of ``dataset``, or on all views if it has none:
     with a DataWarning if they are photographs.
 
-    Images are clipped to [0, 1], and masked pixels do not count; held-out views without others are left out
+    Images are clipped to [0, 1], and masked pixels do not count; fully masked held-out views are left out
     (``Dataset.scorable``). Ground truth with alpha is composited over ``View.background``, and everything is
     rendered over it. For photographs without alpha it has to be the background that the splats were trained
     with (``find_background``, ``Dataset.over``).

@@ -144,7 +144,7 @@ _COLUMNS = {
     "median PSNR": ("median", "psnr", 2),
     "SSIM": ("mean", "ssim", 4),
     "LPIPS": ("mean", "lpips", 4),
-    "PSNR fitted": ("mean", "psnr_exposure", 2),
+    "PSNR colour-corrected": ("mean", "psnr_exposure", 2),
     "floater px": ("mean", "floaters", 1),
 }
 """Header: statistic, score and number of digits."""

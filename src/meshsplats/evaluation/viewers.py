@@ -124,8 +124,8 @@ def choose_alpha(
     cheap = [small for view in views if (small := affordable(mesh, view, _SAMPLES, FRAGMENTS))]
     if not cheap:
         warnings.warn(
-            f"the alpha mode is not measured but 'blend': about {layers(mesh, views[0]):,.0f} layers would"
-            " lie over each other at each pixel of the images",
+            f"the alpha mode is 'blend', without measurement: about {layers(mesh, views[0]):,.0f} layers"
+            " overlap at each pixel of the images, which would take too long to render",
             DataWarning,
             stacklevel=2,
         )

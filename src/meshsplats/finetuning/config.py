@@ -74,14 +74,15 @@ class FinetuneConfig:
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
     as in the paper."""
     position_pixels: Annotated[float, Range(0, 1e6), With(opacity="blended"), Advanced] = 2.0
-    """Greatest size of a splat as that unit, in pixels of the training images that see it: what a step learns
-    at the edges of larger ones is as fine as pixels are. 0: without a limit. For opacity 'blended': edges
-    that are visible tell more."""
+    """Upper limit of that unit, in pixels of the training images that see the splat: at the edges of larger
+    splats, what a step learns is as fine as pixels. 0: no limit. For opacity 'blended' only, as visible
+    edges carry more information."""
     soft_edges: Annotated[bool, Advanced] = True
     """Keep opacities of 0 on the boundary of the mesh, such as the rims of fans, at 0. Visible edges get no
     gradient that would move them back, and opacities, which are clamped at 0, would drift upwards there."""
     final_share: Annotated[float, Range(1e-6, 1), Advanced] = 0.1
-    """Exponential decay: both learning rates fall to this fraction of their initial value over the run."""
+    """Exponential learning-rate decay: both rates fall to this fraction of their initial value over the run
+    (3DGS: position_lr_final / position_lr_init)."""
     rate_steps: Annotated[int, Range(0, 10**9), Advanced] = 250
     """In runs of more steps than this, multiply the learning rate of positions, and the final fraction of
     both, by ``sqrt(rate_steps / steps)``: the step size that a short run needs is noise in a long one. 0:
@@ -141,8 +142,8 @@ class FinetuneConfig:
     """Before this last fraction of the run, triangles that the training views do not show are removed.
     Default: 0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
     hidden_hits: Annotated[int, Range(0, 10**9), With(opacity="cutoff"), Advanced] = 1
-    """Triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples a pixel, are
-    removed. 0: none."""
+    """Remove triangles that are visible at fewer samples than this, counted over 64 training views with 2 x 2
+    samples a pixel. 0: none."""
     opaque_share: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 1.0
     """Largest number of opaque triangles, as a fraction of the number at the start. Splats become polygons of
     fewer corners, down to one triangle; the least visible ones go. 1: all stay."""
@@ -167,8 +168,8 @@ class FinetuneConfig:
     or 'file', and for meshes that do not know their splats."""
     dropout: Annotated[float | None, Range(0, 0.5), With(opacity="blended"), Advanced] = 0.0
     """Share of the splats that each step leaves out, at random, once each view was seen forty times; none
-    until it was seen ten times. The others are more opaque by as much. Few photographs are learnt by heart
-    else. Default of ``train``: 0.15 for up to thirty photographs, less for more, and 0 from sixty on."""
+    until it was seen ten times. The others are more opaque by as much. Few photographs are overfitted
+    otherwise. Default of ``train``: 0.15 for up to thirty photographs, less for more, and 0 from sixty on."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of the order of the views, of random backgrounds and of what is left out. The same seed gives the
     same bits, with any number of threads, unless the length is given in minutes."""

@@ -143,4 +143,4 @@ def check_loss(loss: Loss, config: FinetuneConfig, changes: Mapping[str, object]
     # With opacity 'cutoff', l2_weight weighs the expected error, too.
     for name in ("ssim_weight", "l2_weight"):
         if name in changes and not (name == "l2_weight" and config.expected_share and config.cuts):
-            raise ValueError(f"{name} weighs the default loss: leave it out, or the loss of your own")
+            raise ValueError(f"{name} is a weight of the default loss: leave out either it or your own loss")

@@ -178,6 +178,6 @@ def _sizes_in_words(sizes: SizeScores | None, steps: int | None) -> Iterator[str
         where = ", ".join(str(width) for width in sizes.worse_at)
         count = f"{steps or 0:,} step" + ("" if steps == 1 else "s")
         yield f"the conversion is written: after {count}, the mesh was worse at {where} px;"
-        yield "  a longer run helps, a new one rather than ``resume``, which keeps the start of a short one"
+        yield "  start a longer run; ``resume`` would keep the starting mesh of the short one"
     elif steps == 0:
         yield "there was no time for steps: this is the mesh at the start; more ``minutes`` help"

@@ -111,7 +111,7 @@ class Job:
     def _other_input(self, output: Path) -> str:
         """Why ``output``, which exists, may have been made from another input; empty if nothing tells so."""
         if self.shown == "-":
-            return "of another standard input, for all that is known"
+            return "perhaps made from another standard input"
         return "older than its input" if output.stat().st_mtime < file_of(self.source).stat().st_mtime else ""
 
 

@@ -95,8 +95,8 @@ class ChainOptions:
     alpha: Literal["auto", "blend", "mask", "opaque", "ordered"] = "auto"
     """.glb: auto: blend or mask for all levels, whichever brings the first one nearer to the sorted image in
     viewers that do not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format):
-    solid triangles, cut at 20 %. ordered: triangles in an order of blending that the levels are tuned
-    through, for web viewers and engines that cull back sides."""
+    solid triangles, cut at 20 %. ordered: triangles in a fixed blending order, with which the levels are
+    tuned, for web viewers and engines with back-face culling."""
     order: Order | None = None
     """In which triangles are blended and tuned; None: that of the meshes and of the configuration."""
     sh_degree: int | None = None

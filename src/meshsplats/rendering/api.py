@@ -29,7 +29,8 @@ class Rendering:
     alpha: np.ndarray
     """(h, w) float32 in [0, 1]: 1 minus the transmittance that is left for the background."""
     depth: np.ndarray | None = None
-    """(h, w) float32 camera depth z, summed with the blending weights of colour; see ``mean_depth``."""
+    """(h, w) float32 accumulated depth: camera z summed with the blending weights of colour, as render mode D
+    of gsplat; ``mean_depth`` is the expected depth, ED."""
     normals: np.ndarray | None = None
     """(h, w, 3) float32 world-frame unit normals that face the camera, summed with the same weights."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -37,8 +38,8 @@ class Rendering:
     fragments: int = 0
     """Count of blended fragments: triangles, or splats, at samples."""
     median_depth: np.ndarray | None = None
-    """(h, w) float32 camera depth z of the fragment that leaves half or less of the light, the mean of the
-    samples that have one; infinite in pixels where fewer than half of them have."""
+    """(h, w) float32 camera depth z of the first fragment behind which the transmittance is 0.5 or less, mean
+    over the samples that have one; infinite in pixels where fewer than half of them do."""
 
     def __repr__(self) -> str:
         height, width = self.alpha.shape
@@ -48,7 +49,7 @@ class Rendering:
         return f"Rendering({', '.join([size, f'{self.fragments:,} fragments', *more, *named])})"
 
     def mean_depth(self, *, min_alpha: float = 0.0, empty: float = np.inf) -> np.ndarray:
-        """(h, w) float32 mean depth z of the fragments in each pixel, weighted as their colours are.
+        """(h, w) float32 expected depth: mean camera z of the fragments, weighted as their colours are.
 
         Args:
             min_alpha: pixels whose alpha is not above this are empty.
@@ -89,9 +90,9 @@ def render(
     rule). Triangles are visible from both sides and are clipped at the near plane.
 
     With the order 'splat', whole splats are blended by the depth of their centres, as 3D Gaussian Splatting
-    does. A centre is the mean of the corners of the splat's triangles. Of splats at one depth the later is in
-    front, and so are the later triangles of a splat: the image of splats that are painted far to near, with
-    their triangles in their order. Depth groups have no effect. This takes less time.
+    does. A centre is the mean of the corners of the splat's triangles. At equal
+    depth the splat with the higher index is in front, and within a splat the later triangle: as with the
+    painter's algorithm, back to front, triangles in list order. Depth groups have no effect. This is faster.
 
     A mesh with a low-pass filter of s = ``filter_px2`` is drawn with the fan of each splat widened in screen
     space, as 3D Gaussian Splatting widens splats by 0.3 px^2 at any size of the image. With c and M the mean
@@ -112,7 +113,7 @@ def render(
         mesh: the triangles.
         camera: viewpoint, lens and size of the image.
         background: RGB, (3,) or (h, w, 3), in the space of the mesh's colours.
-        samples: side of the grid of samples in each pixel, 1 to 16; 2 means 2 x 2 samples, averaged.
+        samples: side of the supersampling grid in each pixel, 1 to 16; 2 means 2 x 2 samples, averaged.
         max_layers: blend at most this many of the nearest triangles at each sample, as depth peeling does
             with that many passes.
         min_transmittance: early termination of samples with less transmittance than this; 0: none.
@@ -245,8 +246,8 @@ def render_splats(
         sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default. Colours
             are clamped to 0 and above, as in 3DGS; those of degree 0 alone are ``cloud.colors``, clamped to
             [0, 1].
-        dilation: variance added to the projected covariance, square pixels. Models that were trained with
-            another one need theirs.
+        dilation: variance added to the projected covariance, square pixels (gsplat: ``eps2d``). Models that
+            were trained with another value need theirs.
         threads: at most this many; all processors by default. The result does not depend on it.
 
     Raises:

@@ -23,7 +23,7 @@ tiles that did not fit once more."""
 
 @dataclass(frozen=True)
 class OpacityRamp:
-    """A differentiable stand-in for the hard cut of ``render(mesh, camera, cutoff=...)``.
+    """A soft, differentiable alpha test in place of the hard one of ``render(mesh, camera, cutoff=...)``.
 
     The interpolated opacity a becomes ``clip(height + (a - cutoff) * k, 0, 1)`` with ``k = min(slope, 1 /
     (width |grad a|))``, where grad a is the gradient of a in the image, per pixel. Slope 1, height = cutoff

@@ -70,7 +70,7 @@ def announce_cost(
     if (seconds := estimated_seconds(scene, cameras if many else [camera], samples, threads)) > LONG_SECONDS:
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         if many:
-            say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
+            say(f"about {count:,.0f} layers overlap at each pixel (overdraw): this may take {long}")
         else:
             size = f"{camera.width:,} x {camera.height:,} pixels of {samples} x {samples} samples"
             say(f"{size} take about {long} or more")

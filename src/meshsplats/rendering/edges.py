@@ -1,4 +1,4 @@
-"""Gradients by the motion of edges, for meshes that are drawn with a depth buffer.
+"""Visibility (boundary) gradients, by the motion of edges, for meshes that are drawn with a depth buffer.
 
 The gradients of ``backward.py`` take the fragments of each sample as constant. That is right where opacities
 fall to 0 at the rim of a surface, but an opaque triangle also covers other samples when it moves: an edge

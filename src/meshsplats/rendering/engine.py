@@ -32,7 +32,7 @@ Need = Literal[
 ]
 """What a run may ask of steps beyond positions and colours that follow the default loss: gradients for a
 cutoff; positions on a base mesh; exposures of images; blending in linear light; opacities that decay; fans
-that are rounded between steps; vertices that stay; triangles that share a depth; a loss of one's own; colours
+that are rounded between steps; frozen vertices; triangles that share a depth; a custom loss; colours
 that depend on the view; the order of a file; splats that a step leaves out."""
 
 

@@ -46,9 +46,9 @@ RUN_BY_RUN: frozenset[Need] = frozenset(
         "dropout",
     )
 )
-"""What whole steps do not know. Such runs take the rest of each step themselves, with images and gradients
-from here; so do those with images of more than ``most_pixels`` pixels, or with harmonics that do not fit.
-Meshes that do not fit are in ``gradients.check_limits``."""
+"""Needs that fused steps do not support. Such runs compute the loss and the update themselves, with images
+and gradients from here; so do those with images of more than ``most_pixels`` pixels, or with harmonics that
+do not fit. Meshes that do not fit are in ``gradients.check_limits``."""
 
 
 class GpuEngine:

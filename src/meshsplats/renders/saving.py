@@ -148,7 +148,7 @@ class ImageRun:
             raise OptionValueError(f"{self.source} is a mesh: ``as_splats`` needs a splat file")
         if self.options.draw.sh_degree is not None and not self.options.as_splats:
             raise OptionsError(
-                "``sh_degree`` is for splats: a mesh has one colour per vertex; add ``as_splats``"
+                "``sh_degree`` limits the harmonics of splats: add ``as_splats`` to render them"
             )
 
     def _drawable(self, scene: GaussianCloud | SplatMesh) -> GaussianCloud | SplatMesh:

@@ -432,8 +432,8 @@ def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
         )
     if px2 > 0 and face_splat is None:
         raise ValueError(
-            f"a filter of {px2:g} px^2 widens the triangles of each splat together, but the mesh does not"
-            " know its splats: give face_splat, or filter_px2=0"
+            f"a filter of {px2:g} px^2 widens the triangles of each splat together, but the mesh has no"
+            " face_splat: give it one, or filter_px2=0"
         )
     return float(px2)
 

@@ -21,7 +21,7 @@ def checked_order(order: str, face_splat: np.ndarray | None) -> Order:
         raise ValueError(f"order must be {' or '.join(map(repr, get_args(Order)))}, got {order!r}")
     if order == "splat" and face_splat is None:
         raise ValueError(
-            "order='splat' blends whole splats, but the mesh does not know its splats: give face_splat, or"
+            "order='splat' blends whole splats, but the mesh has no face_splat: give it one, or"
             " order='fragment'"
         )
     return order  # type: ignore[return-value]

@@ -30,7 +30,7 @@ _SHARE = 0.05
 """Share of the positions at either end that do not count for the extent: outliers."""
 
 
-_LOST = "detail is lost; double coordinates, or a point nearby that they are relative to, keep it"
+_LOST = "precision is lost; double coordinates, or coordinates relative to a point nearby, keep it"
 
 
 def zero_origin() -> np.ndarray:

@@ -58,8 +58,8 @@ class SurfaceFileOptions:
     image: base_meshes.TextureImage | None = None
     """File of the texture. Default: png, or jpg where that is large and the format knows it."""
     collision: base_meshes.Collision | None = None
-    """Mark the surface as a static collider for engines. drawn (.glb, USD): it is drawn, too; only (.glb,
-    USD): it is not; convex (.glb): it is drawn, and convex parts of it are its collider in Unreal. Default:
+    """Mark the surface as a static collider for engines. drawn (.glb, USD): rendered, too; only (.glb, USD):
+    not rendered; convex (.glb): rendered, its convex decomposition being the collider in Unreal. Default:
     no collider."""
     scale: float | None = None
     """Multiply all lengths: a scene unit of .stl and .3mf is a millimetre."""

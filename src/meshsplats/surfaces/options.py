@@ -35,8 +35,8 @@ class SurfaceOptions:
     normal_map: Annotated[bool, With("texture")] = True
     """Keep the relief of the finest triangles as a normal map, of a quarter of the texture's side."""
     shape: Shape = "auto"
-    """closed: a solid that can be seen from all sides; what no image sees becomes interior. open: only what
-    images see, for rooms, streets and gardens. floor: open, but for the ground below and between the views,
+    """closed: watertight, a solid for all sides; what no image sees becomes interior. open: only what images
+    see, for rooms, streets and gardens. floor: open, but for the ground below and between the views,
     for walking. auto: closed for objects, open for places."""
     resolution: Annotated[int | None, Range(8, MAX_RESOLUTION)] = None
     """Voxels along the longest side, from whose surface triangles are made. Memory grows with its cube.

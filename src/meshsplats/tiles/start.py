@@ -38,7 +38,7 @@ def need_each_once(paths: Sequence[Path]) -> None:
         other = seen.setdefault(os.path.realpath(path), path)
         if other is not path:
             names = f"{path} is given twice" if other == path else f"{other} and {path} are one file"
-            raise ValueError(f"{names}: its splats would lie upon themselves; name it once")
+            raise ValueError(f"{names}: its splats would be there twice; give it once")
 
 
 def need_other_folder(paths: Sequence[Path], folder: Path) -> None:

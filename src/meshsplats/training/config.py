@@ -49,8 +49,8 @@ class TrainConfig(FinetuneConfig):
     opacity_decay: float = 0.003
     dropout: float | None = None
     epsilon: float = 1e-8
-    """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a
-    pixel that has an error: what views hardly reach, at their borders, does not take whole steps."""
+    """Adam's epsilon for colours, added to the denominator. It is large, about 1/100 of the gradient of a
+    wrong pixel, so that vertices that views hardly reach, at their borders, take small steps."""
     exposure_rate: float = 0.01
     max_splats: Annotated[int | None, Range(1, 10**7)] = None
     """Largest number of fans. Default: 100,000; of large sets of unmasked photographs up to 200,000, one for
@@ -67,13 +67,13 @@ class TrainConfig(FinetuneConfig):
     learning rate does. Six corners that move freely show each photograph what it alone has; held-out ones
     lose. 0: they move freely."""
     growth_events: Annotated[int, Range(0, 1000), Advanced] = 6
-    """Number of times that fans are halved and dropped. 0: their set stays as it is."""
+    """Number of densification steps, in which fans are split and pruned. 0: none."""
     growth_end: Annotated[float, Range(0, 1), Advanced] = 0.5
-    """Share of the run at the last of these times."""
+    """Share of the run after which densification ends (3DGS: densify_until_iter)."""
     quarter_share: Annotated[float, Range(0, 1), Advanced] = 0.1
-    """First share of the run, in which images have a quarter of the photographs' sides."""
+    """Share of the run, from its start, with images at 1/4 of the resolution (coarse to fine)."""
     half_share: Annotated[float, Range(0, 1), Advanced] = 0.6
-    """Share of the run until which they have half of them; then they have all."""
+    """Share of the run until which images have 1/2 of the resolution; afterwards, all of it."""
     background: BackgroundMode = "mixed"
     """Background of the images. random: a new colour in every step, which masked photographs show around the
     subject, and others where nothing covers it. mixed: random in every fourth step, otherwise that of the

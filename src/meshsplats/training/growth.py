@@ -1,4 +1,5 @@
-"""Growth: fans that no view shows are dropped, and those that several views find wrong are halved."""
+"""Growth (densification in 3DGS): fans that no view shows are pruned, and those in which several views find
+errors are split in two."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Which photographs are matched with each other where all pairs are too many: those that look alike, and
 those that follow each other.
 
-Photographs look alike that have rare features in common. Features are counted as words of a vocabulary, which
-is made of the photographs themselves (Sivic and Zisserman 2003: Video Google).
+Image retrieval by bags of visual words (Sivic and Zisserman 2003: Video Google), as COLMAP's vocabulary
+tree matching: photographs look alike that share rare features. The vocabulary is made of the photographs.
 """
 
 from __future__ import annotations

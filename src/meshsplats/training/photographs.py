@@ -35,12 +35,12 @@ class PhotographOptions:
     test_every: int = 8
     """Every n-th view is held out for scores, if the data set has no split; 0: none."""
     missing: Missing = "few"
-    """Missing photographs are left out (skip), if they are fewer than half (few), or an error."""
+    """Missing photographs: skip: left out; few: left out if fewer than half are missing; error: refused."""
     masks: Masks = "count"
-    """Only pixels inside of masks count, or what is outside is clear, as in photographs that were cut out."""
+    """count: pixels outside the masks are ignored; subject: they are transparent, as in cut-outs."""
     estimate_cameras: bool = False
-    """Find the cameras of the photographs though the folder holds some of a kind that is not read, or those
-    that were found of fewer photographs."""
+    """Run structure from motion although the folder has cameras: in a format that is not read, or found
+    earlier, for fewer photographs."""
     frames: int | None = None
     """Frames to take of a video. Default: two per second, 40 to 120."""
     cache: float = 2.0

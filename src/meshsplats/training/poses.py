@@ -15,7 +15,7 @@ import numpy as np
 from meshsplats._common.words import plural
 
 GROWTH = 1.4
-"""All cameras are adjusted together again when there are so many times as many, or as many points."""
+"""Growth of cameras or points that triggers the next global bundle adjustment (COLMAP: ba_global_*_ratio)."""
 REFINEMENTS = 2
 """Times that they are, at most. With COLMAP's defaults, 1.1 and 5, poses take a third longer, or several
 times as long, and are not more exact."""
@@ -142,9 +142,7 @@ def find_poses(
         best = one_by_one()
         return best and best.without_outvoted()
     many = count >= MANY
-    first, second, way = (
-        (together, one_by_one, "one after the other") if many else (one_by_one, together, "all together")
-    )
+    first, second, way = (together, one_by_one, "incremental") if many else (one_by_one, together, "global")
     best = first()
     if best is not None and not best.doubtful:
         return best

@@ -218,7 +218,7 @@ def find_cameras(
     outvoted = [named[name] for name in poses.outvoted]
     lost = [path.name for path in photographs if path.name not in {*placed, *apart, *outvoted}]
     for names, text in (
-        (lost, "found no place among the others and are left out"),
+        (lost, "could not be registered with the others and are left out"),
         (outvoted, "were placed where most of their matches contradict it: left out"),
         *((group, "match each other, but nothing joins them to the rest: left out") for group in groups),
     ):
@@ -291,7 +291,7 @@ def _whole(folder: Path, photographs: list[Path], threads: int | None) -> dict[P
             f" not found here: {shortened(panoramas)}"
         )
         if len(flat) < max(FEWEST, len(panoramas)):
-            raise ValueError(f"{text}; export flat pictures of them, of 90 degrees, say")
+            raise ValueError(f"{text}; convert them to perspective images, such as 90-degree cube faces")
         warnings.warn(f"{text}; they are left out", DataWarning, stacklevel=3)
     return flat
 

@@ -146,8 +146,8 @@ def train(
         before, run = run.spent, replace(run, spent=run.spent + time.perf_counter() - began)
         if not run.resume and config.minutes is not None and run.spent > LATE * 60 * config.minutes:
             warnings.warn(
-                f"{run.spent / 60:.1f} of {config.minutes:g} minutes were over before the first step: more"
-                " ``minutes`` help (cameras are found only once)",
+                f"{run.spent / 60:.1f} of {config.minutes:g} minutes were spent before the first step: allow"
+                " more ``minutes`` (cameras are found only once)",
                 DataWarning,
                 stacklevel=2,
             )

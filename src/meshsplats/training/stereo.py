@@ -1,4 +1,5 @@
-"""Depths of photographs: each is matched with a few others, and what these do not confirm is dropped.
+"""Multi-view stereo: each photograph is matched with a few others, and depths that these do not confirm
+(geometric consistency) are dropped.
 
 The core sweeps planes at half the size and improves slanted windows at the whole (csrc/stereo.h). Here: which
 photographs are matched, which depths stay, and what is filled in between.

@@ -57,7 +57,7 @@ class Suspects:
         if self.doubles:
             names = [f"{one} and {other}" for one, other in self.doubles]
             lines.append(
-                f"the same photograph twice: {shortened(names)}. If one is held out, its score means nothing;"
+                f"duplicate photographs: {shortened(names)}. If one is held out, its score means nothing;"
                 " if their cameras differ, one is wrong"
             )
         return lines

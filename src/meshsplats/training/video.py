@@ -59,8 +59,8 @@ class Frames(NamedTuple):
     sharpness: np.ndarray
     """(n,) mean square of the Laplacian of the grey values."""
     motion: np.ndarray
-    """(n,) how much each frame differs from the one before, 0 for the first: about proportional to the way of
-    the camera where frames follow closely."""
+    """(n,) how much each frame differs from the one before, 0 for the first: roughly proportional to the
+    distance that the camera moves between close frames."""
     seconds: float
     """Length of the video."""
 
@@ -111,9 +111,9 @@ def save_frames(
 ) -> int:
     """Writes the ``count`` best frames of ``video`` as JPEG files to ``folder``/images, whole or not at all.
 
-    The way of the camera is divided into as many equal parts, and the sharpest frame of each is taken.
-    Frames are turned and stretched as players show them, and of interlaced ones the later lines are made of
-    the earlier.
+    The camera path is divided into ``count`` equal parts, and the sharpest frame of each is taken. Frames are
+    rotated and scaled to square pixels as players show them; interlaced ones are deinterlaced, from the
+    earlier field.
 
     Args:
         count: number of frames; None: two per second, 40 to 120.
@@ -344,8 +344,8 @@ def _one_field(frame: Any, video: Path) -> Any:
         return graph.pull()
     except FFmpegError as error:
         raise FileFormatError(
-            f"{video}: is interlaced, and its frames of {frame.format.name} cannot be mended"
-            f" ({error.strerror}): deinterlace it first, with ffmpeg -vf bwdif, for one"
+            f"{video}: is interlaced, and frames of format {frame.format.name} cannot be deinterlaced here"
+            f" ({error.strerror}): deinterlace it first, for example with ffmpeg -vf bwdif"
         ) from None
 
 

@@ -69,9 +69,9 @@ class FoundCameras:
     """What ``find_cameras`` found, in the frame of the splats."""
 
     kind: Kind
-    """'object': seen from all around, against nothing. 'relief': a photograph whose pixels were given
-    depth, seen from where it was taken. 'ring': a subject in its surroundings, photographed from a ring
-    of cameras or part of one. 'place': seen from within. 'aerial': a landscape from above."""
+    """'object': an isolated object, seen from all around. 'relief': one image with depth (2.5D), seen from
+    its camera. 'ring': an unbounded scene around a subject, inward-facing cameras. 'place': indoor or
+    outward-facing, seen from within. 'aerial': a landscape from above."""
     confidence: float
     """How sure the kind is, 0 to 1."""
     up: np.ndarray
@@ -92,7 +92,7 @@ class FoundCameras:
         told = "sure" if self.up_confidence >= 0.6 else "likely" if self.up_confidence > 0 else "the default"
         what = {
             "object": "an object",
-            "relief": "a relief, a photograph with depth, seen from its front",
+            "relief": "a single image with depth (2.5D), seen from its camera",
             "ring": "a subject in its surroundings",
             "place": "a place, seen from within",
             "aerial": "a landscape from above",

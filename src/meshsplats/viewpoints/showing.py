@@ -125,7 +125,7 @@ def default_views(
     if found.kind == "object":
         return None
     if film:
-        words = f"seen on a round through {len(found.cameras)} views that were found"
+        words = f"seen along a closed camera path through {len(found.cameras)} of the views found"
         return walk(found.cameras, count, found.up), f"{found.in_words()}: {words}"
     start = source if cloud is scene else None
     return opened_with(found.cameras, start, cloud.origin, side), found.seen_in_words()

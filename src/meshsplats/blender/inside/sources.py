@@ -66,7 +66,7 @@ def _state(obj: Any) -> str:
 def check_own(obj: Any) -> None:
     """Raises ValueError if the splats of ``obj`` cannot be converted instead of its file."""
     if priors.base_of(obj) is not None:
-        raise ValueError(_refusal(obj.name, "its splats hang on a base, which another conversion would lose"))
+        raise ValueError(_refusal(obj.name, "its splats are bound to a base, which converting would lose"))
 
 
 def own_splats(mesh: SplatMesh, name: str) -> GaussianCloud:

@@ -112,7 +112,7 @@ def restored(
             else:
                 attributes[key] = values[:, 0] if columns is None else values
     if lost:
-        warn(f"{document.path}: another program has altered the file, left out: {', '.join(lost)}")
+        warn(f"{document.path}: another program has changed the file, so this is ignored: {', '.join(lost)}")
     return result | {"attributes": attributes}
 
 

@@ -118,7 +118,7 @@ def _warn_of_sizes(cloud: GaussianCloud, where: object) -> None:
     larger = int((sizes[:, 1] < _SMALLEST / _STEP).sum()) if shows else 0
     if smaller or larger:
         warnings.warn(
-            f"{where}: SPZ stores deviations from {_SMALLEST:.2g} to {_LARGEST:.0f} scene units; {larger:,}"
+            f"{where}: SPZ stores scales from {_SMALLEST:.2g} to {_LARGEST:.0f} scene units; {larger:,}"
             f" visible splats become larger and {smaller:,} smaller: .sog and .ply keep their sizes, or scale"
             " the scene",
             DataWarning,

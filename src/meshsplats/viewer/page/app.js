@@ -155,9 +155,9 @@ export class App extends Pilot {
     exact.kept = this.kept;
     const left = exact.add(level, this.levels[level]);
     if (left) {
-      say(`WebGPU takes buffers of ${Math.round(exact.most / 2 ** 20)} MiB here:` +
-        ` the exact image lacks the ${(100 * left).toFixed(left < 0.1 ? 1 : 0)} % of the triangles` +
-        " that show least.");
+      say(`WebGPU limits buffers to ${Math.round(exact.most / 2 ** 20)} MiB on this device:` +
+        ` the exact image leaves out ${(100 * left).toFixed(left < 0.1 ? 1 : 0)} % of the triangles,` +
+        " those that contribute least.");
     }
   }
 

@@ -73,7 +73,7 @@ export class SortedRenderer {
   // Those of a mesh, where a texture holds them.
   #harmonicsOf({ harmonics }) {
     if (!harmonics || harmonics.values.length / 3 <= WIDTH * this.longest) return harmonics;
-    this.note("WebGL draws without colours that depend on the view: its textures do not hold so many here.");
+    this.note("WebGL draws without view-dependent colour: its textures are too small for it on this device.");
     return null;
   }
 
