@@ -9,7 +9,7 @@ For each scene the surface with default options, by images of degree 0. Its imag
 compared with those of the splats (degree 0, means over areas, on white) from the standard cameras, eight of
 400 pixels at the given distances; places from the first eight views that are found, from which no surface is
 made. lego is fitted to photographs and compared with those that are held out.
-"colours" is the same surface with colours of vertices, as fused; "opaque" are the splats' own images, each
+"colours" is the same surface with vertex colours, as fused; "opaque" are the splats' own images, each
 pixel opaque in its own colour or white: what an opaque surface of these colours could reach at best. With
 --fans the splats as triangles are compared in place of surfaces: `convert`, no fine-tuning, `.glb`.
 

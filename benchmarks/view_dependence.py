@@ -1,4 +1,4 @@
-"""What colours that depend on the view are worth and cost, by degree of the harmonics.
+"""What view-dependent colours are worth and cost, by degree of the harmonics.
 
     python benchmarks/view_dependence.py --data ../shared/data
     python benchmarks/view_dependence.py --data ../shared/data --splats FILE --steps 150

@@ -15,7 +15,7 @@ opacities, windows of the image, fragments on the tape and triangles in tiles, d
 megabytes of buffers, and milliseconds of the image, of its backward pass, and of both on the core: by the
 clock, and of the processor.
 
-With --steps, whole steps of fine-tuning on eight views of the mesh itself with other colours: milliseconds by
+With --steps, fused steps of fine-tuning on eight views of the mesh itself with other colours: milliseconds by
 the clock of a step on the GPU and on the core, medians of the second half, and the losses of both at the end.
 """
 

@@ -97,7 +97,7 @@ class NoColorsWarning(DataWarning):
 
 
 class NoTextureWarning(DataWarning):
-    """The textures of a mesh file were left out, or became colours of vertices."""
+    """The textures of a mesh file were left out, or became vertex colours."""
 
 
 class AnimationWarning(DataWarning):

@@ -1,5 +1,5 @@
 # ruff: noqa: E402
-"""Colours that depend on the view in Blender: unlit images are those of ``render``; they are read back."""
+"""View-dependent colours in Blender: unlit images are those of ``render``; they are read back."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from PIL import Image
 import meshsplats as ms
 from meshsplats.cli import main
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.datasets.image_files import Shelf
+from meshsplats.datasets.image_files import ImageIndex
 from meshsplats.datasets.layouts import find_layout, unread_cameras
 from meshsplats.datasets.points import load_points
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
@@ -308,8 +308,8 @@ def test_names_stay_inside_the_folder(tmp_path):
     save(tmp_path / "secret.png", np.zeros((8, 12, 3), np.uint8))
     inner = tmp_path / "set"
     pictures(inner / "images", ["a.png"])
-    assert Shelf(inner).alike("../secret.jpg") == []
-    assert Shelf(inner).alike(str(tmp_path / "secret.jpg")) == []
+    assert ImageIndex(inner).alike("../secret.jpg") == []
+    assert ImageIndex(inner).alike(str(tmp_path / "secret.jpg")) == []
     text_model(inner / "sparse/0", ["../../secret.jpg", "a.png"])
     with pytest.raises(FileFormatError, match="only files inside"):
         load_dataset(inner)

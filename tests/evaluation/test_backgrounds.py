@@ -23,7 +23,7 @@ from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
-from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_other_worlds
+from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_frame_mismatch
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh
@@ -164,12 +164,12 @@ def test_images_of_something_else_are_reported(cloud):
     data = photographs(cloud, COLORS["black"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_other_worlds(find_background(data, {"splats": cloud}))
+        warn_of_frame_mismatch(find_background(data, {"splats": cloud}))
     noise = np.random.default_rng(0)
     other = [View(v.camera, ViewImage(noise.random((32, 32, 3), np.float32))) for v in data.train]
     found = find_background(Dataset(tuple(other)), {"splats": cloud})
     with pytest.warns(DataWarning, match=r"splats shows almost nothing of the photographs \(\d+\.\d dB\)"):
-        warn_of_other_worlds(found)
+        warn_of_frame_mismatch(found)
 
 
 def test_model_folders_name_their_background(tmp_path):

@@ -14,7 +14,7 @@ from _local import shared_data
 import meshsplats as ms
 from meshsplats import DataWarning, GaussianCloud
 from meshsplats.cameras.framing import scene_bounds
-from meshsplats.evaluation.backgrounds import ALIKE, find_background, warn_of_other_worlds
+from meshsplats.evaluation.backgrounds import ALIKE, find_background, warn_of_frame_mismatch
 
 FRAMES = "different frames, moved, rotated or scaled"
 SAME = "frames of cameras and scene agree, as coarse images are alike"
@@ -79,7 +79,7 @@ def test_the_reason_is_the_likely_one(name, change, reason):
     assert found.shown is not None
     assert (found.shown.likeness >= ALIKE) == (reason == SAME)
     with pytest.warns(DataWarning, match=reason):
-        warn_of_other_worlds(found)
+        warn_of_frame_mismatch(found)
 
 
 @pytest.mark.parametrize("name", ["statue", "toy"])
@@ -88,7 +88,7 @@ def test_scenes_in_their_own_frame_need_no_word(name):
     found = find_background(data, {"splats": cloud})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_other_worlds(found)
+        warn_of_frame_mismatch(found)
     assert found.shown is not None
     assert found.shown.likeness > 0.9
 
@@ -101,10 +101,10 @@ def test_empty_and_masked_scenes_have_a_reason(tmp_path):
     corners = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
     one = ms.SplatMesh(corners, np.array([[0, 1, 2]], np.int32), np.ones((3, 4)))
     with pytest.warns(DataWarning, match=f"the mesh shows almost nothing .* covers 0.0% .* 100% .* {EMPTY}"):
-        warn_of_other_worlds(find_background(data, {"mesh": one}))
+        warn_of_frame_mismatch(find_background(data, {"mesh": one}))
     behind = replace(one, vertices=one.vertices - np.float32([0, 0, 9]))
     with pytest.warns(DataWarning, match=FRAMES):
-        warn_of_other_worlds(find_background(data, {"mesh": behind}))
+        warn_of_frame_mismatch(find_background(data, {"mesh": behind}))
     hidden = ms.Dataset((ms.View(camera, ms.ViewImage(noise, None, np.zeros((32, 32), bool))),))
     found = find_background(hidden, {"mesh": one})
     assert found.shown is not None

@@ -71,7 +71,7 @@ OLD = "KHR_materials_pbrSpecularGlossiness"
     ],
 )
 def test_gltf_colours_that_are_no_base_colour(tmp_path, material, wanted):
-    """What a black material emits, which colours of vertices have no part in; the diffuse colour of old
+    """What a black material emits, which vertex colours have no part in; the diffuse colour of old
     files, unless there is a base colour, too."""
     document = gltf(
         [(TRIANGLE, "VEC3", False), (np.array([[0.5, 1, 0, 1]] * 3, "<f4"), "VEC4", False)],

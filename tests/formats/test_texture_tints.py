@@ -1,4 +1,4 @@
-"""Colours of vertices multiply the texture (glTF 2.0, 3.9.2), wherever it is shown or written."""
+"""Vertex colours multiply the texture (glTF 2.0, 3.9.2), wherever it is shown or written."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_translucent_tints_of_a_scene_are_blended(tmp_path):
 @pytest.mark.parametrize("suffix", [".obj", ".ply"])
 def test_what_other_formats_leave_out_is_told_of(tmp_path, suffix):
     path = tmp_path / f"surface{suffix}"
-    with pytest.warns(DataWarning, match=f"surface{suffix}: left out are the colours of vertices by which"):
+    with pytest.warns(DataWarning, match=f"surface{suffix}: left out are the vertex colours by which"):
         ms.save_base(tinted(), path)
     assert ms.load_base(path).textured
     with warnings.catch_warnings():

@@ -183,7 +183,7 @@ def test_a_surface_of_ours_comes_back(tmp_path, suffix, unlit):
 
 @pytest.mark.parametrize("lit", [False, True])
 def test_a_scene_of_ours_has_its_textures_again(tmp_path, parts, lit):
-    """Several of them, translucent and cut out, on some of the faces; colours of vertices on the others."""
+    """Several of them, translucent and cut out, on some of the faces; vertex colours on the others."""
     base = surface()
     pixels = base.textures[0].pixels
     cut, blended = pixels.copy(), np.random.default_rng(1).integers(0, 256, (6, 10, 4), np.uint8)

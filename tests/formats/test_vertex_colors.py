@@ -1,4 +1,4 @@
-"""Textures as colours of vertices: what is drawn with them is what the texture shows."""
+"""Textures as vertex colours: what is drawn with them is what the texture shows."""
 
 from __future__ import annotations
 

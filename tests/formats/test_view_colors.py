@@ -1,4 +1,4 @@
-"""Colours that depend on the view, in files: they come back, and other programs see plain ones."""
+"""View-dependent colours, in files: they come back, and other programs see plain ones."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ def call_compare(make: Maker) -> None:
     b, h, w, c = make.count(2), 1 + make.count(30), 1 + make.count(30), 1 + make.count(4)
     images = [make.values(b, h, w, c).clip(-1e6, 1e6) for _ in range(2)]
     mask = make.rng.random((b, h, w)) < 0.5 if make.chance(0.5) else None
-    rates = {"l1_rate": make.count(1), "ssim_rate": make.count(1)}
+    rates = {"l1_weight": make.count(1), "ssim_weight": make.count(1)}
     compare_images(*images, mask, **rates, gradient=make.chance(0.7), threads=THREADS)
 
 
@@ -329,9 +329,9 @@ def call_stereo(make: Maker) -> None:
     )
     known = (make.rng.random(matched.pixels) < float(make.one_of(0.0, 0.3, 1.0))) & (planes.inverse > 0)
     inverse = stereo.fill_depths(matched, own, planes, known, per_pixel=1.0, threads=THREADS)
-    judges = make.rng.integers(-1, max(1, len(chosen)), (len(chosen), 1 + make.count(3))).astype(np.int32)
+    neighbors = make.rng.integers(-1, max(1, len(chosen)), (len(chosen), 1 + make.count(3))).astype(np.int32)
     tolerances = (0.02, 0.05)
-    stereo.count_witnesses(matched, planes.inverse, inverse, judges, tolerances, THREADS)
+    stereo.count_consistent(matched, planes.inverse, inverse, neighbors, tolerances, THREADS)
     stereo.count_views(matched, inverse, make.points(make.count(40)).astype(float), tolerances, THREADS)
 
 

@@ -12,7 +12,7 @@ import meshsplats
 from meshsplats.rendering.cpu import CpuEngine
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.engine import Need
-from meshsplats.rendering.gpu import CANNOT, RUN_BY_RUN
+from meshsplats.rendering.gpu import CANNOT, NOT_FUSED
 from meshsplats.webgpu import frames, gradients, training
 from meshsplats.webgpu.device import CORE_BINDING
 from meshsplats.webgpu.layout import FANS_IN_WORKGROUP, MAX_WORKGROUPS
@@ -48,8 +48,8 @@ def test_one_module_chooses_the_phases_of_a_run():
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the documents are not here")
 def test_what_the_gpu_cannot_do_is_documented():
-    assert RUN_BY_RUN.isdisjoint(CANNOT)
-    assert RUN_BY_RUN.union(CANNOT) == set(get_args(Need))
+    assert NOT_FUSED.isdisjoint(CANNOT)
+    assert NOT_FUSED.union(CANNOT) == set(get_args(Need))
     text = PAGE.read_text("utf-8").partition("## What it cannot do")[2].partition("\n## ")[0]
     for need in get_args(Need):
         assert need in text

@@ -1,4 +1,4 @@
-"""Colours that depend on the view: the core's shading against its definition, its gradients, and its laws."""
+"""View-dependent colours: the core's shading against its definition, its gradients, and its laws."""
 
 from __future__ import annotations
 

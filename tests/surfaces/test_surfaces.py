@@ -291,7 +291,7 @@ def discs(count=1500) -> GaussianCloud:
 
 
 PLAIN = ["--texture", "0", "--rounds", "0", "--views", "16", "--size", "96", "--no-preview"]
-"""Quick: colours of vertices, and the shape as fused."""
+"""Quick: vertex colours, and the shape as fused."""
 
 
 @needs_extra

@@ -182,7 +182,7 @@ def slanted_scores(
     return best_two(found)
 
 
-def witnesses(
+def consistency(
     inverse: np.ndarray,
     camera: Camera,
     maps: Sequence[np.ndarray],

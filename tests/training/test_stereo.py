@@ -15,6 +15,7 @@ from _balls import ball_view, cameras_around
 from _stereo_twin import (
     camera_at,
     cameras_on_a_grid,
+    consistency,
     grey,
     halved,
     inverse_of_plane,
@@ -23,7 +24,6 @@ from _stereo_twin import (
     slanted_scores,
     swept,
     view_of,
-    witnesses,
 )
 
 from meshsplats._core import library
@@ -34,7 +34,7 @@ from meshsplats._core.stereo import (
     Pairs,
     Planes,
     SurfaceArrays,
-    count_witnesses,
+    count_consistent,
     fuse_points,
     match_photos,
 )
@@ -133,11 +133,11 @@ def test_outlines_are_not_widened():
 
 
 def given_depths(maps: list[np.ndarray]) -> tuple[Layout, Planes, np.ndarray, np.ndarray]:
-    """What ``confirmed`` takes, for nine views of which each judges all others."""
+    """What ``confirmed`` takes, for nine views of which each checks all others."""
     layout = layout_of([view_of(camera, *FLAT) for camera in cameras_on_a_grid(step=0.1)])
     inverse = np.concatenate([values.astype(np.float32).ravel() for values in maps])
-    judges = np.array([[j for j in range(9) if j != i] for i in range(9)], np.int32)
-    return layout, Planes(inverse, inverse, inverse, inverse), np.ones(layout.pixels, bool), judges
+    neighbors = np.array([[j for j in range(9) if j != i] for i in range(9)], np.int32)
+    return layout, Planes(inverse, inverse, inverse, inverse), np.ones(layout.pixels, bool), neighbors
 
 
 def test_depths_that_other_views_do_not_have_are_dropped():
@@ -145,15 +145,15 @@ def test_depths_that_other_views_do_not_have_are_dropped():
     maps = [inverse_of_plane(camera, *FLAT) for camera in cameras_on_a_grid(step=0.1)]
     factor = np.random.default_rng(0).choice([1.0, 1.3, 0.75], maps[4].shape)
     maps[4] = maps[4] * factor
-    layout, planes, fits, judges = given_depths(maps)
-    kept = layout.image(confirmed(layout, planes, fits, judges), 4) > 0
+    layout, planes, fits, neighbors = given_depths(maps)
+    kept = layout.image(confirmed(layout, planes, fits, neighbors), 4) > 0
     assert not kept[factor != 1].any()
     lone = np.where(factor == 1, maps[4], 0)  # beside nothing else, as those are dropped for outlines
-    layout, planes, fits, judges = given_depths([*maps[:4], lone, *maps[5:]])
-    kept = layout.image(confirmed(layout, planes, fits, judges), 4) > 0
+    layout, planes, fits, neighbors = given_depths([*maps[:4], lone, *maps[5:]])
+    kept = layout.image(confirmed(layout, planes, fits, neighbors), 4) > 0
     assert kept[factor == 1].all()
     fits[:] = False
-    assert not confirmed(layout, planes, fits, judges).any()
+    assert not confirmed(layout, planes, fits, neighbors).any()
 
 
 def test_rims_of_what_is_in_front_are_dropped():
@@ -164,8 +164,8 @@ def test_rims_of_what_is_in_front_are_dropped():
         insides.append(reach < 0.4)
         widened = reach < 0.4 + 2 / camera.fx
         maps.append(np.where(widened, 1 / 2, 1 / 4))
-    layout, planes, fits, judges = given_depths(maps)
-    sure = confirmed(layout, planes, fits, judges)
+    layout, planes, fits, neighbors = given_depths(maps)
+    sure = confirmed(layout, planes, fits, neighbors)
     for i, inside in enumerate(insides):
         near = layout.image(sure, i) > 0.4
         assert not near[~inside].any()
@@ -198,8 +198,8 @@ def test_what_one_view_alone_shows_continues_its_surroundings():
     inverse, slopes = (np.zeros(layout.pixels, np.float32) for _ in range(2))
     layout.image(inverse, 0)[:, 20:24] = truth[:, 20:24]
     color, counted = np.full((layout.pixels, 3), 128, np.uint8), np.ones(layout.pixels, bool)
-    judges = np.array([[1], [0]], np.int32)
-    filled = between(layout, color, Planes(inverse, slopes, slopes, slopes), counted, judges)
+    neighbors = np.array([[1], [0]], np.int32)
+    filled = between(layout, color, Planes(inverse, slopes, slopes, slopes), counted, neighbors)
     shared = right.in_image(right.project((left.center + 3 * rays(left)).reshape(-1, 3))[0])
     lone = ~shared.reshape(truth.shape)
     lone[:, 20:24] = False
@@ -281,11 +281,11 @@ def test_witnesses_are_those_of_the_twin():
         maps.append(np.where(rng.random((18, 24)) < 0.8, truth, 0).astype(np.float32))
     layout = layout_of([view_of(camera, *FLAT) for camera in cameras])
     values = np.concatenate([m.ravel() for m in maps])
-    judges = np.array([[1, 2, 3], [0, -1, 2], [-1, -1, -1], [0, 1, 2]], np.int32)
-    found = count_witnesses(layout, values, values, judges, (0.01, 0.03), 2)
+    neighbors = np.array([[1, 2, 3], [0, -1, 2], [-1, -1, -1], [0, 1, 2]], np.int32)
+    found = count_consistent(layout, values, values, neighbors, (0.01, 0.03), 2)
     for i in range(4):
-        chosen = [j for j in judges[i] if j >= 0]
-        agree, past = witnesses(
+        chosen = [j for j in neighbors[i] if j >= 0]
+        agree, past = consistency(
             maps[i], cameras[i], [maps[j] for j in chosen], [cameras[j] for j in chosen], (0.01, 0.03)
         )
         assert np.abs(layout.image(found.agree, i) - agree).sum() <= 2  # rounding at a pixel's border
@@ -487,9 +487,9 @@ def test_the_core_refuses_photographs_that_are_not_there():
         with pytest.raises(ValueError, match=r"photograph -?[0-9]+ of 2"):
             match_photos(layout, color, layout_of(views[:1]), pairs, planes=4, rounds=1, threads=1)
     planes = Planes(*np.zeros((4, layout.pixels), np.float32))
-    judges = np.array([[5], [0]], np.int32)
+    neighbors = np.array([[5], [0]], np.int32)
     with pytest.raises(ValueError, match="view 5 of 2"):
-        confirmed(layout, planes, np.ones(layout.pixels, bool), judges, 1)
+        confirmed(layout, planes, np.ones(layout.pixels, bool), neighbors, 1)
 
 
 def test_fusion_of_few_points(monkeypatch):

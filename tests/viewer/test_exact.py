@@ -325,7 +325,7 @@ def test_levels_in_the_exact_image(shown, mesh, cloud, cameras):
     page.close()
 
 
-# Colours that depend on the view
+# View-dependent colours
 
 
 def glowing(cloud: ms.GaussianCloud, terms: int) -> ms.SplatMesh:

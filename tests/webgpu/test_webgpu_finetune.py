@@ -19,7 +19,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DeviceError, DivergenceError, FileFormatError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
 from meshsplats.finetuning.gradients import Rates, StepImage
-from meshsplats.finetuning.loss import DefaultLoss, LossRates
+from meshsplats.finetuning.loss import DefaultLoss, LossWeights
 from meshsplats.finetuning.phases.blended import Blended
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step, view_of_step
@@ -221,18 +221,18 @@ def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene, monkeypatc
     dataset, _ = scene
     camera = dataset.train[0].camera
     state = steps(scene, "gpu")[1]
-    assert state.whole_steps(camera, ())
+    assert state.fused_steps(camera, ())
     shaded = steps((scene[0], dark_with_harmonics(scene[1], 15)), "gpu", 0)[1]
-    assert shaded.whole_steps(camera, ())
+    assert shaded.fused_steps(camera, ())
     monkeypatch.setattr(open_device(), "binding_limit", shaded.harmonics.nbytes - 1)
-    assert shaded.whole_steps(camera, ()) is None
+    assert shaded.fused_steps(camera, ()) is None
     monkeypatch.undo()
-    assert steps(scene, "cpu", 0)[1].whole_steps(camera, ()) is None
+    assert steps(scene, "cpu", 0)[1].fused_steps(camera, ()) is None
     for options in ({"blending": "linear"}, {"exposure": True}):
-        assert steps(scene, "gpu", 0, **options)[1].whole_steps(camera, ()) is None
+        assert steps(scene, "gpu", 0, **options)[1].fused_steps(camera, ()) is None
     monkeypatch.setattr(open_device(), "binding_limit", CORE_BINDING)
-    assert state.whole_steps(replace(camera, width=2000, height=2000), ()) is None
-    assert state.whole_steps(camera, ("loss",)) is None
+    assert state.fused_steps(replace(camera, width=2000, height=2000), ()) is None
+    assert state.fused_steps(camera, ("loss",)) is None
 
 
 @pytest.mark.slow
@@ -276,7 +276,7 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
     monkeypatch.setattr(open_device(), "binding_limit", CORE_BINDING)
     monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 10_000)  # as if there were more fragments
     losses, state = steps(scene, "gpu")
-    assert state.whole_steps(scene[0].train[0].camera, ())
+    assert state.fused_steps(scene[0].train[0].camera, ())
     assert state.arrays()["window_samples"] < 1 << 22
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - known.mesh.vertices)
@@ -299,10 +299,10 @@ def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):
     with pytest.raises(DivergenceError, match="the loss is not finite"):
         make_step(state, views, 1, 0.2, Blended(config))
     target, camera = dataset.train[0].image, dataset.train[0].camera
-    loss = LossRates(0.0, 0.0, 3e38, 0.0)  # the sums are finite, the gradients are not
-    steps, image = state.whole_steps(camera, ()), StepImage(camera, TapeOptions((0, 0, 0)), target, None)
+    loss = LossWeights(0.0, 0.0, 3e38, 0.0)  # the sums are finite, the gradients are not
+    steps, image = state.fused_steps(camera, ()), StepImage(camera, TapeOptions((0, 0, 0)), target, None)
     assert steps is not None
-    sums = state.whole_step(steps, image, loss, Rates(0.02, 0.02))
+    sums = state.fused_step(steps, image, loss, Rates(0.02, 0.02))
     assert np.isfinite(sums[:3]).all()
     assert not sums.finite
     after = state.arrays()

@@ -1,4 +1,4 @@
-"""Colours that depend on the view on the GPU: the images of the core, from one upload."""
+"""View-dependent colours on the GPU: the images of the core, from one upload."""
 
 from __future__ import annotations
 

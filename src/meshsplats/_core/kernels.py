@@ -31,8 +31,8 @@ class Comparison(NamedTuple):
     l1: float
     ssim: float
     gradient: np.ndarray | None
-    """(b, h, w, c) float32: of ``l1_rate * l1 + ssim_rate * ssim`` with respect to the images, 0 at pixels
-    that do not count."""
+    """(b, h, w, c) float32: of ``l1_weight * l1 + ssim_weight * ssim`` with respect to the images, 0 at
+    pixels that do not count."""
 
 
 def compare_images(
@@ -40,15 +40,15 @@ def compare_images(
     targets: np.ndarray,
     mask: np.ndarray | None = None,
     *,
-    l1_rate: float = 0,
-    ssim_rate: float = 0,
+    l1_weight: float = 0,
+    ssim_weight: float = 0,
     gradient: bool = False,
     threads: int | None = None,
 ) -> Comparison:
     """Sums of |image - target| and of SSIM, 3DGS convention, and the gradient of their weighted sum.
 
     ``images`` and ``targets`` are (b, h, w, c) float32, ``mask`` (b, h, w) bool. SSIM is not computed, and
-    its sum is 0, where ``ssim_rate`` is 0. The result has the same bits with any number of ``threads`` (all
+    its sum is 0, where ``ssim_weight`` is 0. The result has the same bits with any number of ``threads`` (all
     processors by default) and on every instruction set.
     """
     count, height, width, channels = images.shape
@@ -63,8 +63,8 @@ def compare_images(
         target=pointer(targets),
         mask=pointer(mask),
         gradient=pointer(result),
-        l1_rate=l1_rate,
-        ssim_rate=ssim_rate,
+        l1_weight=l1_weight,
+        ssim_weight=ssim_weight,
     )
     run("ms_compare_images", comparison)
     return Comparison(comparison.l1, comparison.ssim, result)

@@ -37,7 +37,7 @@ QUICK_FRAGMENTS = 1e9
 """Images that cannot have more of them are soon drawn: in seconds, if each triangle were as large as they."""
 LONG = frozenset(
     {"ms_nearest", "ms_merge_pairs", "ms_order_triangles", "ms_viewer_images", "ms_match_photos"}
-    | {"ms_count_witnesses", "ms_fill_depths", "ms_count_views", "ms_fuse_points"}
+    | {"ms_count_consistent", "ms_fill_depths", "ms_count_views", "ms_fuse_points"}
 )
 """Functions other than those of images that may run for seconds."""
 

@@ -16,11 +16,11 @@ from meshsplats._core.library import pointer, run, thread_count
 from meshsplats._core.structures import (
     CameraStruct,
     CarvingStruct,
+    ConsistencyStruct,
     FillingStruct,
     FusionStruct,
     MatchingStruct,
     ViewsStruct,
-    WitnessesStruct,
 )
 
 
@@ -110,7 +110,7 @@ def match_photos(
     return found
 
 
-class Witnesses(NamedTuple):
+class Consistency(NamedTuple):
     """For each pixel with a depth how many other views, (pixels,) uint8, ..."""
 
     agree: np.ndarray
@@ -121,31 +121,31 @@ class Witnesses(NamedTuple):
     """have it in the image, with nothing that is known in front of it."""
 
 
-def count_witnesses(
+def count_consistent(
     views: Layout,
     inverse: np.ndarray,
     others: np.ndarray,
-    judges: np.ndarray,
+    neighbors: np.ndarray,
     tolerances: tuple[float, float],
     threads: int | None = None,
-) -> Witnesses:
+) -> Consistency:
     """What the depths ``others`` say of the depths ``inverse``, both (pixels,) float32 inverse, 0: none.
 
-    ``judges``: (views, k) int32 views that judge each; -1: none. ``tolerances``: relative differences of
+    ``neighbors``: (views, k) int32 views that check each; -1: none. ``tolerances``: relative differences of
     depth up to which they agree, and from which they see past it.
     """
-    found = Witnesses(*(np.zeros(views.pixels, np.uint8) for _ in Witnesses._fields))
-    struct = WitnessesStruct(
+    found = Consistency(*(np.zeros(views.pixels, np.uint8) for _ in Consistency._fields))
+    struct = ConsistencyStruct(
         views=views.struct(threads),
         inverse=pointer(inverse),
         others=pointer(others),
-        judges=pointer(judges),
+        neighbors=pointer(neighbors),
         **{name: pointer(values) for name, values in found._asdict().items()},
         tolerance=tolerances[0],
         past_tolerance=tolerances[1],
-        judge_count=judges.shape[1],
+        neighbor_count=neighbors.shape[1],
     )
-    run("ms_count_witnesses", struct)
+    run("ms_count_consistent", struct)
     return found
 
 
@@ -186,7 +186,7 @@ def count_views(
     threads: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) int32 each: how many ``views`` have a known depth at ``points`` (n, 3) float64, and how many see
-    past them. ``inverse`` and ``tolerances`` as in ``count_witnesses``."""
+    past them. ``inverse`` and ``tolerances`` as in ``count_consistent``."""
     agree, past = np.zeros((2, len(points)), np.int32)
     struct = CarvingStruct(
         views=views.struct(threads),

@@ -76,7 +76,7 @@ class ComparisonStruct(CoreStruct):
         *int64("count"),
         *int32("height", "width", "channels", "threads"),
         *pointers("image", "target", "mask", "gradient"),
-        *floats("l1_rate", "ssim_rate"),
+        *floats("l1_weight", "ssim_weight"),
         *doubles("l1", "ssim"),
     ]
 
@@ -204,12 +204,12 @@ class MatchingStruct(CoreStruct):
     ]
 
 
-class WitnessesStruct(CoreStruct):
+class ConsistencyStruct(CoreStruct):
     _fields_ = [
         ("views", ViewsStruct),
-        *pointers("inverse", "others", "judges", "agree", "past", "seen"),
+        *pointers("inverse", "others", "neighbors", "agree", "past", "seen"),
         *floats("tolerance", "past_tolerance"),
-        *int32("judge_count"),
+        *int32("neighbor_count"),
     ]
 
 

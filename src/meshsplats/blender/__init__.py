@@ -70,7 +70,7 @@ def draw(
         executable: an installed Blender, 4.2 or newer; the module bpy of this environment by default.
         announce: called once before Blender starts, with the size of the work: ``{"triangles", "layers",
             "bounce_limit", "samples" per pixel, "pixels" of all images, "mean_layers" of a pixel,
-            "harmonics": terms of colours that depend on the view}``.
+            "harmonics": terms of view-dependent colours}``.
         progress: called whenever Blender reports progress.
 
     Returns:

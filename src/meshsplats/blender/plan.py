@@ -45,9 +45,9 @@ def _processors(options: SceneOptions) -> str:
 def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:
     """Estimated time with Cycles, from the plan of ``draw``; None for EEVEE. Fitted to processor times of
     Blender 4.2 and 4.5 (docs/blender.md): a ray that meets m layers costs 1.1 m + 0.0083 m^2 microseconds,
-    as each layer is searched for among those around it, 0.14 m more for each term of colours that depend on
-    the view, and lit one more for the ground. Before a lit image
-    come the stand-in, colours and baked light."""
+    as each layer is searched for among those around it, 0.14 m more for each term of view-dependent
+    colours, and lit one more for the ground. Before a lit image come the stand-in, colours and
+    baked light."""
     if options.engine != "cycles":
         return None
     from meshsplats._core.library import processors

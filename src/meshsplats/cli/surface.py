@@ -76,7 +76,7 @@ class Surface(Command):
         seconds, lines = time.perf_counter() - start, []
         rows = run.rows(made)
         for path, base in made:
-            look = f"{len(base.textures[0].pixels)} texels, " if base.textures else "colours of vertices, "
+            look = f"{len(base.textures[0].pixels)} texels, " if base.textures else "vertex colours, "
             look = "" if path.suffix.lower() in PRINTED else look
             lines.append(f"{path} ({len(base.faces):,} triangles, {look}{size_of(path)})")
         lines += [f"in {seconds:.1f} s", *([] if self.files.no_preview else [f"preview: {run.preview}"])]

@@ -102,7 +102,7 @@ class ConversionOptions:
     most important ones, by opacity times area in the images of the cameras (splats that no camera sees count
     as at the median distance), or in scene units without cameras; this tears holes."""
     colors: Annotated[Colors | None, Advanced] = None
-    """view: as the splats, the mesh has colours that depend on the view, where the splats have spherical
+    """view: as the splats, the mesh has view-dependent colours, where the splats have spherical
     harmonics (``SplatMesh.harmonics``). mean: one colour, the mean of those that the cameras see. base: one
     colour, the part of degree 0. Programs that do not know the harmonics show the base colour of 'view'."""
     color_degree: Annotated[int | None, Range(1, 3), With(colors="view"), Advanced] = None

@@ -14,6 +14,7 @@
 #include "layout.h"
 #ifndef MS_WIDE_ONLY
 #include "cells.h"
+#include "consistency.h"
 #include "fusion.h"
 #include "listing.h"
 #include "merging.h"
@@ -23,7 +24,6 @@
 #include "texture.h"
 #include "tsdf.h"
 #include "viewer.h"
-#include "witnesses.h"
 #endif
 #include "mesh_tile.h"
 #include "shading.h"
@@ -405,8 +405,8 @@ MS_EXPORT int ms_list_triangles(const MsListing *listing, char *message, int mes
     return guarded(message, message_size, [&] { ms::Listing(*listing).run(); });
 }
 
-MS_EXPORT int ms_count_witnesses(const MsWitnesses *witnesses, char *message, int message_size) {
-    return guarded(message, message_size, [&] { ms::count_witnesses(*witnesses); });
+MS_EXPORT int ms_count_consistent(const MsConsistency *consistency, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::count_consistent(*consistency); });
 }
 
 MS_EXPORT int ms_fill_depths(const MsFilling *filling, char *message, int message_size) {

@@ -10,6 +10,7 @@
 #include "fans.h"
 #ifndef MS_WIDE_ONLY
 #include "cells.h"
+#include "consistency.h"
 #include "fusion.h"
 #include "listing.h"
 #include "merging.h"
@@ -19,7 +20,6 @@
 #include "texture.h"
 #include "tsdf.h"
 #include "viewer.h"
-#include "witnesses.h"
 #endif
 #include "shading.h"
 #include "ssim.h"
@@ -95,8 +95,8 @@ constexpr MsField FIELDS[] = {
     MS_STRUCT(MsImage, color, alpha, depth, normals, attributes, median_depth, fragments),
     MS_STRUCT(MsImageGradients, color, alpha, attributes, expected_weight, target),
     MS_STRUCT(MsVertexGradients, vertices, colors, attributes),
-    MS_STRUCT(MsComparison, count, height, width, channels, threads, image, target, mask, gradient, l1_rate,
-              ssim_rate, l1, ssim),
+    MS_STRUCT(MsComparison, count, height, width, channels, threads, image, target, mask, gradient, l1_weight,
+              ssim_weight, l1, ssim),
     MS_STRUCT(MsAdam, rows, columns, threads, values, mean, square, gradient, scale, chosen, chosen_count,
               mask, step, one_minus_beta1, one_minus_beta2, epsilon, low, high),
     MS_STRUCT(MsFans, count, sides, threads, vertices, polygon, share),
@@ -122,8 +122,8 @@ constexpr MsField FIELDS[] = {
               before, after),
     MS_STRUCT(MsListing, camera, vertex_count, face_count, vertices, faces, face_splat, copies, starts,
               listed, listed_splat, node_count, threads),
-    MS_STRUCT(MsWitnesses, views, inverse, others, judges, agree, past, seen, tolerance, past_tolerance,
-              judge_count),
+    MS_STRUCT(MsConsistency, views, inverse, others, neighbors, agree, past, seen, tolerance, past_tolerance,
+              neighbor_count),
     MS_STRUCT(MsFilling, views, color, inverse, along_x, along_y, known, result, per_pixel),
     MS_STRUCT(MsCarving, views, inverse, points, agree, past, count, tolerance, past_tolerance),
     MS_STRUCT(MsFusion, points, normals, pixels, colors, sure, patches, count, wanted, threads, largest,

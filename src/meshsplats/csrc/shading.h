@@ -1,4 +1,4 @@
-// Shading: colours of vertices in a view, where splats have spherical harmonics. A vertex of splat s has the
+// Shading: vertex colours in a view, where splats have spherical harmonics. A vertex of splat s has the
 // colour max(0, rgb + sum_k b_k(d) h_sk) with the unit vector d from the camera to the vertex, real spherical
 // harmonics b_k of degree 1 and more, in the order of sh_color in splat_scene.h, and the coefficients h_sk.
 #pragma once

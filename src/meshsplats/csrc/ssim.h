@@ -28,8 +28,8 @@ struct MsComparison {
     int32_t threads;
     const float *image, *target;  // (count, height, width, channels)
     const uint8_t *mask;          // (count, height, width), 0: does not count; or null
-    float *gradient;              // out: of l1_rate * l1 + ssim_rate * ssim, shaped like the images; or null
-    float l1_rate, ssim_rate;
+    float *gradient;  // out: of l1_weight * l1 + ssim_weight * ssim, shaped like the images; or null
+    float l1_weight, ssim_weight;
     double l1, ssim;  // out: sums over channels and pixels that count
 };
 
@@ -77,7 +77,7 @@ class ComparisonTile {
         length_ = (right - left) * channels_;
         set_sizes(length_);
         MS_ASSERT(size2_ <= (int64_t)x_.size());
-        if (comparison_.ssim_rate == 0)
+        if (comparison_.ssim_weight == 0)
             compare_l1(top, bottom, sums);
         else
             compare_l1_and_ssim(top, bottom, sums);
@@ -279,15 +279,15 @@ class ComparisonTile {
         float *out = comparison_.gradient +
                      ((image_ * comparison_.height + row) * comparison_.width + left_) * (int64_t)channels_;
         typedef int vi __attribute__((vector_size(4 * W)));
-        const vf ssim_rate = set1(comparison_.ssim_rate), two = set1(2), half = set1(0.5f);
-        const vi l1_rate = (vi)set1(comparison_.l1_rate);
+        const vf ssim_weight = set1(comparison_.ssim_weight), two = set1(2), half = set1(0.5f);
+        const vi l1_weight = (vi)set1(comparison_.l1_weight);
         for (int64_t i = 0; i < length_; i += W) {
             const vf x = load(&x_[i]), y = load(&y_[i]), d = x - y, m = (x + y) * half - half;
-            // l1_rate * sign(d)
-            vf sum = (vf)((vi)(d > vf{}) & l1_rate) - (vf)((vi)(d < vf{}) & l1_rate);
+            // l1_weight * sign(d)
+            vf sum = (vf)((vi)(d > vf{}) & l1_weight) - (vf)((vi)(d < vf{}) & l1_weight);
             if (with_ssim)
-                sum += ssim_rate * (filter(rows, i) + two * d * filter(rows, i + size0_) +
-                                    m * filter(rows, i + 2 * size0_));
+                sum += ssim_weight * (filter(rows, i) + two * d * filter(rows, i + size0_) +
+                                      m * filter(rows, i + 2 * size0_));
             sum *= load(&counts_[i]);
             if (i + W <= length_)
                 store(out + i, sum);

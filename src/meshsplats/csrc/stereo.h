@@ -2,8 +2,8 @@
 // then slanted windows at the whole.
 #pragma once
 
+#include "patchmatch.h"
 #include "plane_sweep.h"
-#include "slanted.h"
 
 extern "C" {
 
@@ -94,7 +94,7 @@ class Matching {
                 maps.score[i] = score[from];
             }
         if (input_.rounds < 0) return;
-        SlantedWindows(photo.level[0], camera, warps[0], images[0], low, high, maps).run(input_.rounds);
+        PatchMatch(photo.level[0], camera, warps[0], images[0], low, high, maps).run(input_.rounds);
     }
 
     const MsMatching &input_;

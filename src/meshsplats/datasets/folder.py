@@ -16,7 +16,7 @@ from meshsplats._common.foreign import what_it_is
 from meshsplats._common.kinds import need_path
 from meshsplats._common.words import plural
 from meshsplats.datasets.colmap import read_model
-from meshsplats.datasets.image_files import Album, Frame, Taken, first_names, split
+from meshsplats.datasets.image_files import Frame, PhotoLoader, PhotoViews, first_names, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
 from meshsplats.datasets.llff import read_poses_bounds
 from meshsplats.datasets.photo_file import PhotoFile
@@ -42,18 +42,18 @@ def read_folder(
             what = what_it_is(path)
             raise FileFormatError(f"{path}: {what or 'a data set is a folder, or its transforms.json'}")
         raise FileFormatError(f"{path}: {what_is_there(path)}")
-    album = Album(layout.root, downscale, store, missing, layout.images, masks)
+    loader = PhotoLoader(layout.root, downscale, store, missing, layout.images, masks)
     if layout.name == "COLMAP":
-        return _colmap(layout, album, test_every)
+        return _colmap(layout, loader, test_every)
     if layout.name == "LLFF":
         frames = read_poses_bounds(layout.source, layout.images)
-        return _views(*split(_taken(frames, layout.source, album), test_every))
+        return _views(*split(_taken(frames, layout.source, loader), test_every))
     if layout.name == "NeRF-synthetic":
-        return _nerf_synthetic(layout.source.parent, album)
-    return _nerfstudio(layout.source, album, test_every)
+        return _nerf_synthetic(layout.source.parent, loader)
+    return _nerfstudio(layout.source, loader, test_every)
 
 
-def _colmap(layout: Layout, album: Album, test_every: int) -> Views:
+def _colmap(layout: Layout, loader: PhotoLoader, test_every: int) -> Views:
     model = layout.source
     if layout.before:
         warnings.warn(
@@ -67,20 +67,20 @@ def _colmap(layout: Layout, album: Album, test_every: int) -> Views:
     listed = model.parent.name == "sparse" or model.name == "sparse"
     chosen = _listed_test(model / "test.txt") if listed else None
     if chosen is None:
-        return _views(*split(_taken(frames, model, album), test_every))
+        return _views(*split(_taken(frames, model, loader), test_every))
     stems = [_stem(frame.name) for frame in frames]
     known = set(stems)
     # The 3DGS code lists names without suffixes, which may have dots.
     chosen = {name if name in known else _stem(name) for name in chosen}
     _check_names(model, "test.txt", chosen, stems)
-    taken = _taken(frames, model, album)
+    taken = _taken(frames, model, loader)
     train, test = (_members(taken, [(stem in chosen) is held for stem in stems]) for held in (False, True))
     return _views(train, test)
 
 
-def _taken(frames: list[Frame], where: Path, album: Album, *, needed: bool = True) -> list[Taken]:
-    taken = album.views(frames, str(where))
-    album.report(str(where), sum(map(bool, taken)), needed=needed)
+def _taken(frames: list[Frame], where: Path, loader: PhotoLoader, *, needed: bool = True) -> list[PhotoViews]:
+    taken = loader.views(frames, str(where))
+    loader.report(str(where), sum(map(bool, taken)), needed=needed)
     return taken
 
 
@@ -88,7 +88,7 @@ def _stem(name: str) -> str:
     return name.rsplit(".", 1)[0]
 
 
-def _members(taken: Sequence[Taken], chosen: Sequence[bool]) -> list[Taken]:
+def _members(taken: Sequence[PhotoViews], chosen: Sequence[bool]) -> list[PhotoViews]:
     return [views for views, one in zip(taken, chosen, strict=True) if one]
 
 
@@ -110,7 +110,7 @@ def _check_names(where: Path, place: str, listed: set[str], names: Sequence[str]
         )
 
 
-def _apart(where: Path, train: list[Taken], test: list[Taken]) -> Views:
+def _apart(where: Path, train: list[PhotoViews], test: list[PhotoViews]) -> Views:
     """The views of ``train``, and of ``test`` those of photographs that are not in it, with a DataWarning of
     the others."""
     known = {views[0][1].path for views in train if views}
@@ -142,11 +142,11 @@ def _listed_test(path: Path) -> set[str] | None:
     return names
 
 
-def _nerf_synthetic(folder: Path, album: Album) -> Views:
-    train = _numbered(folder / "transforms_train.json", album)
+def _nerf_synthetic(folder: Path, loader: PhotoLoader) -> Views:
+    train = _numbered(folder / "transforms_train.json", loader)
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
-            return _apart(folder / name, train, _numbered(folder / name, album, needed=False))
+            return _apart(folder / name, train, _numbered(folder / name, loader, needed=False))
     warnings.warn(
         f"{folder}: neither transforms_test.json nor transforms_val.json: there are no test views",
         DataWarning,
@@ -155,8 +155,8 @@ def _nerf_synthetic(folder: Path, album: Album) -> Views:
     return _views(train, [])
 
 
-def _numbered(path: Path, album: Album, *, needed: bool = True) -> list[Taken]:
-    return _taken(sorted(read_transforms(path).frames, key=_by_number), path, album, needed=needed)
+def _numbered(path: Path, loader: PhotoLoader, *, needed: bool = True) -> list[PhotoViews]:
+    return _taken(sorted(read_transforms(path).frames, key=_by_number), path, loader, needed=needed)
 
 
 def _by_number(frame: Frame) -> tuple[str, int, str]:
@@ -167,7 +167,7 @@ def _by_number(frame: Frame) -> tuple[str, int, str]:
     return stem[:cut], int(stem[cut:] or 0) if digits < 19 else 0, frame.name
 
 
-def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
+def _nerfstudio(path: Path, loader: PhotoLoader, test_every: int) -> Views:
     content = read_transforms(path)
     frames = _each_once(path, sorted(content.frames, key=lambda frame: frame.name))
     names = [frame.name for frame in frames]
@@ -178,7 +178,7 @@ def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
     for part in ("train", out):
         if part in listed:
             _check_names(path, f"'{part}_filenames'", listed[part], names)
-    taken = _taken(frames, path, album)
+    taken = _taken(frames, path, loader)
     # A list that is missing has what is in no other.
     rest = set(names).difference(*listed.values())
     train, test = listed.get("train", rest), listed.get(out, rest)
@@ -205,8 +205,8 @@ def _each_once(where: Path, frames: Sequence[Frame]) -> list[Frame]:
     return list(first.values())
 
 
-def _views(train: list[Taken], test: list[Taken]) -> Views:
-    def flat(part: list[Taken]) -> list[View]:
+def _views(train: list[PhotoViews], test: list[PhotoViews]) -> Views:
+    def flat(part: list[PhotoViews]) -> list[View]:
         return [View(camera, photo, turn=photo.turn) for views in part for camera, photo in views]
 
     return flat(train), flat(test)

@@ -100,7 +100,7 @@ def leads_out(name: str) -> bool:
     return clean.startswith("/") or bool(PureWindowsPath(clean).drive) or ".." in PurePosixPath(clean).parts
 
 
-class Shelf:
+class ImageIndex:
     """The images below a folder, found by what people take for the same name: in letters of another case,
     with accents composed otherwise, or with another suffix of images."""
 
@@ -179,12 +179,12 @@ def _stem_of(name: str) -> str:
     return _fold(name[: len(name) - len(suffix)] if suffix.lower() in (*READABLE, *UNREADABLE) else name)
 
 
-Taken = list[tuple[Camera, PhotoFile]]
+PhotoViews = list[tuple[Camera, PhotoFile]]
 """The views made from one photograph: one, or the six of a panorama; none if it is missing."""
 
 
 @dataclass
-class Album:
+class PhotoLoader:
     """Turns the frames of a data set into cameras with their photographs, and counts what is missing."""
 
     folder: Path
@@ -200,15 +200,15 @@ class Album:
     renamed: list[str] = field(default_factory=list)
     unclear: list[str] = field(default_factory=list)
     """Masks that may be meant as they are stored or upright: of photographs taken upside down, or square."""
-    _shelf: Shelf = field(init=False, repr=False)
+    _shelf: ImageIndex = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._shelf = Shelf(self.folder)
+        self._shelf = ImageIndex(self.folder)
 
-    def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
+    def views(self, frames: Iterable[Frame], where: str) -> list[PhotoViews]:
         """Cameras and photographs of each frame, in order."""
         self.missing, self.no_mask, self.renamed, self.unclear = [], [], [], []
-        result: list[Taken] = []
+        result: list[PhotoViews] = []
         frames = list(frames)
         masks = self._mask_folder(frames, where)
         labels = [f"{where}: image {frame.name[:60]!r}" for frame in frames]
@@ -292,8 +292,8 @@ class Album:
         for name in folders:
             if "mask" not in name.casefold() or name in places:
                 continue
-            shelf = Shelf(self.folder / name)
-            if any(shelf.alike(file) or shelf.alike(f"{file}.png") for file in files):
+            index = ImageIndex(self.folder / name)
+            if any(index.alike(file) or index.alike(f"{file}.png") for file in files):
                 text = "looks like masks of the photographs, which are read from masks/: rename it"
                 warnings.warn(f"{where}: {name}/ {text}", DataWarning, stacklevel=4)
         return ""
@@ -402,7 +402,7 @@ class Album:
             return f"; {' and '.join(near[:3])} may both be meant: keep one of them"
         small = re.compile(r".*_[0-9]+")  # smaller copies, of what was thrown away, perhaps
         folders = [folder for folder in _folders(self.folder) if not small.fullmatch(folder)]
-        elsewhere = [folder for folder in folders if Shelf(self.folder / folder).alike(name)]
+        elsewhere = [folder for folder in folders if ImageIndex(self.folder / folder).alike(name)]
         if elsewhere:
             return f"; {elsewhere[0]}/ has an image of that name: name that folder 'images'"
         return ""
@@ -441,7 +441,7 @@ def _is_smaller(copy: Header, photograph: Header) -> bool:
     return copy.width * copy.height < photograph.width * photograph.height
 
 
-def split(taken: Sequence[Taken], test_every: int) -> tuple[list[Taken], list[Taken]]:
+def split(taken: Sequence[PhotoViews], test_every: int) -> tuple[list[PhotoViews], list[PhotoViews]]:
     """Train and test: every n-th, which are sorted by name, is for testing, from the first on. Missing ones
     count: where a photograph is thrown away, the others stay on their side."""
     if not test_every:

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from meshsplats._common.foreign import what_it_is
 from meshsplats.datasets.cameras_of_others import cameras_of_others
 from meshsplats.datasets.colmap import MODEL_FILES, find_model, image_names
-from meshsplats.datasets.image_files import READABLE, Shelf, first_names, is_hidden, is_readable
+from meshsplats.datasets.image_files import READABLE, ImageIndex, first_names, is_hidden, is_readable
 from meshsplats.errors import FileFormatError
 
 POSES_BOUNDS = "poses_bounds.npy"
@@ -78,7 +78,7 @@ def find_layout(path: Path) -> Layout | None:
 
 
 def _llff(root: Path) -> Layout:
-    folders = [name for name in image_folders(root) if name and Shelf(root / name).images()]
+    folders = [name for name in image_folders(root) if name and ImageIndex(root / name).images()]
     return Layout("LLFF", root / POSES_BOUNDS, root, folders[0] if folders else "")
 
 
@@ -154,8 +154,8 @@ def _holds(root: Path, folder: str, names: Sequence[str] | None) -> bool:
         return False
     if names is None:
         return True
-    shelf = Shelf(place)
-    return any(shelf.alike(name) or shelf.alike(name.replace("\\", "/").split("/")[-1]) for name in names)
+    index = ImageIndex(place)
+    return any(index.alike(name) or index.alike(name.replace("\\", "/").split("/")[-1]) for name in names)
 
 
 def _sample(model: Path) -> Sequence[str] | None:
@@ -218,7 +218,7 @@ def what_is_there(path: Path) -> str:
         return "a trained model, not the photographs it was trained on"
     if path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent):
         return f"the images alone; give the folder above it, {path.absolute().parent}, which has the cameras"
-    photographs = max(len(Shelf(path / name).images()) for name in image_folders(path))
+    photographs = max(len(ImageIndex(path / name).images()) for name in image_folders(path))
     bare = f"{wanted}; of photographs without, 'meshsplats train' finds the cameras"
     if photographs >= _SEVERAL:  # phones put videos among them
         return bare
@@ -228,7 +228,7 @@ def what_is_there(path: Path) -> str:
     if photographs:
         return bare
     for name in image_folders(path):
-        if unread := Shelf(path / name).unread():
+        if unread := ImageIndex(path / name).unread():
             kind = f"images of kinds that are not read ({first_names(unread)}): convert them to JPEG"
             return f"{name or 'it'}{'/' * bool(name)} holds {kind}; {wanted}"
     if deeper := photographs_beneath(path):
@@ -247,7 +247,7 @@ def photographs_beneath(path: Path) -> dict[str, list[str]]:
     places = [
         place for first in firsts for place in (first, *(f"{first}/{s}" for s in _folders(path / first)))
     ]
-    found = {place: Shelf(path / place).images() for place in places[:_MOST_FOLDERS]}
+    found = {place: ImageIndex(path / place).images() for place in places[:_MOST_FOLDERS]}
     return {place: names for place, names in found.items() if names}
 
 

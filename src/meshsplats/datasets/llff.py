@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._common.choices import MAX_SIDE
-from meshsplats.datasets.image_files import Frame, Shelf
+from meshsplats.datasets.image_files import Frame, ImageIndex
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.npz import read_npy_header
@@ -30,7 +30,7 @@ def read_poses_bounds(path: Path, images: str) -> list[Frame]:
     """A frame for each row of ``path``, in the order of the names of the images in the folder ``images``
     beside it, or in its own if that is empty. FileFormatError if they are not as many, or it is broken."""
     rows = _rows(path)
-    names = Shelf(path.parent / images).images()
+    names = ImageIndex(path.parent / images).images()
     if len(names) != len(rows):
         place = f"{images}/" if images else "the folder"
         raise FileFormatError(

@@ -138,7 +138,7 @@ class SceneReading:
     def load_scene(
         self, path: Path, *, up: str | None = None, find_up: bool = True, threads: int | None = None
     ) -> GaussianCloud | SplatMesh:
-        """The splats or the mesh at ``path``, textures as colours of vertices; ``up``, ``find_up`` and
+        """The splats or the mesh at ``path``, textures as vertex colours; ``up``, ``find_up`` and
         ``threads`` as for ``load``. FileFormatError for cameras, and OptionsError as by ``refuse_for``."""
         from meshsplats.formats.base_meshes import load_vertex_colored
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from meshsplats._common.choices import MAX_SIDE
 from meshsplats._common.json_files import read_json
-from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable, leads_out
+from meshsplats.datasets.image_files import Frame, ImageIndex, find, inside, is_readable, leads_out
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.images.reading import read_header
@@ -60,8 +60,8 @@ def read_transforms(path: Path) -> Transforms:
                 raise FileFormatError(f"{path}: {key!r} must be a list of file names")
             splits[key.removesuffix("_filenames")] = set(names)
     common = {key: value for key, value in content.items() if key != "frames"}
-    shelf = Shelf(path.parent)
-    found = [_frame(path, shelf, common, f, i) for i, f in enumerate(frames)]
+    index = ImageIndex(path.parent)
+    found = [_frame(path, index, common, f, i) for i, f in enumerate(frames)]
     masks = [(str(given.get("mask_path")), frame.mask) for given, frame in zip(frames, found, strict=True)]
     for what, pairs in (("images", [(frame.name, frame.file) for frame in found]), ("masks", masks)):
         moved = [f"{a}: {b}" for a, b in pairs if b and leads_out(a) and not leads_out(b)]
@@ -91,7 +91,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _frame(path: Path, shelf: Shelf, common: dict[str, Any], frame: object, i: int) -> Frame:
+def _frame(path: Path, index: ImageIndex, common: dict[str, Any], frame: object, i: int) -> Frame:
     where = f"{path}: frame {i}"
     if not isinstance(frame, dict):
         raise FileFormatError(f"{where}: must be a JSON object")
@@ -105,7 +105,7 @@ def _frame(path: Path, shelf: Shelf, common: dict[str, Any], frame: object, i: i
     # Some writers name what they do not know, with null.
     values = common | {key: value for key, value in frame.items() if value is not None}
     values = {key: value for key, value in values.items() if value is not None}
-    lens = _lens(shelf, values, file, where)
+    lens = _lens(index, values, file, where)
     mask = _here(path.parent, mask) if mask else None
     return Frame(name, file, lens, _world_to_camera(frame, where), mask)
 
@@ -121,8 +121,8 @@ def _here(folder: Path, file: str) -> str:
     return file
 
 
-def _lens(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> Lens | None:
-    size = _size(shelf, values, file, where)
+def _lens(index: ImageIndex, values: dict[str, Any], file: str, where: str) -> Lens | None:
+    size = _size(index, values, file, where)
     if size is None:
         return None
     width, height = size
@@ -160,7 +160,7 @@ def _lens(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> Lens |
         raise FileFormatError(f"{where}: {error}") from None
 
 
-def _size(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> tuple[int, int] | None:
+def _size(index: ImageIndex, values: dict[str, Any], file: str, where: str) -> tuple[int, int] | None:
     """(width, height) that the intrinsics are meant for."""
     if "w" in values and "h" in values:
         sides = (_number(values, "w", where), _number(values, "h", where))
@@ -170,10 +170,10 @@ def _size(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> tuple[
                 f" got {sides[0]:g}, {sides[1]:g}"
             )
         return int(sides[0]), int(sides[1])
-    found = find(shelf.folder, file, where)
-    alike = [name for name in shelf.by_last_parts(file) if is_readable(name)] if found is None else []
+    found = find(index.folder, file, where)
+    alike = [name for name in index.by_last_parts(file) if is_readable(name)] if found is None else []
     if len(alike) == 1:
-        found = inside(shelf.folder, alike[0], where)
+        found = inside(index.folder, alike[0], where)
     if found is None:
         return None
     header = read_header(found)

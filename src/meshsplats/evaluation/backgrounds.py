@@ -208,7 +208,7 @@ def _warn_of_profiles(
             )
 
 
-def warn_of_other_worlds(found: Background) -> None:
+def warn_of_frame_mismatch(found: Background) -> None:
     """Issues a DataWarning if the scene that was scored shows almost nothing of the photographs, with the
     likely reason: another frame, a scene that is nearly empty or tiny, or other colours."""
     scores = found.psnr.get(found.judge)
@@ -354,5 +354,5 @@ def choose_background(
     named = None if source is None else model_background(source)
     found = find_background(photographs, scenes, given=given, named=named, threads=threads)
     if whole:
-        warn_of_other_worlds(found)
+        warn_of_frame_mismatch(found)
     return found

@@ -18,7 +18,7 @@ from meshsplats.evaluation.backgrounds import (
     Background,
     find_background,
     model_background,
-    warn_of_other_worlds,
+    warn_of_frame_mismatch,
 )
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, evaluate
 from meshsplats.evaluation.strips import markdown_table
@@ -236,7 +236,7 @@ class _Scenes:
         judged = {"splats" if isinstance(scene, GaussianCloud) else "mesh": scene}
         named = model_background(source)
         chosen = find_background(dataset, judged, given=self.background, named=named, threads=self.threads)
-        warn_of_other_worlds(chosen)
+        warn_of_frame_mismatch(chosen)
         dataset = dataset.over(chosen.color)
         return self.score(name, dataset, chosen, self.prepare(scene, dataset))
 

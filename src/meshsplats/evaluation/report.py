@@ -279,7 +279,7 @@ def masked_ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None, threads: 
     x, y = (np.ascontiguousarray(p[None], np.float32) for p in (a, b))
     inside = None if mask is None else np.ascontiguousarray(mask[None])
     pixels = a.shape[0] * a.shape[1] if mask is None else int(mask.sum())
-    return compare_images(x, y, inside, ssim_rate=1, threads=threads).ssim / (pixels * a.shape[2])
+    return compare_images(x, y, inside, ssim_weight=1, threads=threads).ssim / (pixels * a.shape[2])
 
 
 def exposure_between(

@@ -19,7 +19,7 @@ class Rates(NamedTuple):
 
 
 class StepImage(NamedTuple):
-    """The image of a whole step, and what it is compared with."""
+    """The image of a fused step, and what it is compared with."""
 
     camera: Camera
     options: TapeOptions

@@ -40,7 +40,7 @@ class Loss(Protocol):
         [0, 1] are possible. Pixels that do not count have a gradient of 0."""
 
 
-class LossRates(NamedTuple):
+class LossWeights(NamedTuple):
     """Derivatives of the default loss with respect to sums over all channels of the pixels that count."""
 
     l1: float
@@ -70,10 +70,10 @@ class DefaultLoss:
     def of(cls, config: FinetuneConfig, threads: int | None = None) -> DefaultLoss:
         return cls(config.ssim_weight, config.l2_weight, threads)
 
-    def rates(self, target: Target) -> LossRates:
+    def rates(self, target: Target) -> LossWeights:
         mask, share = target.mask, self.ssim_weight
         count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
-        return LossRates((1 - share) / count, -share / count, self.l2_weight / count, share)
+        return LossWeights((1 - share) / count, -share / count, self.l2_weight / count, share)
 
     def __call__(self, image: np.ndarray, target: Target, /) -> tuple[float, np.ndarray]:
         mask = target.mask
@@ -82,8 +82,8 @@ class DefaultLoss:
             image[None],
             target.color[None],
             None if mask is None else mask[None],
-            l1_rate=rates.l1,
-            ssim_rate=rates.ssim,
+            l1_weight=rates.l1,
+            ssim_weight=rates.ssim,
             gradient=True,
             threads=self.threads,
         )

@@ -168,7 +168,7 @@ class _Weighted(torch.autograd.Function):
         inside = None if mask is None else _batch(mask, 3)
         l1_weight, ssim_weight, constant = weights
         rates: dict[str, Any] = dict(
-            l1_rate=l1_weight / count, ssim_rate=ssim_weight / count, threads=threads
+            l1_weight=l1_weight / count, ssim_weight=ssim_weight / count, threads=threads
         )
         wanted = [needed and gradients for needed in ctx.needs_input_grad[:2]]
         result = compare_images(x, y, inside, gradient=wanted[0], **rates)

@@ -17,11 +17,11 @@ from meshsplats.finetuning.checkpoint import mesh_arrays, reading_arrays, stored
 from meshsplats.finetuning.config import HARMONICS_RATE, FinetuneConfig, epsilons
 from meshsplats.finetuning.gradients import Gradients, Rates, StepImage
 from meshsplats.finetuning.initial import boundary_vertices, order_of, vertex_sizes
-from meshsplats.finetuning.loss import LossRates
+from meshsplats.finetuning.loss import LossWeights
 from meshsplats.rendering.backward import TapeOptions
 from meshsplats.rendering.devices import engine
 from meshsplats.rendering.edges import faces_across
-from meshsplats.rendering.engine import Need, Taped, WholeSteps
+from meshsplats.rendering.engine import FusedSteps, Need, Taped
 from meshsplats.scene.camera import Camera
 from meshsplats.scene.colors import srgb_to_linear
 from meshsplats.scene.mesh import MAX_COLOR, SplatMesh, Triangles, solid_faces
@@ -38,7 +38,7 @@ class State:
     """The optimisation state.
 
     Attributes:
-        vertices: (v, 3) float32, scene units, changed in place. After whole steps of the engine, they are
+        vertices: (v, 3) float32, scene units, changed in place. After fused steps of the engine, they are
             fetched when they are read.
         colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, likewise. With harmonics
             RGB may be above 1.
@@ -67,7 +67,7 @@ class State:
         self.mesh, self.sizes, self.config, self.threads = mesh, sizes, config, threads
         self.device: Device = device
         self._session = engine(device, threads).session(mesh)
-        self._ahead: WholeSteps | None = None  # has taken steps that the arrays here do not have
+        self._ahead: FusedSteps | None = None  # has taken steps that the arrays here do not have
         self._vertices, self._rgba = mesh.vertices.copy(), mesh.colors.copy()
         self.exposures = None if exposures is None else exposures.copy()
         adam = partial(RowAdam, betas=(config.beta1, config.beta2), threads=threads)
@@ -325,11 +325,11 @@ class State:
             colors[:, 3] *= factors
         return self._session.tape(self.triangles._replace(colors=colors), camera, options)
 
-    def whole_steps(self, camera: Camera, needs: Collection[Need]) -> WholeSteps | None:
-        """What takes whole steps with images of this camera, in ``whole_step``; None: only ``step`` does."""
-        return self._session.whole_steps(camera, self.needs.union(needs))
+    def fused_steps(self, camera: Camera, needs: Collection[Need]) -> FusedSteps | None:
+        """What takes fused steps with images of this camera, in ``fused_step``; None: only ``step`` does."""
+        return self._session.fused_steps(camera, self.needs.union(needs))
 
-    def whole_step(self, steps: WholeSteps, image: StepImage, loss: LossRates, rates: Rates) -> Sums:
+    def fused_step(self, steps: FusedSteps, image: StepImage, loss: LossWeights, rates: Rates) -> Sums:
         """One step that ``steps`` take, with all that belongs to it. ``rates``: learning rates of colours and
         of positions.
 

@@ -19,7 +19,7 @@ from meshsplats.finetuning.opaque import expected_error
 from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapeOptions
 from meshsplats.rendering.edges import edge_gradients
-from meshsplats.rendering.engine import Need, Taped, WholeSteps
+from meshsplats.rendering.engine import FusedSteps, Need, Taped
 from meshsplats.rendering.shading import shaded
 from meshsplats.scene.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.scene.draw_order import DrawOrder
@@ -281,9 +281,9 @@ def make_step(
     plan = plan._replace(dropout=dropout_share(config, step / len(views)))
     needs: list[Need] = ["loss"] if default is None else []
     needs += ["dropout"] if plan.dropout else []
-    steps = state.whole_steps(view.camera, needs)
+    steps = state.fused_steps(view.camera, needs)
     if steps is not None and default is not None:
-        return _whole_step(state, steps, view, step, plan, target, default)
+        return _fused_step(state, steps, view, step, plan, target, default)
     found = view_gradients(state, (index, view), step, plan, target, loss)
     state.step(found.gradients, plan.color_rate, plan.position_rate, index, edges=found.edges)
     return found.loss
@@ -338,13 +338,13 @@ def view_gradients(
     return ViewGradients(value, gradients, edges is not None)
 
 
-def _whole_step(
-    state: State, steps: WholeSteps, view: View, step: int, plan: Plan, target: Target, loss: DefaultLoss
+def _fused_step(
+    state: State, steps: FusedSteps, view: View, step: int, plan: Plan, target: Target, loss: DefaultLoss
 ) -> float:
     """``make_step`` where the loss and Adam are with the image, too."""
     image = StepImage(view.camera, tape_options(state, target.background, plan), target.color, target.mask)
     by_sums = loss.rates(target)
-    sums = state.whole_step(steps, image, by_sums, Rates(plan.color_rate, plan.position_rate))
+    sums = state.fused_step(steps, image, by_sums, Rates(plan.color_rate, plan.position_rate))
     value = by_sums.loss(*sums[:3])
     if not (np.isfinite(value) and sums.finite):
         raise _divergence(step, view, "a gradient" if np.isfinite(value) else "the loss")

@@ -58,7 +58,7 @@ def load_base(
     """The mesh in a file that ``load_mesh`` reads, with its vertex colours, if it has any, and textures.
 
     Vertices and triangles are those of ``load_mesh``. Textures are read from glTF (base colour, with the
-    colours of vertices that multiply it), from USD (``diffuseColor`` of UsdPreviewSurface), from the material
+    vertex colours that multiply it), from USD (``diffuseColor`` of UsdPreviewSurface), from the material
     library beside an `.obj` (``map_Kd``), and as a `.ply` names them (comment TextureFile); image files must
     lie in the folder of the mesh or below, or in the same `.usdz`.
     Faces whose texture is missing or of an unknown kind count as untextured, with a DataWarning.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def examine() -> dict[str, Any]:
     """Findings, ready for JSON: versions, threads, whether the core and the GPU draw a triangle and have its
-    gradient, what draws colours that depend on the view here, the libraries of each extra, and the
+    gradient, what draws view-dependent colours here, the libraries of each extra, and the
     requirements that are missing, in pip's form."""
     import meshsplats
     from meshsplats._core.library import processors
@@ -65,7 +65,7 @@ def in_words(findings: dict[str, Any]) -> list[str]:
     state = "renders and differentiates correctly" if gpu["works"] else gpu["problem"]
     lines.append("gpu: " + "; ".join(filter(None, (gpu["adapter"], state))))
     drawing = ", ".join(findings["harmonics_drawn_by"]) or "nothing"
-    lines.append(f"colours that depend on the view: drawn by {drawing}; other programs show plain ones")
+    lines.append(f"view-dependent colours: drawn by {drawing}; other programs show plain ones")
     lines.append("libraries: " + _listed(findings["required"]))
     for extra, libraries in findings["extras"].items():
         missing = findings["to_install"].get(extra)

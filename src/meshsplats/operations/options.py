@@ -72,7 +72,7 @@ class BakingOptions:
 
     views: SceneViews = field(default_factory=SceneViews)
     colors: bool = False
-    """Replace colours that depend on the view by their mean over these views, for programs that show them the
+    """Replace view-dependent colours by their mean over these views, for programs that show them the
     same from everywhere."""
     filter_px2: float | None = None
     """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""

@@ -78,8 +78,8 @@ class MeshPrior:
 
         Every vertex is the barycentric combination of the posed corners of its face, which layers above 0
         have moved along the posed base's normals. Where an affine map mirrors the whole base, its triangles
-        are seen from behind: normals and layers then are on the other side of them, and colours that depend
-        on the view are mirrored.
+        are seen from behind: normals and layers then are on the other side of them, and view-dependent
+        colours are mirrored.
 
         Args:
             vertices: (n, 3) posed positions of the base's vertices, relative to the origin of the mesh; the

@@ -72,7 +72,7 @@ class CpuSession:
     def tape(self, triangles: Triangles, camera: Camera, options: TapeOptions) -> TapedRendering:
         return self.engine.tape(triangles, camera, options)
 
-    def whole_steps(self, camera: Camera, needs: Collection[Need]) -> None:
+    def fused_steps(self, camera: Camera, needs: Collection[Need]) -> None:
         return None
 
     def release(self) -> None:

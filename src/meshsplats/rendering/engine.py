@@ -32,8 +32,8 @@ Need = Literal[
 ]
 """What a run may ask of steps beyond positions and colours that follow the default loss: gradients for a
 cutoff; positions on a base mesh; exposures of images; blending in linear light; opacities that decay; fans
-that are rounded between steps; frozen vertices; triangles that share a depth; a custom loss; colours
-that depend on the view; the order of a file; splats that a step leaves out."""
+that are rounded between steps; frozen vertices; triangles that share a depth; a custom loss; view-dependent
+colours; the order of a file; splats that a step leaves out."""
 
 
 def check_device(device: str) -> None:
@@ -108,7 +108,7 @@ class Taped(Protocol):
         """Adds vertex gradients to the arrays given; see ``backward.TapedRendering.backward``."""
 
 
-class WholeSteps(Protocol):
+class FusedSteps(Protocol):
     """Steps whose loss and optimiser run where the images are drawn."""
 
     def step(
@@ -147,12 +147,12 @@ class Session(Protocol):
     def tape(self, triangles: Triangles, camera: Camera, options: TapeOptions) -> Taped:
         """``Engine.tape``, in windows that a resumed run has, too."""
 
-    def whole_steps(self, camera: Camera, needs: Collection[Need]) -> WholeSteps | None:
+    def fused_steps(self, camera: Camera, needs: Collection[Need]) -> FusedSteps | None:
         """What takes steps with images of this camera for a run that ``needs`` these; None: the run does it,
         with images and gradients from here."""
 
     def release(self) -> None:
-        """To be called before the run changes its arrays, into which whole steps were fetched."""
+        """To be called before the run changes its arrays, into which fused steps were fetched."""
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps."""

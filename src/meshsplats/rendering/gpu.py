@@ -35,7 +35,7 @@ CANNOT: Mapping[Need, str] = {
     "file order": "order 'file' needs device 'cpu': the GPU draws sorted fragments and splats alone",
 }
 """What is refused, and how."""
-RUN_BY_RUN: frozenset[Need] = frozenset(
+NOT_FUSED: frozenset[Need] = frozenset(
     (
         "base mesh",
         "exposure",
@@ -299,7 +299,7 @@ class GpuRendering:
 
 
 class GpuSession:
-    """A run on the GPU, where positions, colours and moments stay between whole steps.
+    """A run on the GPU, where positions, colours and moments stay between fused steps.
 
     Attributes:
         limit: of its windows: rounding depends on them, so a resumed run has the same.
@@ -313,9 +313,9 @@ class GpuSession:
     def tape(self, triangles: Triangles, camera: Camera, options: TapeOptions) -> GpuRendering:
         return self._engine.tape(triangles, camera, options, limit=self.limit)
 
-    def whole_steps(self, camera: Camera, needs: Collection[Need]) -> GpuSession | None:
+    def fused_steps(self, camera: Camera, needs: Collection[Need]) -> GpuSession | None:
         device = open_device()
-        able = RUN_BY_RUN.isdisjoint(needs) and camera.width * camera.height <= most_pixels(device)
+        able = NOT_FUSED.isdisjoint(needs) and camera.width * camera.height <= most_pixels(device)
         return self if able and harmonics_fit(device, self._mesh) else None
 
     def step(
@@ -327,7 +327,7 @@ class GpuSession:
         mask: np.ndarray | None,
         rates: Rates,
     ) -> Sums:
-        """``WholeSteps.step``."""
+        """``FusedSteps.step``."""
         settings = DrawSettings(
             samples=options.samples,
             min_transmittance=options.min_transmittance,

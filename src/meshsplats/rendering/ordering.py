@@ -116,7 +116,7 @@ def drawing_order(
     """The order in which viewers that cull and do not sort should blend the triangles of ``mesh``: for
     ``save_mesh(mesh, "scene.glb", order=...)``.
 
-    A viewer that culls back sides shows one of the two windings of a triangle, so each has a place of its
+    A viewer that culls back faces shows one of the two windings of a triangle, so each has a place of its
     own in the order: two triangles may cover each other one way when seen from here, and the other way from
     behind. The order is solved: pairs of planar pieces of splats that overlap in views are counted by what
     a pixel would lose if the nearer one, by its centre, came first; pieces are moved until little is lost. It

@@ -1,4 +1,4 @@
-"""plain_colors_of: colours of vertices that are the same from everywhere, for programs without harmonics."""
+"""plain_colors_of: vertex colours that are the same from everywhere, for programs without harmonics."""
 
 from __future__ import annotations
 

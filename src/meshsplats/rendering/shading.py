@@ -1,4 +1,4 @@
-"""Shading: the colours of vertices in a view, where splats have spherical harmonics, and its backward pass.
+"""Shading: the vertex colours in a view, where splats have spherical harmonics, and its backward pass.
 
 It comes before rasterisation, so whatever draws triangles knows no harmonics.
 """
@@ -24,7 +24,7 @@ def camera_center(camera: Camera, pose: np.ndarray | None = None) -> np.ndarray:
 
 
 class Shading:
-    """Colours of vertices as a camera sees them.
+    """Vertex colours as a camera sees them.
 
     Concretely, vertex i of splat s has the display colour ``max(0, colors[i, :3] + B @ harmonics[s])``, where
     B are real spherical harmonics of degree 1 and more (``sh_basis(d, degree)[1:]``) in the unit direction d

@@ -25,7 +25,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
             "textures need the extra 'base', with Python 3.11 or newer: pip install uvunwrap. Without it,"
-            " texture=0 (--texture 0) gives colours of vertices"
+            " texture=0 (--texture 0) gives vertex colours"
         ) from error
     points = np.ascontiguousarray(vertices, np.float32)
     try:
@@ -55,7 +55,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
 
 def cells(count: int, side: int) -> np.ndarray:
     """(count, 3, 2) float32 texture coordinates of as many triangles, each by itself, two in each square cell
-    of a grid: without seams that anybody sees, as the colours of vertices need none."""
+    of a grid: without seams that anybody sees, as the vertex colours need none."""
     across = int(np.ceil(np.sqrt(-(-count // 2))))
     cell, corner = divmod(np.arange(count), 2)
     size = side / across

@@ -169,7 +169,7 @@ def draw_surface(
     threads: int | None = None,
 ) -> np.ndarray:
     """(h, w, 3) float32 image of an opaque mesh with one texture or with vertex colours, unlit: display RGB,
-    the mean over 2 x 2 samples of each pixel. A texture with tints is drawn as colours of vertices
+    the mean over 2 x 2 samples of each pixel. A texture with tints is drawn as vertex colours
     (``texture_to_vertex_colors``).
 
     Args:

@@ -30,7 +30,7 @@ class SurfaceOptions:
     """Approximate largest number of triangles; 0: as many as the voxels give. Default: 20,000 of closed
     surfaces, 60,000 of open ones, or as many as an atlas can be made of."""
     texture: Annotated[int | None, Range(0, MAX_TEXTURE)] = None
-    """Side of the texture in texels; 0: colours of vertices instead. Default: 2048 for closed surfaces, 4096
+    """Side of the texture in texels; 0: vertex colours instead. Default: 2048 for closed surfaces, 4096
     for open ones."""
     normal_map: Annotated[bool, With("texture")] = True
     """Keep the relief of the finest triangles as a normal map, of a quarter of the texture's side."""

@@ -105,7 +105,7 @@ class TilingOptions:
     """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
     colors: Literal["base", "view"] | None = None
     """base: one colour for each splat, which every program shows; the default of meshes. view: also the
-    harmonics of colours that depend on the view, for this program's images and for shaders; 1.6 to 2 times
+    harmonics of view-dependent colours, for this program's images and for shaders; 1.6 to 2 times
     as large."""
     color_degree: int | None = None
     """Harmonics of 'view' up to this degree, 1 to 3. Default: all that the splats have."""

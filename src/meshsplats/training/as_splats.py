@@ -161,7 +161,7 @@ class _FansOfSplats(State):
 
     @property
     def needs(self) -> set[Need]:
-        return super().needs | {"frozen"}  # whole steps of a GPU would not keep them together
+        return super().needs | {"frozen"}  # fused steps of a GPU would not keep them together
 
 
 @lru_cache

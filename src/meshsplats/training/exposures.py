@@ -22,9 +22,9 @@ FEWEST_VIEWS, FEWEST_PIXELS = 3, 200
 CHANGES = 0.7
 """Exposures differ where a fit leaves less than this share of the median view's squared error. At the start
 of a training: 0.89 to 0.99 in four data sets and two own scenes of constant light, 0.38 to 0.69 in these
-with gains from 0.6 to 1. dtu65 is on the border, with 0.67 to 0.72: its light changes little, colours that
-depend on the view suffice, and its held-out photographs, of which no exposure is known, have 30.0 dB without
-the fit, 29.5 with it."""
+with gains from 0.6 to 1. dtu65 is on the border, with 0.67 to 0.72: its light changes little, view-dependent
+colours suffice, and its held-out photographs, of which no exposure is known, have 30.0 dB without the fit,
+29.5 with it."""
 
 
 def exposures_differ(mesh: SplatMesh, views: Sequence[View], threads: int | None = None) -> bool:

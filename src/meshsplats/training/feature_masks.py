@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._common.arrays import subsample
-from meshsplats.datasets.image_files import Album
+from meshsplats.datasets.image_files import PhotoLoader
 from meshsplats.datasets.photo_file import light_of_mask
 from meshsplats.datasets.views import ImageCache
 from meshsplats.errors import DataWarning
@@ -42,7 +42,7 @@ class FeatureMasks:
     def __init__(self, folder: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # which load_dataset gives
-            self._found = Album(folder, 1, ImageCache(0)).masks_of(names, sizes, str(folder))
+            self._found = PhotoLoader(folder, 1, ImageCache(0)).masks_of(names, sizes, str(folder))
         self._sizes = sizes
 
     def __bool__(self) -> bool:

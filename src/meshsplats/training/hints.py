@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from meshsplats._common.words import plural
 from meshsplats.datasets.colmap import image_names
-from meshsplats.datasets.image_files import Shelf
+from meshsplats.datasets.image_files import ImageIndex
 from meshsplats.datasets.layouts import Layout, photographs_beneath
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.outputs import CONFIGURATION
@@ -70,7 +70,7 @@ def say_what_has_no_camera(layout: Layout, say: Callable[[str], None]) -> None:
         }
     except FileFormatError:
         return  # its reader says so
-    there = Shelf(layout.root / layout.images).images()
+    there = ImageIndex(layout.root / layout.images).images()
     without = [name for name in there if Path(name).stem.casefold() not in known]
     if without and len(without) < len(there):
         say(

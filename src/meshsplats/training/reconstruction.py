@@ -24,7 +24,7 @@ from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
 from meshsplats._core.library import thread_count
 from meshsplats._files.atomic import together, write_bytes, write_text
-from meshsplats.datasets.image_files import Shelf, inside
+from meshsplats.datasets.image_files import ImageIndex, inside
 from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.outputs import PREVIEW
@@ -71,7 +71,7 @@ def bare_photographs(folder: Path) -> list[Path]:
 
 def _photographs(folder: Path) -> list[Path]:
     for name in image_folders(folder):
-        paths = [folder / name / image for image in Shelf(folder / name).images()]
+        paths = [folder / name / image for image in ImageIndex(folder / name).images()]
         if found := [path for path in paths if not _is_preview(path)]:
             return found
     return []
@@ -180,7 +180,7 @@ def find_cameras(
             "is in the place of the points that come with the cameras: move it away",
             str(folder / POINTS),
         )
-    if unread := Shelf(photographs[0].parent).unread():
+    if unread := ImageIndex(photographs[0].parent).unread():
         warnings.warn(
             f"{folder}: {len(unread)} images are of kinds that are not read, and are left out:"
             f" {shortened(unread)}",

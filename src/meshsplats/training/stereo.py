@@ -1,8 +1,8 @@
 """Multi-view stereo: each photograph is matched with a few others, and depths that these do not confirm
 (geometric consistency) are dropped.
 
-The core sweeps planes at half the size and improves slanted windows at the whole (csrc/stereo.h). Here: which
-photographs are matched, which depths stay, and what is filled in between.
+The core runs a plane sweep at half the resolution and PatchMatch with slanted windows at the full one
+(csrc/stereo.h). Here: which photographs are matched, which depths stay, and what is filled in between.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from meshsplats._core.stereo import (
     Pairs,
     Planes,
     SurfaceArrays,
+    count_consistent,
     count_views,
-    count_witnesses,
     fill_depths,
     match_photos,
 )
@@ -37,10 +37,10 @@ REFERENCES = 64
 PLANES = 128
 """Depths that are tried at half the size, evenly spaced in inverse depth."""
 ROUNDS = 1
-"""Times that slanted windows are improved."""
+"""Iterations of PatchMatch."""
 SOURCES = 5
 """Views that each view is matched with."""
-JUDGES = 12
+NEIGHBORS = 12
 """Views with depths that confirm or refute those of a view, at most."""
 ANGLES = (2.5, 8.0, 30.0)
 """Least, best and greatest angle in degrees between two views of a pair, seen from points in both."""
@@ -51,8 +51,8 @@ LEAST_SUITED = 0.005
 MIN_CORRELATION = 0.5
 AGREEMENT, PAST = 0.01, 0.03
 """Relative differences of depth up to which two views agree, and from which one sees past the other."""
-WITNESSES = 2
-"""Views that must confirm a depth..."""
+CONSISTENT = 2
+"""Views that must be consistent with a depth..."""
 FEW = 3
 """... but one is enough where only so many views have the place in their image."""
 OUTLINE = 2
@@ -63,7 +63,7 @@ MATCHED_BYTES, PHOTO_BYTES = 150, 20
 """Memory of a pixel of a view whose depths are found, and of a photograph that takes part."""
 FILL_AGREEMENT, FILL_PAST = 0.03, 0.05
 """The same as ``AGREEMENT`` and ``PAST`` for filled depths."""
-FILL_WITNESSES = 3
+FILL_CONSISTENT = 3
 """Views whose filled depths must agree."""
 FILL_PER_PIXEL = 0.3
 """Cost of filling across a pixel, in differences of colour from 0 to 255."""
@@ -144,7 +144,7 @@ def find_depths(
     suited = suited_views(cameras, points, chosen)
     sources = [_spread(cameras, i, *found) for i, found in zip(chosen, suited, strict=True)]
     place = {view: i for i, view in enumerate(chosen)}
-    judges = _table([[place[j] for j in order if j in place] for order, _ in suited], JUDGES)
+    neighbors = _table([[place[j] for j in order if j in place] for order, _ in suited], NEIGHBORS)
     # Thousands of photographs would not fit: only those that take part are read.
     read = sorted({*chosen, *(j for row in sources for j in row)})
     photos = _layout([cameras[i] for i in read])
@@ -165,8 +165,8 @@ def find_depths(
     pixels = np.concatenate([np.arange(photos.start[i], photos.start[i + 1]) for i in own])
     color, counted = color[pixels], counted[pixels]
     fits = counted & (planes.score > MIN_CORRELATION)
-    sure = confirmed(matched, planes, fits, judges, threads)
-    filled = between(matched, color, planes._replace(inverse=sure), counted, judges, threads)
+    sure = confirmed(matched, planes, fits, neighbors, threads)
+    filled = between(matched, color, planes._replace(inverse=sure), counted, neighbors, threads)
     return Depths(matched, tuple(cameras[i] for i in chosen), color, planes, sure, filled)
 
 
@@ -243,12 +243,12 @@ def _table(rows: Sequence[Sequence[int]], width: int) -> np.ndarray:
 
 
 def confirmed(
-    views: Layout, planes: Planes, fits: np.ndarray, judges: np.ndarray, threads: int | None = None
+    views: Layout, planes: Planes, fits: np.ndarray, neighbors: np.ndarray, threads: int | None = None
 ) -> np.ndarray:
     """(pixels,) float32 inverse depths that the depths of other views confirm, of those that ``fits``."""
     inverse = np.where(fits, planes.inverse, 0).astype(np.float32)
-    found = count_witnesses(views, inverse, inverse, judges, (AGREEMENT, PAST), threads)
-    enough = (found.agree >= WITNESSES) | ((found.agree >= 1) & (found.seen <= FEW))
+    found = count_consistent(views, inverse, inverse, neighbors, (AGREEMENT, PAST), threads)
+    enough = (found.agree >= CONSISTENT) | ((found.agree >= 1) & (found.seen <= FEW))
     good = (inverse > 0) & enough & (found.past <= found.agree)
     sure = np.where(good, inverse, 0).astype(np.float32)
     for i in range(len(views)):
@@ -262,7 +262,7 @@ def between(
     color: np.ndarray,
     planes: Planes,
     counted: np.ndarray,
-    judges: np.ndarray,
+    neighbors: np.ndarray,
     threads: int | None = None,
 ) -> np.ndarray:
     """(pixels,) float32 inverse depths where ``planes`` has none, on walls without texture, say: continued
@@ -276,9 +276,9 @@ def between(
     whole = fill_depths(views, color, planes, seeds, per_pixel=FILL_PER_PIXEL, threads=threads)
     whole = np.where(sure > 0, sure, np.where(counted, whole, 0)).astype(np.float32)
     limits = (FILL_AGREEMENT, FILL_PAST)
-    found = count_witnesses(views, whole, whole, judges, limits, threads)
-    against = count_witnesses(views, whole, sure, judges, limits, threads).past
-    enough = (found.agree >= FILL_WITNESSES) | ((found.agree >= 1) & (found.seen <= FEW))
+    found = count_consistent(views, whole, whole, neighbors, limits, threads)
+    against = count_consistent(views, whole, sure, neighbors, limits, threads).past
+    enough = (found.agree >= FILL_CONSISTENT) | ((found.agree >= 1) & (found.seen <= FEW))
     enough |= found.seen == 0
     return np.where((sure == 0) & enough & (against == 0), whole, 0).astype(np.float32)
 

@@ -157,7 +157,7 @@ class MeshFrames:
         self.upload("digits", digits)
 
     def _upload_colors(self, mesh: SplatMesh) -> None:
-        """What is blended or, for colours that depend on the view, what ``shade`` makes it of."""
+        """What is blended or, for view-dependent colours, what ``shade`` makes it of."""
         if mesh.harmonics is None:
             self.upload("values", mesh.colors)
             return

@@ -100,7 +100,7 @@ class WindowLimit:
 
 
 def harmonics_fit(device: Device, mesh: SplatMesh) -> bool:
-    """Whether whole steps can have the harmonics of ``mesh`` and their moments on the GPU."""
+    """Whether fused steps can have the harmonics of ``mesh`` and their moments on the GPU."""
     if mesh.harmonics is None:
         return True
     few = len(mesh.harmonics) <= MAX_WORKGROUPS * FANS_IN_WORKGROUP

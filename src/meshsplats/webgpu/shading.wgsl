@@ -1,4 +1,4 @@
-// Shading: colours of vertices in a view, where splats have spherical harmonics. On harmonics.wgsl, the
+// Shading: vertex colours in a view, where splats have spherical harmonics. On harmonics.wgsl, the
 // bindings of lists.wgsl, and:
 //
 // A vertex of splat s has the colour max(0, RGB + sum_k b_k(d) h_sk), with the unit vector d from the camera

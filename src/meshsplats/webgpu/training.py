@@ -99,7 +99,7 @@ TRAINING = GRADIENTS._replace(pipeline=_pipeline, uniforms=GRADIENTS.uniforms | 
 
 
 def most_pixels(device: Device) -> int:
-    """Most pixels of an image of a whole step."""
+    """Most pixels of an image of a fused step."""
     return device.binding_limit // DERIVATIVE_BYTES
 
 

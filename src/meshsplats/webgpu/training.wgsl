@@ -9,7 +9,7 @@ struct Step {
   tiles: u32,                            // of the window
   background: vec3f,                     // RGB
   position_epsilon: f32,                 // Adam's for positions
-  l1_rate: f32, ssim_rate: f32, l2_rate: f32,  // derivatives of the loss with respect to the sums
+  l1_weight: f32, ssim_weight: f32, l2_weight: f32,  // derivatives of the loss with respect to the sums
   color_epsilon: f32,                    // Adam's for colours
   color_step: f32, position_step: f32,   // learning rates with bias corrections; 0: positions are fixed
   one_minus_beta1: f32, one_minus_beta2: f32,
@@ -224,8 +224,8 @@ fn find_image_gradient(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocati
     let own = pixel_at(here.x, here.y, c);
     let d = own.x - own.y;
     let m = 0.5 * (own.x + own.y) - 0.5;
-    gradient[c] = own.z * (step_of.l1_rate * sign(d) + step_of.l2_rate * 2.0 * d
-      + step_of.ssim_rate * (f.x + 2.0 * d * f.y + m * f.z));
+    gradient[c] = own.z * (step_of.l1_weight * sign(d) + step_of.l2_weight * 2.0 * d
+      + step_of.ssim_weight * (f.x + 2.0 * d * f.y + m * f.z));
     workgroupBarrier();
   }
   if (here.x < i32(step_of.width) && here.y < i32(step_of.height)) {

@@ -1,5 +1,5 @@
 """Splats that were turned under their object: by *Apply* or *Join*, in edit mode, or by modifiers. Blender
-turns their vertices, but not what else is in the frame of the object: colours that depend on the view, and
+turns their vertices, but not what else is in the frame of the object: view-dependent colours, and
 shading normals.
 
 So each vertex knows in which direction from the middle of its splat it lay when these were right.
@@ -56,7 +56,7 @@ def remember(data: Any) -> None:
 
 
 def follow(data: Any) -> None:
-    """Turns colours that depend on the view and shading normals of the mesh ``data`` as its splats were
+    """Turns view-dependent colours and shading normals of the mesh ``data`` as its splats were
     turned since the last time."""
     splats = _splats(data) if REST in data.attributes else None
     turned = None if splats is None else _turned(data, splats)

@@ -1,5 +1,5 @@
 """Triangles in an order of blending: each is in the file twice, once with each winding, of which viewers that
-cull back sides show one. The reader drops the second copy.
+cull back faces show one. The reader drops the second copy.
 
 Little more than flags is stored for that. The two windings of a triangle are (a, b, c) and (a, c, b), so that
 they are found by their corners and sorted by them: bits in this order tell which is the triangle's own, and

@@ -23,7 +23,7 @@ class Look(NamedTuple):
     cutoff: float
     """Of the alpha mode MASK."""
     emits: bool
-    """Whether it is the light of the material's own, which colours of vertices do not change."""
+    """Whether it is the light of the material's own, which vertex colours do not change."""
 
 
 def look_of(document: GltfDocument, primitive: dict[str, Any]) -> Look:

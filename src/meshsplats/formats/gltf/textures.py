@@ -173,7 +173,7 @@ class _Textures:
         ``look`` by (glTF 2.0, 3.9.2); None where they are white."""
         if "COLOR_0" not in attributes or look.emits:
             return None
-        self.document.budget.spend(16 * v, "colours of vertices")
+        self.document.budget.spend(16 * v, "vertex colours")
         tint = linear_colors(self.document, attributes, v).clip(0, 1)
         if look.alpha_mode != "BLEND":
             self.uncut += look.alpha_mode == "MASK" and bool((tint[:, 3] != 1).any())

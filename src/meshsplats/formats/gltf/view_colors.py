@@ -1,4 +1,4 @@
-"""Colours that depend on the view, in glTF. COLOR_0 has those for programs that draw no harmonics.
+"""View-dependent colours, in glTF. COLOR_0 has those for programs that draw no harmonics.
 
 Every vertex has those of its splat: a shader needs no table, and compression removes what is repeated. As
 attributes of the application: ``_BASE``, display RGB and opacity, divided by ``base`` in our note, and four

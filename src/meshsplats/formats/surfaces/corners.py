@@ -123,7 +123,7 @@ def warn_of_tints(base: BaseMesh, target: Path) -> None:
     """DataWarning where the texture of ``base`` has tints, which the format of ``target`` does not keep."""
     if base.textured and base.tints is not None:
         warnings.warn(
-            f"{target.name}: left out are the colours of vertices by which the texture is multiplied, which"
+            f"{target.name}: left out are the vertex colours by which the texture is multiplied, which"
             " only .glb keeps beside a texture",
             DataWarning,
             stacklevel=3,

@@ -1,4 +1,4 @@
-"""Textures as colours of vertices, for whatever draws or writes these alone."""
+"""Textures as vertex colours, for whatever draws or writes these alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _AT_ONCE = 1_000_000
 
 
 def texture_to_vertex_colors(base: BaseMesh, triangles: int = TRIANGLES) -> SplatMesh:
-    """``base`` with its textures as colours of vertices: triangles with a texture are divided where it has
+    """``base`` with its textures as vertex colours: triangles with a texture are divided where it has
     more texels than they have corners, up to two for a texel, and into at most ``triangles`` in all. A mesh
     without textures keeps its triangles, and its colours, else it is grey."""
     need(BaseMesh, base=base)

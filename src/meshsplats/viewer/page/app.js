@@ -2,7 +2,7 @@
 
 import { add, nearestVertex } from "./camera.js";
 import { Contents, connectOptions } from "./contents.js";
-import { Pilot, connect, connectPanel, fillCameras } from "./controls.js";
+import { ViewController, connect, connectPanel, fillCameras } from "./controls.js";
 import { CropBox } from "./crop.js";
 import { ExactRenderer } from "./exact.js";
 import { SortedRenderer } from "./sorted.js";
@@ -21,7 +21,7 @@ const LOST = "The graphics device was lost. If it does not come back by itself, 
 
 const PHONE = 600; // CSS pixels of the shorter side of a screen, below which a device with touch is a phone
 
-export class App extends Pilot {
+export class App extends ViewController {
   // levels: the meshes that are unpacked, "coarse" and "fine", and the "surface"; unpackFine() gives the
   // fine one, once, where it is not.
   constructor(settings, levels, splats, unpackFine) {

@@ -15,7 +15,7 @@ const FLIES = /^[wasdqe]$/, ZOOMS = /^[+=-]$/, WITH_ALT = /^[[\]]$/; // with Alt
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
 // The view and its motion. What extends it has changed(), which is called when the view is another.
-export class Pilot {
+export class ViewController {
   constructor(settings) {
     this.settings = settings;
     this.view = this.#viewOf(0);
@@ -70,13 +70,13 @@ export class Pilot {
   #move(seconds) { this.view.move(...this.thrust.map(value => value * seconds), this.settings.radius); }
 }
 
-// They move the view of `pilot`, a Pilot with command(name) and pick(x, y), and end its flight to another.
+// They move the view of `controller`, a ViewController with command(name) and pick(x, y), and end its flight to another.
 // radius: of the scene.
-export function connect(stage, pilot, radius) {
+export function connect(stage, controller, radius) {
   const touches = new Map(), keys = new Set();
   const shorter = () => Math.min(stage.clientWidth, stage.clientHeight);
-  const pan = (x, y) => pilot.view.pan(x, y, stage.clientWidth, stage.clientHeight);
-  const grab = () => { pilot.flight = null; };
+  const pan = (x, y) => controller.view.pan(x, y, stage.clientWidth, stage.clientHeight);
+  const grab = () => { controller.flight = null; };
 
   stage.addEventListener("pointerdown", event => {
     if (event.target.closest("#divider")) return;
@@ -99,33 +99,33 @@ export function connect(stage, pilot, radius) {
     const before = pair(touches), x = event.clientX - touch.x, y = event.clientY - touch.y;
     if (x === 0 && y === 0) return;
     Object.assign(touch, { x: event.clientX, y: event.clientY });
-    const { view } = pilot, side = shorter();
+    const { view } = controller, side = shorter();
     if (touches.size >= 2) {
       const after = pair(touches);
       pan(after.x - before.x, after.y - before.y);
       if (after.apart > 10 && before.apart > 10) view.zoom(before.apart / after.apart, radius);
     } else if (touch.pans) {
       pan(x, y);
-    } else if (pilot.flying) {
+    } else if (controller.flying) {
       view.look(x / side * 1.2, -y / side * 1.2);
     } else {
       view.orbit(-x / side * 4, y / side * 4);
     }
-    pilot.changed();
+    controller.changed();
   });
   stage.addEventListener("wheel", event => {
     event.preventDefault();
     grab();
     const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
     const power = pixels * (event.ctrlKey ? PINCH : WHEEL);
-    pilot.view.zoom(Math.exp(Math.max(-MOST, Math.min(MOST, power))), radius);
-    pilot.changed();
+    controller.view.zoom(Math.exp(Math.max(-MOST, Math.min(MOST, power))), radius);
+    controller.changed();
   }, { passive: false });
   stage.addEventListener("contextmenu", event => event.preventDefault());
   stage.addEventListener("dblclick", event => {
     if (event.target.closest("#divider")) return;
     const bounds = stage.getBoundingClientRect();
-    pilot.pick(event.clientX - bounds.left, event.clientY - bounds.top);
+    controller.pick(event.clientX - bounds.left, event.clientY - bounds.top);
   });
 
   const once = {
@@ -140,7 +140,7 @@ export function connect(stage, pilot, radius) {
   });
   const release = () => {
     keys.clear();
-    pilot.fly(keys, false);
+    controller.fly(keys, false);
   };
   document.addEventListener("keydown", event => {
     pressed = null;
@@ -148,23 +148,23 @@ export function connect(stage, pilot, radius) {
     const key = labelOf(event), place = placeOf(event);
     if (event.ctrlKey || event.metaKey || event.altKey && !WITH_ALT.test(key)) return;
     if (event.target.matches("select") || event.target.matches(WITH_ARROWS) && MOVES.test(key)) return;
-    const { view } = pilot, flies = FLIES.test(place), command = once[key] ?? once[place];
+    const { view } = controller, flies = FLIES.test(place), command = once[key] ?? once[place];
     if (flies || key.startsWith("Arrow") || ZOOMS.test(key)) grab();
     if (flies) {
       keys.add(place);
-      pilot.fly(keys, event.shiftKey, !event.repeat);
+      controller.fly(keys, event.shiftKey, !event.repeat);
     } else if (ZOOMS.test(key)) { // before commands: a + may be at the place of a digit
       view.zoom(key === "-" ? 1 / ZOOM : ZOOM, radius);
-      pilot.changed();
+      controller.changed();
     } else if (command) {
-      if (!event.repeat) pilot.command(command);
+      if (!event.repeat) controller.command(command);
     } else if (key.startsWith("Arrow")) {
       const x = Number(key === "ArrowRight") - Number(key === "ArrowLeft");
       const y = Number(key === "ArrowDown") - Number(key === "ArrowUp");
       if (event.shiftKey) pan(-x * STEP * shorter(), -y * STEP * shorter());
-      else if (pilot.flying) view.look(-x * STEP, y * STEP);
+      else if (controller.flying) view.look(-x * STEP, y * STEP);
       else view.orbit(x * STEP * 2, -y * STEP * 2);
-      pilot.changed();
+      controller.changed();
     } else {
       return;
     }
@@ -173,7 +173,7 @@ export function connect(stage, pilot, radius) {
   document.addEventListener("keyup", event => {
     keys.delete(placeOf(event));
     if (event.key === "Meta") keys.clear();
-    pilot.fly(keys, event.shiftKey);
+    controller.fly(keys, event.shiftKey);
   });
   window.addEventListener("blur", release);
 }

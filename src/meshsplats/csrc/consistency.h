@@ -6,16 +6,16 @@
 
 extern "C" {
 
-struct MsWitnesses {
+struct MsConsistency {
     MsViews views;
-    const float *inverse;   // (pixels) inverse depths to be judged; 0: none
-    const float *others;    // (pixels) those that judge them; 0: unknown
-    const int32_t *judges;  // (views.count, judge_count) views that judge each; negative: none
-    // Results, (pixels): judges that see the same place, that see past it, and that have it in the image with
-    // nothing known in front of it.
+    const float *inverse;      // (pixels) inverse depths that are checked; 0: none
+    const float *others;       // (pixels) those that they are checked against; 0: unknown
+    const int32_t *neighbors;  // (views.count, neighbor_count) views that check each; negative: none
+    // Results, (pixels): neighbors that see the same place, that see past it, and that have it in the image
+    // with nothing known in front of it.
     uint8_t *agree, *past, *seen;
     float tolerance, past_tolerance;  // relative to the depth
-    int32_t judge_count;
+    int32_t neighbor_count;
 };
 
 struct MsFilling {
@@ -44,22 +44,22 @@ namespace ms {
 // What is known in front of a place hides it where it is nearer by this much more than what sees past it.
 constexpr float IN_FRONT = 0.02f;
 
-inline void count_witnesses(const MsWitnesses &input) {
+inline void count_consistent(const MsConsistency &input) {
     const MsViews &views = input.views;
     parallel_blocks(views.threads, views.count, 1, [&](int64_t view, int64_t, int) {
-        struct Judge {
+        struct Neighbor {
             Warp warp;
             const float *inverse;
         };
         const MsCamera &camera = views.cameras[view];
-        std::vector<Judge> judges;
-        for (int k = 0; k < input.judge_count; ++k) {
-            const int other = input.judges[view * input.judge_count + k];
+        std::vector<Neighbor> neighbors;
+        for (int k = 0; k < input.neighbor_count; ++k) {
+            const int other = input.neighbors[view * input.neighbor_count + k];
             if (other < 0) continue;
             if (other >= views.count)
                 throw std::invalid_argument("view " + std::to_string(other) + " of " +
                                             std::to_string(views.count));
-            judges.push_back({Warp(camera, views.cameras[other], 0), input.others + views.start[other]});
+            neighbors.push_back({Warp(camera, views.cameras[other], 0), input.others + views.start[other]});
         }
         for (int y = 0; y < camera.height; ++y)
             for (int x = 0; x < camera.width; ++x) {
@@ -67,15 +67,15 @@ inline void count_witnesses(const MsWitnesses &input) {
                 const float q = input.inverse[i], u = (float)x + 0.5f, v = (float)y + 0.5f;
                 int agree = 0, past = 0, seen = 0;
                 if (q > 0)
-                    for (const Judge &judge : judges) {
-                        const Warp &warp = judge.warp;
+                    for (const Neighbor &neighbor : neighbors) {
+                        const Warp &warp = neighbor.warp;
                         const float z = warp.row(2, u, v, q);
                         if (!(z > 1e-6f)) continue;
                         const float column = warp.row(0, u, v, q) / z, row = warp.row(1, u, v, q) / z;
                         if (!(column >= 0 && row >= 0 && column < (float)warp.width &&
                               row < (float)warp.height))
                             continue;
-                        const float known = judge.inverse[(int64_t)row * warp.width + (int)column];
+                        const float known = neighbor.inverse[(int64_t)row * warp.width + (int)column];
                         const float ratio = z / q * known;  // depth there by the depth that is known there
                         seen += !(ratio > 1 + input.past_tolerance + IN_FRONT);
                         if (!(known > 0)) continue;

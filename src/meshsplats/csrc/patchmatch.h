@@ -40,11 +40,11 @@ inline void fit_slopes(int width, int height, const float *inverse, float tolera
         }
 }
 
-class SlantedWindows {
+class PatchMatch {
   public:
     // Depths are between `low` and `high`, inverse. Random changes depend on the pixel alone.
-    SlantedWindows(const GreyImage &grey, const MsCamera &camera, const std::vector<Warp> &warps,
-                   const std::vector<const GreyImage *> &images, float low, float high, const PlaneMaps &maps)
+    PatchMatch(const GreyImage &grey, const MsCamera &camera, const std::vector<Warp> &warps,
+               const std::vector<const GreyImage *> &images, float low, float high, const PlaneMaps &maps)
         : width_(grey.width),
           height_(grey.height),
           pitch_(grey.width + 2 * REACH + 2 * W),
