@@ -20,6 +20,14 @@ def test_samples_are_as_many_as_may_be_and_evenly_spread(count):
         assert set(gaps) == {count // 20}
 
 
+def test_samples_of_large_arrays_where_numbers_have_32_bits(monkeypatch):
+    """By default, those of NumPy 1 on Windows."""
+    real = np.arange
+    monkeypatch.setattr(np, "arange", lambda *a, dtype=np.int32, **more: real(*a, dtype=dtype, **more))
+    chosen = subsample(real(1_000_000), 10_000)
+    assert np.array_equal(chosen, real(10_000, dtype=np.int64) * 100)
+
+
 def test_samples_are_of_the_kind_of_what_they_are_of():
     rows = np.arange(21.0).reshape(7, 3)
     assert np.array_equal(subsample(rows, 3), rows[[0, 2, 4]])

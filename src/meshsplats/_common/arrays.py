@@ -28,7 +28,7 @@ def subsample(items: Sequence[T] | np.ndarray, most: int) -> Sequence[T] | np.nd
     count = len(items)
     if count <= most:
         return items
-    rows = np.arange(most) * count // most
+    rows = np.arange(most, dtype=np.int64) * count // most
     if isinstance(items, np.ndarray):
         return np.asarray(items[rows])
     chosen = [items[i] for i in rows.tolist()]

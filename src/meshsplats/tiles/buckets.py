@@ -201,7 +201,7 @@ class Buckets:
     def _digits(self, key: str, means: np.ndarray, passed: int, size: int) -> np.ndarray:
         depth = len(key) + LEVELS_AT_ONCE
         if depth > DEPTH:
-            return (passed + np.arange(len(means))) * 8**LEVELS_AT_ONCE // size
+            return (passed + np.arange(len(means), dtype=np.int64)) * 8**LEVELS_AT_ONCE // size
         codes = self._cube.codes(means) >> np.uint64(3 * (DEPTH - depth))
         return (codes & np.uint64(8**LEVELS_AT_ONCE - 1)).astype(np.int64)
 

@@ -129,7 +129,7 @@ class TileWriter:
     def _starts(self, key: str, codes: np.ndarray) -> np.ndarray:
         """(9,) first splat of each octant of a cell whose ``codes`` are ascending, and their count."""
         if len(key) >= DEPTH:
-            return np.arange(9) * len(codes) // 8
+            return np.arange(9, dtype=np.int64) * len(codes) // 8
         octants = (codes >> np.uint64(3 * (DEPTH - 1 - len(key)))) & np.uint64(7)
         return np.searchsorted(octants, np.arange(9, dtype=np.uint64))
 
