@@ -78,6 +78,22 @@ def test_executable_is_run_from_another_folder(program, tmp_path, monkeypatch):
     assert launch.command(Path("./blender"))[0] == str(own)
 
 
+def test_executables_of_windows_have_an_ending(program, tmp_path, monkeypatch):
+    """And ``which`` of its Python 3.11 takes no Path."""
+    blender = program("Blender 4.5.0")
+    monkeypatch.setattr(sys, "platform", "win32")
+    asked = []
+
+    def which(name):
+        assert isinstance(name, str)
+        asked.append(name)
+        return str(blender) if name.endswith(".exe") else None
+
+    monkeypatch.setattr(shutil, "which", which)
+    assert launch.command(tmp_path / "Blender 4.5" / "blender")[0] == str(blender)
+    assert asked[-1] == str(tmp_path / "Blender 4.5" / "blender.exe")
+
+
 def test_nothing_is_imported_from_the_current_folder(tmp_path, monkeypatch):
     """It may be a downloaded one, with a json.py in it; temporary files may lie there."""
     monkeypatch.setattr(tempfile, "tempdir", os.curdir)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import subprocess
@@ -24,6 +25,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main, messages
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import print_table
+from meshsplats.cli.messages import one_line
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import PACKAGE, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.gaussians import save_gaussians
@@ -395,3 +397,44 @@ def test_one_splat_that_is_kept_is_no_plural(tmp_path, capsys):
     save_gaussians(cloud(1), tmp_path / "one.ply")
     assert main(["clean", str(tmp_path / "one.ply"), "-o", str(tmp_path / "clean.ply")]) == 0
     assert "\nkept: 1 splat, from [" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("encoding", "written"), [("cp1252", b"\\u573a"), ("utf-8", "\u573a".encode())])
+def test_names_that_standard_output_cannot_encode_end_nothing(tmp_path, monkeypatch, encoding, written):
+    """Redirected, Windows has a code page there, and Python's surrogateescape."""
+    path = tmp_path / "\u573a.ply"
+    save_gaussians(make_scene(200), path)
+    output = io.TextIOWrapper(io.BytesIO(), encoding, errors="surrogateescape")
+    monkeypatch.setattr(sys, "stdout", output)
+    assert main(["convert", str(path), "-o", str(tmp_path / "\u573a.npz"), "--no-preview"]) == 0
+    output.flush()
+    assert written in output.buffer.getvalue()
+
+
+def test_a_pipe_that_is_closed_on_windows(monkeypatch):
+    class Closed(io.StringIO):
+        def write(self, text):
+            raise OSError(22, "Invalid argument")
+
+    closed = []
+    monkeypatch.setattr("meshsplats._common.streams.close_output", lambda: closed.append(1))
+    monkeypatch.setattr(sys, "stdout", Closed())
+    assert main(["--version"]) == 1
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert main(["--version"]) == 141
+    assert closed == [1]
+
+
+def test_a_file_without_a_command(tmp_path, capsys):
+    path = tmp_path / "my scene.ply"
+    path.touch()
+    assert main([str(path)]) == 2
+    assert f"a file needs a command before it: meshsplats view '{path}'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("code", "said"), [(None, "Is a directory"), (32, "used by another process")])
+def test_folders_in_use_on_windows_are_not_said_to_be_folders(tmp_path, monkeypatch, code, said):
+    monkeypatch.setattr(sys, "platform", "win32")
+    error = PermissionError(13, "The folder is used by another process", str(tmp_path))
+    error.winerror = code
+    assert said in one_line(error)

@@ -3,11 +3,12 @@
 import os
 import stat
 import sys
+import time
 
 import pytest
 from _local import make_link
 
-from meshsplats._files.atomic import atomic_path, refuse_existing, replace_folder
+from meshsplats._files.atomic import atomic_path, refuse_existing, replace_folder, write_bytes
 
 as_root = hasattr(os, "geteuid") and os.geteuid() == 0
 posix = pytest.mark.skipif(sys.platform == "win32", reason="permissions of POSIX")
@@ -24,6 +25,47 @@ def test_a_finished_file_replaces_the_old_one(tmp_path):
         assert target.read_bytes() == b"old"
     assert target.read_bytes() == b"new"
     assert os.listdir(tmp_path) == ["mesh.glb"]
+
+
+@pytest.fixture(name="opened")
+def opened_fixture(monkeypatch):
+    """Windows where another program has a file open for so many attempts to replace it."""
+    attempts = []
+    real = os.replace
+
+    def replace(source, target):
+        if attempts:
+            attempts.pop()
+            raise PermissionError(13, "Access is denied", str(source), 5, str(target))
+        real(source, target)
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    return attempts
+
+
+def test_a_file_that_another_program_has_open_for_a_moment_is_replaced(tmp_path, opened):
+    target = tmp_path / "mesh.glb"
+    target.write_bytes(b"old")
+    opened += [None] * 5
+    write_bytes(target, b"new")
+    assert target.read_bytes() == b"new"
+    assert os.listdir(tmp_path) == ["mesh.glb"]
+
+
+def test_a_result_is_kept_beside_a_file_that_another_program_has_open(tmp_path, opened):
+    """Not named by its temporary name, which nobody knows."""
+    target = tmp_path / "mesh.glb"
+    target.write_bytes(b"old")
+    for kept in ("mesh.new.glb", "mesh.new1.glb"):
+        opened += [None] * 6
+        with pytest.raises(PermissionError, match=f"so the new one is {kept}") as found:
+            write_bytes(target, kept.encode())
+        assert found.value.filename == str(target)
+        assert (tmp_path / kept).read_bytes() == kept.encode()
+    assert target.read_bytes() == b"old"
+    assert sorted(os.listdir(tmp_path)) == ["mesh.glb", "mesh.new.glb", "mesh.new1.glb"]
 
 
 def _write_and_raise(path, error):

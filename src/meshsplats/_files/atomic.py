@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import shutil
 import socket
 import stat
 import sys
+import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +24,8 @@ from meshsplats._files.locks import LOCK, locked
 
 _LEFTOVER = re.compile(r"\..*\.([0-9a-f]+)-([0-9a-f]{8})\.[0-9a-f]{16}(\..*)?")
 """Names of temporary files: process and machine, then a random part."""
+_PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Seconds after each attempt to replace a file that another program has open, on Windows."""
 _swept: set[Path] = set()
 """Folders that this process has searched for leftovers."""
 _promised: set[Path] | None = None
@@ -246,11 +250,32 @@ class _Finished:
     def place(self) -> None:
         """Gives the file its name. FileExistsError if it is taken and must not be."""
         if not self.new:
-            os.replace(self.temporary, self.target)
+            _replace(self.temporary, self.target, self.shown)
             return
         _place_new(self.temporary, self.target, self.shown)
         if _promised is not None:
             _promised.discard(self.target)  # ours: it may be replaced from now on
+
+
+def _replace(temporary: Path, target: Path, shown: str) -> None:
+    """Moves ``temporary`` to ``target``, in place of an older file.
+
+    Windows refuses that while another program has the older one open: a virus scanner for a moment, which is
+    waited for, or a viewer. Then the new file stays beside it, and a PermissionError says so.
+    """
+    if sys.platform != "win32":
+        os.replace(temporary, target)
+        return
+    for pause in _PAUSES:
+        with suppress(PermissionError):
+            os.replace(temporary, target)
+            return
+        time.sleep(pause)
+    names = (f"{target.stem}.new{number or ''}{target.suffix}" for number in itertools.count())
+    kept = next(path for path in map(target.with_name, names) if not os.path.lexists(path))
+    os.rename(temporary, kept)
+    reason = f"another program has this file open, so the new one is {kept.name}: close it there, and rename"
+    raise PermissionError(errno.EACCES, reason, shown)
 
 
 def _place_new(temporary: Path, target: Path, shown: str) -> None:

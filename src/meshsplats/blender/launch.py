@@ -82,7 +82,10 @@ def command(executable: Path | None) -> list[str]:
             raise MissingDependencyError(MISSING)
         return [sys.executable, "-m", worker.__name__]
     # A path is without its "./", so that a file here is second to a program of that name.
-    found = shutil.which(executable) or shutil.which(os.path.abspath(executable))
+    # As text: on Windows, which() of Python 3.11 takes no Path. It adds no ending to the last name of a path.
+    program, ending = os.fspath(executable), ".exe" if sys.platform == "win32" else ""
+    tried = (program, os.path.abspath(program), os.path.abspath(program) + ending)
+    found = next(filter(None, map(shutil.which, tried)), None)
     if found is None:
         raise FileNotFoundError(f"{executable}: there is no such program; --executable names Blender's own")
     try:

@@ -7,7 +7,6 @@ A module is imported only when its command runs, so that ``meshsplats --version`
 from __future__ import annotations
 
 import importlib
-import io
 import os
 import signal
 import sys
@@ -16,6 +15,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from meshsplats._common import streams
 from meshsplats._files import DISK_FULL
 from meshsplats.cli import messages
 from meshsplats.cli.messages import OK, USAGE, Terminated, UsageError, exit_code, one_line, say
@@ -56,9 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     SIGTERM, 141 where nobody reads standard output any more (``| head``). With ``--json``, an error is
     printed as JSON too: ``{"error": {"kind", "code", "message", "path", "type"}}``.
     """
-    messages.open_missing_streams()
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error: some file names are no UTF-8
+    streams.open_missing_streams()
+    streams.write_all_names()
     if "numpy" not in sys.modules:
         # The core has threads of its own. Those of NumPy's BLAS, which wait in loops for the next small
         # product, would take a fifth of the processor time of a conversion.
@@ -77,16 +76,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         number = getattr(stop, "number", signal.SIGINT)
         say(f"{messages.ENDINGS.get(number, 'ended')}; no file was left half-written")
         return 128 + number
-    except BrokenPipeError:
-        messages.close_output()
-        return messages.UNREAD
     except (UsageError, ValueError, OSError, ImportError, MemoryError, DeviceError, ClusterError) as error:
+        if streams.is_of_closed_pipe(error):
+            streams.close_output()
+            return messages.UNREAD
         if debug:
             raise
         if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:
             # All files have names in their errors.
             error = OSError(error.errno, error.strerror, "standard output")
-            messages.close_output()
+            streams.close_output()
         hint = f" (see meshsplats {name} --help)" if isinstance(error, UsageError) else ""
         say(f"error: {one_line(error)}{hint}")
         if as_json:
@@ -174,7 +173,7 @@ def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
             with open(path, "wb") as file:
                 shutil.copyfileobj(sys.stdin.buffer, file, 1 << 20)
         except OSError as error:
-            raise OSError(error.errno, f"standard input does not fit here: {error.strerror}", path) from None
+            raise OSError(error.errno, f"cannot store standard input: {error.strerror}", path) from None
         messages.read_from_standard_input(path)  # until the next command: errors are printed after this one
         yield [*arguments[: places[0]], path, *arguments[places[0] + 1 :]]
 
@@ -190,7 +189,11 @@ def _answer(name: str) -> int:
         print(f"meshsplats {meshsplats.__version__}")
         return OK
     from meshsplats._common.options import did_you_mean
+    from meshsplats._common.words import command_line
 
+    if os.path.exists(name):
+        say(f"error: a file needs a command before it: {command_line(['meshsplats', 'view', name])}")
+        return USAGE
     hint = did_you_mean(name, COMMANDS) or f"commands: {', '.join(COMMANDS)}"
     say(f"error: there is no command {name!r}; {hint}")
     return USAGE

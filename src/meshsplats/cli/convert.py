@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from meshsplats._common.options import of_presets
+from meshsplats._common.streams import is_of_closed_pipe
 from meshsplats._common.words import command_line, plural
 from meshsplats.cli import option
 from meshsplats.cli.arguments import Command, Flat, as_cli_options, usage_errors
@@ -163,9 +164,9 @@ class Convert(Command):
                     result = self._convert(job, cameras)
                 skipped += result["skipped"]
                 self._print_line(result, job)
-            except BrokenPipeError:
-                raise
             except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
+                if is_of_closed_pipe(error):
+                    raise
                 codes.append(exit_code(error))
                 with about(*named):
                     say(f"error: {one_line(error)}")

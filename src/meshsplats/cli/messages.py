@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from meshsplats import errors
+from meshsplats._common.streams import close_output
 from meshsplats._common.words import naming, printable
 from meshsplats._files import DISK_FULL
 
@@ -76,19 +77,6 @@ def print_json_error(error: BaseException) -> None:
         close_output()
 
 
-def close_output() -> None:
-    """Keeps Python from failing again, when it ends, to print the rest."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def open_missing_streams() -> None:
-    """Opens standard output and error where the process began without them (``>&-``), lest a result file take
-    their numbers and get the messages."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
-
-
 def read_from_standard_input(path: str | None) -> None:
     """Messages name the file at ``path`` "standard input" until the next command."""
     global _standard_input
@@ -117,7 +105,8 @@ def one_line(error: object) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         reason = error.strerror
         if sys.platform == "win32" and isinstance(error, PermissionError) and os.path.isdir(error.filename):
-            reason = os.strerror(errno.EISDIR)  # Windows says "Permission denied"
+            # To open a folder is "Permission denied" there; other calls say what is wrong.
+            reason = os.strerror(errno.EISDIR) if getattr(error, "winerror", None) is None else reason
         text = f"{os.fsdecode(error.filename)}: {reason}"
     else:
         text = error.spelled(_spelled or flag) if isinstance(error, errors.NamingOptions) else str(error)
