@@ -30,6 +30,7 @@ from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.rendering import previews, render
 from meshsplats.rendering.looks import draw_splats
+from meshsplats.rendering.ordering import drawing_order
 from meshsplats.rendering.samples import needed_samples
 from meshsplats.scene.mesh import SplatMesh
 
@@ -461,6 +462,22 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     assert run(tmp_path / "folder", "-o", tmp_path / "all", "--no-preview") == 0
     assert "balls.glb (" in (line := capsys.readouterr().out)
     assert ", alpha blend" in line
+
+
+def test_an_order_is_solved_for_views_that_are_found_in_a_place(splats, tmp_path, monkeypatch):
+    found, solved = orbit(load_gaussians(splats), 5, width=40, height=40), []
+
+    def solve(mesh, cameras=None, **options):
+        solved.append(cameras)
+        return drawing_order(mesh, cameras, **options)
+
+    monkeypatch.setattr("meshsplats.operations.conversion.default_views", lambda *_, **__: (found, "a room"))
+    monkeypatch.setattr("meshsplats.rendering.ordering.drawing_order", solve)
+    words = (splats, "-o", tmp_path / "a.glb", "--alpha", "ordered", "--no-preview", "--force")
+    assert run(*words) == 0
+    monkeypatch.setattr("meshsplats.operations.conversion.default_views", lambda *_, **__: None)
+    assert run(*words) == 0
+    assert solved == [found, None]
 
 
 def test_an_order_for_viewers_that_cull(tmp_path, capsys):

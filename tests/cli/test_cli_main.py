@@ -328,7 +328,7 @@ def test_doctor(capsys, monkeypatch):
     out = capsys.readouterr().out
     assert "in use" in out
     assert f"gpu: {found['gpu']['adapter'] or found['gpu']['problem']}" in out
-    assert f"the view: drawn by {', '.join(found['harmonics_drawn_by'])}; other" in out
+    assert f"view-dependent colours: drawn by {', '.join(found['harmonics_drawn_by'])}; other" in out
 
     from meshsplats.operations import installation
 

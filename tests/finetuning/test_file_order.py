@@ -10,11 +10,15 @@ import pytest
 from _stock_viewer import stock_image
 
 from meshsplats import convert, drawing_order, finetune, finetune_ordered, psnr, save_mesh, splat_dataset
+from meshsplats.cameras.framing import scene_bounds
+from meshsplats.cameras.trajectories import look_around, orbit
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import Interrupted, RunOptions, make_config
 from meshsplats.finetuning.cells import check_for_cells
 from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.ordered import ordering_views
 from meshsplats.rendering.looks import image_of
+from meshsplats.rendering.ordering import VIEWS
 
 CONFIG = make_config(steps=48, order="file", prune_epochs=1, prune_opacity=0.02, samples=1)
 
@@ -45,6 +49,24 @@ def test_viewers_show_the_gain_and_it_is_more_than_by_the_fragment(scene, tmp_pa
             assert psnr(images[-1], own) > 42
         scores.append(np.mean([psnr(i, v.image) for i, v in zip(images, dataset.test, strict=True)]))
     assert scores[2] > scores[1] + 0.3 > scores[0] + 0.3, scores
+
+
+def test_orders_are_solved_for_what_is_seen(scene):
+    """Around an object also from sides that nothing trains from, which of a room are the backs of walls."""
+    mesh, _, around = scene
+    bounds = scene_bounds(mesh)
+    cameras = look_around(mesh, 6, width=48, height=48)
+    assert max(np.linalg.norm(camera.center - bounds.center) for camera in cameras) < bounds.radius
+    within = splat_dataset(make_scene(400), cameras=cameras, train=5, test=1, width=48)
+    given = splat_dataset(
+        make_scene(400), cameras=orbit(mesh, 6, width=48, height=48), train=5, test=1, width=48
+    )
+    found = replace(given, placed="a room")
+    for dataset, others in ((around, True), (given, True), (within, False), (found, False)):
+        centers = {tuple(view.camera.center) for view in dataset.train}
+        views = ordering_views(mesh, dataset)
+        assert centers >= {tuple(view.center) for view in views} or others
+        assert len(views) == min(len(dataset.train), VIEWS // 2 if others else VIEWS) + others * VIEWS // 2
 
 
 def test_pruning_keeps_the_order_of_the_rest(scene):

@@ -107,6 +107,10 @@ class MeshFileOptions:
         """Whether the alpha mode of a .glb among ``paths`` is left to the measurement."""
         return self.alpha == "auto" and any(takes(path, "alpha") for path in paths)
 
+    def orders(self, paths: Sequence[Path]) -> bool:
+        """Whether a .glb among ``paths`` is to list its triangles in an order of blending."""
+        return self.alpha == "ordered" and any(takes(path, "alpha") for path in paths)
+
     def choice(
         self,
         mesh: SplatMesh,
@@ -130,7 +134,7 @@ class MeshFileOptions:
         """The order of blending of the .glb among ``paths``, where it is to have one."""
         from meshsplats.rendering.ordering import NODES, drawing_order
 
-        if self.alpha != "ordered" or not any(takes(path, "alpha") for path in paths):
+        if not self.orders(paths):
             return None
         nodes = NODES if self.nodes is None else self.nodes
         return drawing_order(mesh, cameras or None, nodes=nodes, quick=self.quick, threads=threads)

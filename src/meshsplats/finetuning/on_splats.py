@@ -31,7 +31,7 @@ from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import starting_mesh
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import available_memory, check_order_memory
-from meshsplats.finetuning.ordered import finetune_ordered
+from meshsplats.finetuning.ordered import finetune_ordered, ordering_views
 from meshsplats.finetuning.pace import (
     BRIEF_RATES,
     BRIEF_ZOOMS,
@@ -49,7 +49,7 @@ from meshsplats.finetuning.run import finetune
 from meshsplats.finetuning.run_options import RunOptions
 from meshsplats.finetuning.setup import Display, Setup
 from meshsplats.formats.mesh_formats import takes
-from meshsplats.rendering.ordering import VIEWS, default_views, drawing_order
+from meshsplats.rendering.ordering import drawing_order
 from meshsplats.scene.draw_order import DrawOrder
 from meshsplats.scene.gaussians import GaussianCloud
 from meshsplats.scene.mesh import SplatMesh
@@ -160,9 +160,7 @@ class SplatTuning:
             conversion = conversion.plain  # as files have it
             check_for_file_order(conversion, self.config)
             check_order_memory(conversion)
-            # Views from all sides, too: around an object in its surroundings, none trains from below.
-            around = subsample(default_views(conversion), VIEWS // 2)
-            views = [*subsample(cameras, VIEWS // 2), *around]
+            views = ordering_views(conversion, self.dataset)
             self._order = drawing_order(conversion, views, threads=run.threads)
         setup.phase("scoring the conversion")
         seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds

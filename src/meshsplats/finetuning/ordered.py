@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
+from meshsplats._common.arrays import subsample
 from meshsplats._common.kinds import need
+from meshsplats.cameras.framing import scene_bounds
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.journal import claimed
 from meshsplats.finetuning.run import Progress, ready_loop
 from meshsplats.finetuning.run_options import RunOptions
+from meshsplats.rendering.ordering import VIEWS, default_views
+from meshsplats.scene.camera import Camera
 from meshsplats.scene.draw_order import DrawOrder
 from meshsplats.scene.mesh import SplatMesh
 
@@ -25,6 +31,23 @@ class OrderedMesh(NamedTuple):
 
     mesh: SplatMesh
     order: DrawOrder
+
+
+def ordering_views(mesh: SplatMesh, dataset: Dataset) -> list[Camera]:
+    """Views that the order of ``mesh`` is solved for before it is trained on ``dataset``: training views and,
+    unless these look from within the scene or were found in a place, as many from all sides. Around an object
+    in its surroundings, none trains from below; of a room, such views show the backs of walls."""
+    cameras = [view.camera for view in dataset.train]
+    if dataset.placed or (not dataset.around and _are_within(cameras, mesh)):
+        return [*subsample(cameras, VIEWS)]
+    return [*subsample(cameras, VIEWS // 2), *subsample(default_views(mesh), VIEWS // 2)]
+
+
+def _are_within(cameras: Sequence[Camera], mesh: SplatMesh) -> bool:
+    """Whether most cameras are nearer to the middle of the scene than nine tenths of it are."""
+    bounds = scene_bounds(mesh)
+    distances = [np.linalg.norm(camera.center - bounds.center) for camera in cameras]
+    return bool(np.median(distances) < bounds.radius)
 
 
 def finetune_ordered(

@@ -36,6 +36,7 @@ from meshsplats.formats.splat_formats import listed, written_ending
 from meshsplats.formats.streaming import SplatStream
 from meshsplats.operations.batches import Job
 from meshsplats.operations.product import Product
+from meshsplats.rendering.ordering import VIEWS as ORDER_VIEWS
 from meshsplats.scene.camera import Camera
 from meshsplats.scene.draw_order import DrawOrder
 from meshsplats.scene.gaussians import GaussianCloud
@@ -120,7 +121,7 @@ class Converter:
         )
         mesh = product.files.prepared(mesh, seen, self.threads)
         times = {"read": read - start, "convert": time.perf_counter() - read}
-        measured = seen or self._views_for_alpha(cloud, job)
+        measured = seen or self._views_of_place(cloud, job)
         opening = self.callbacks.opening(cloud, job.source, seen) if job.preview else None
         return {
             "splats": len(cloud),
@@ -183,16 +184,18 @@ class Converter:
         counted = self.product.fidelity
         return fidelity(cloud, mesh, cameras, counted, look, threads=self.threads)
 
-    def _views_for_alpha(self, cloud: GaussianCloud, job: Job) -> list[Camera]:
-        """Views by which the alpha mode is chosen where no cameras are given: those that are found in a
-        place, which from outside shows the backs of its walls. None for an object. With or without a
-        preview, which has the first of them: it must not change the mesh."""
-        if not self.product.files.measures(job.outputs):
+    def _views_of_place(self, cloud: GaussianCloud, job: Job) -> list[Camera]:
+        """Views by which the alpha mode is chosen, or for which the order is solved, where no cameras are
+        given: those that are found in a place, which from outside shows the backs of its walls. None for an
+        object. With or without a preview, which has the first of them: it must not change the mesh."""
+        files = self.product.files
+        if not (files.measures(job.outputs) or files.orders(job.outputs)):
             return []
         if self.product.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.product.conversion.crop)
         up, side = self.product.direction, (SIDE, SIDE)
-        found = default_views(cloud, job.source, VIEWS, side=side, up=up, threads=self.threads)
+        count = ORDER_VIEWS if files.orders(job.outputs) else VIEWS
+        found = default_views(cloud, job.source, count, side=side, up=up, threads=self.threads)
         return [] if found is None else found[0]
 
     def _finish(
@@ -206,15 +209,16 @@ class Converter:
         order: DrawOrder | None = None,
     ) -> dict[str, Any]:
         """Writes ``mesh``, which is prepared, and its preview. Its part of the result; ``times``: of what was
-        done before, in seconds; ``measured``: views that the alpha mode is chosen by, by default the
-        ``cameras``; ``order``: one that the mesh has already."""
+        done before, in seconds; ``measured``: views that the alpha mode or the order is chosen by, by default
+        the ``cameras``; ``order``: one that the mesh has already."""
         start, files, threads = time.perf_counter(), self.product.files, self.threads
+        views = cameras if measured is None else measured
         choice = None
         if files.compression == "none":
             _warn_of_size(mesh, job.outputs)
         if order is None:
-            choice = files.choice(mesh, job.outputs, cameras if measured is None else measured, threads)
-            order = files.order(mesh, job.outputs, cameras, threads)
+            choice = files.choice(mesh, job.outputs, views, threads)
+            order = files.order(mesh, job.outputs, views, threads)
         chosen = time.perf_counter()
         placed = self.callbacks.place(scaled(mesh, self.product.scale))
         with self._recorded(job):
