@@ -237,7 +237,7 @@ def test_the_tasks_of_a_killed_worker_run_again(scheduler, tmp_path):
 def test_a_task_that_kills_every_worker_ends_the_run(cluster, scheduler, monkeypatch):
     monkeypatch.setattr(cluster.scheduler, "allowed_failures", 1)  # three, usually: each start takes seconds
     with open_workers(scheduler) as workers:
-        with pytest.raises(ClusterError, match="a task ended its workers, one after the other"):
+        with pytest.raises(ClusterError, match="a task killed one worker after another"):
             dict(workers.run(deadly, [0]))
         assert dict(workers.run(squared, [2]))[0][0] == 4
 

@@ -261,7 +261,7 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(command, "make_level", stops)
     assert run(splats, "-o", out, *QUICK) == 130
-    assert "--resume continues" in capsys.readouterr().err
+    assert "--resume to continue" in capsys.readouterr().err
     assert not out.exists()
     first = (tmp_path / "chain.partial" / "level_0.glb").stat().st_mtime_ns
     assert run(splats, "-o", out, *QUICK) == 3
@@ -436,7 +436,7 @@ def test_a_chain_that_ends_anywhere_says_how_it_goes_on(splats, tmp_path, capsys
         with monkeypatch.context() as patch:
             patch.setattr(command, "likeness", stops)
             assert run(splats, "-o", out, *QUICK, *options) in (4, 130, 143)
-        assert f"what is done stays: the same command with {way} continues\n" in capsys.readouterr().err
+        assert f"run the same command with {way} to continue\n" in capsys.readouterr().err
     capsys.readouterr()
     assert run(splats, "-o", out, *QUICK, "--resume") == 0  # in place of the older chain
     assert capsys.readouterr().out.endswith(f"{out}/: levels.json has this table\n")

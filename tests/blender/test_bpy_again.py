@@ -124,7 +124,7 @@ def test_what_would_be_lost_is_refused_with_a_remedy(captures, tmp_path):
     bpy.context.view_layer.objects.active = prior
     bpy.ops.object.join()
     count = len(prior.data.polygons)
-    with pytest.raises(RuntimeError, match=r"prior was edited or joined.* its splats hang"):
+    with pytest.raises(RuntimeError, match=r"prior was edited or joined.* its splats are bound"):
         bpy.ops.object.meshsplats_convert_again()
     assert len(prior.data.polygons) == count
 

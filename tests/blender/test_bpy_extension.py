@@ -198,8 +198,8 @@ def test_a_whole_session(packed, tmp_path):
     assert plain[2] != moved[2] == [0, 0, 0]
     light = report["light"]
     assert (light["baked"], light["again"]) == ("", "")
-    assert light["lamp"] == "Light is older than the scene: Bake Light"
-    assert light["duplicated"] == light["joined"] == "Light was made for other splats: Bake Light"
+    assert light["lamp"] == "Baked light is out of date: Bake Light again"
+    assert light["duplicated"] == light["joined"] == "Baked light belongs to other splats: Bake Light again"
     assert [len(names) for names in light["own"]] == [2, 2], "each has a stand-in and light points"
     assert light["left"] == [], "those of the copy are gone"
     assert not light["shadows"], "the stand-in casts them"

@@ -250,7 +250,7 @@ def test_one_click_lights_what_blender_has_imported(extension, scene):
     assert panel.light_warning(scene, obj) == ""
     for lamp in bpy.data.lights:
         lamp.energy *= 3
-    assert panel.light_warning(scene, obj) == "Light is older than the scene: Bake Light"
+    assert panel.light_warning(scene, obj) == "Baked light is out of date: Bake Light again"
     before = light_of(obj.data)
     assert bpy.ops.scene.meshsplats_bake_light(fast=True) == {"FINISHED"}
     assert light_of(obj.data).mean() > 1.2 * before.mean()

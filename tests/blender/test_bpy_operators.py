@@ -390,7 +390,7 @@ def test_fast_light_is_made_carefully_when_asked(ball, extension):
     assert home.hide_render
     assert panel.light_warning(bpy.context.scene, ball) == ""
     bpy.ops.object.meshsplats_adjust(hue=1.0)
-    assert panel.light_warning(bpy.context.scene, ball).startswith("Light was made for other splats")
+    assert panel.light_warning(bpy.context.scene, ball).startswith("Baked light belongs to other splats")
 
 
 def test_a_modifier_that_tears_splats_is_named(ball, extension):
@@ -436,7 +436,7 @@ def test_the_panel_has_a_button_for_each(ball, extension):
 def test_a_warning_is_shown_whole_in_the_usual_side_bar(extension):
     lines = []
     column = SimpleNamespace(label=lambda text, icon: lines.append((text, icon)))
-    text = "Light was made for other splats: Bake Light"
+    text = "Baked light belongs to other splats: Bake Light again"
     sys.modules["blender_extension.panel"].draw_warning(SimpleNamespace(column=lambda align: column), text)
     assert " ".join(line for line, _ in lines) == text
     assert max(len(line) for line, _ in lines) <= 32

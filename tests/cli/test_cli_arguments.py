@@ -135,7 +135,7 @@ def test_help_names_options_by_their_flags(capsys):
         (["--crop", "1", "2"], "--crop needs 6 values, got '1 2'"),
         (["--origin", "here"], "--origin needs one of keep, local or 3 values, got 'here'"),
         (["--force=3"], "--force takes no value, got '3'"),
-        (["b.ply"], "'b.ply' is one word too many"),
+        (["b.ply"], "unexpected argument 'b.ply'"),
         (["--minutes", "0"], "--minutes must be a number from 0.0001 to 100000, got 0.0"),
         (["--opaque-share", "2"], "--opaque-share must be a number from 0 to 1, got 2.0"),
         (["--cutoff", "0.3"], "--cutoff has no effect without --opacity cutoff, got --opacity blended"),

@@ -184,7 +184,7 @@ def test_nothing_is_overwritten(triangle, tmp_path, capsys):
         (["--dome", "2", "--elevation", "10"], "--elevation has no effect with --dome"),
         (["--look-around", "2", "--distance", "2"], "--distance has no effect"),
         (["--cameras", "x.json", "--up", "-y"], "--up has no effect"),
-        (["--sh-degree", "0"], "--sh-degree is for splats"),
+        (["--sh-degree", "0"], "--sh-degree limits the harmonics of splats"),
         (["--as-splats", "--depth", "png"], "--depth is that of a mesh"),
         (["--as-splats", "--max-layers", "2"], "--max-layers"),
         (["--transparent", "--background", "black"], "exclude"),

@@ -96,7 +96,9 @@ def test_a_scene_of_many_small_parts_is_no_floater():
     middle = np.repeat(rng.uniform(-9, 9, (300, 3)), 20, axis=0)
     points = middle + rng.normal(0, 0.01, (6000, 3))
     cloud = plates(points, np.tile([0, 0, 1.0], (6000, 1)), 0.01, 0.5)
-    with pytest.warns(DataWarning, match=r"in parts below 1\.0% of all opacity have 100% .* stay; min_part"):
+    with pytest.warns(
+        DataWarning, match=r"in components below 1\.0% of all opacity have 100% .* give min_part"
+    ):
         found = floaters(cloud)
     assert not found.gone["min_part"].any()
     with pytest.raises(ValueError, match="none of the 6,000 splats would be left"):

@@ -78,7 +78,7 @@ def test_colours_that_are_not_times_alpha_are_refused(kind):
             np.minimum(straight * brightness * alpha[..., None] * white, 255).astype(kind),
             (alpha * white).astype(kind),
         )
-    with pytest.raises(ValueError, match=r"color must be times alpha .*: give color \* alpha\[..., None\]"):
+    with pytest.raises(ValueError, match=r"color must be premultiplied .*: give color \* alpha\[..., None\]"):
         ViewImage((straight * white).astype(kind), (alpha * white).astype(kind))
 
 
@@ -184,7 +184,7 @@ def test_pixels_of_tiff_are_those_stored(tmp_path, orientation):
         assert read_shot(path.with_suffix(".tif")).size == (12, 8)
         turn = read_header(path.with_suffix(".jpg")).turn
         path.with_suffix(".jpg").unlink()
-    with pytest.warns(DataWarning, match="another name"):
+    with pytest.warns(DataWarning, match="other names"):
         view = load_dataset(folder, test_every=0).train[0]
     assert np.array_equal(view.load().color, pixels)
     assert view.turn == turn

@@ -375,7 +375,7 @@ def test_images_of_another_shape_are_refused(tmp_path):
     save(folder / "images/p01.png", np.zeros((8, 16, 3), np.uint8))
     refused(folder, "16 x 8 pixels do not fit its camera, which took 12 x 8")
     save(folder / "images/p01.png", np.zeros((12, 8, 3), np.uint8))
-    refused(folder, "8 x 12 pixels do not fit.*It is turned")
+    refused(folder, "8 x 12 pixels do not fit.*It is rotated")
 
 
 def test_a_model_beside_its_images_is_no_numbered_one(tmp_path):

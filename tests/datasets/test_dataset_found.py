@@ -236,7 +236,7 @@ def test_the_only_file_that_can_be_meant_is_taken(tmp_path, named, stored):
         place.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", SIZE, (10 * i,) * 3).save(place, format="PNG")
     text_model(tmp_path / "sparse/0", [named.format(i) for i in range(4)])
-    with pytest.warns(DataWarning, match="4 images have another name than the file gives them"):
+    with pytest.warns(DataWarning, match="4 images were found under other names than the file gives"):
         views = load_dataset(tmp_path, test_every=0).train
     for i, view in enumerate(views):
         assert round(255 * float(view.image[0, 0, 0])) == 10 * i
@@ -249,14 +249,14 @@ def test_transforms_with_paths_of_another_place(tmp_path):
     names = ["/home/me/fox/images/a.png", "..\\fox\\images\\b.png", "C:/fox/images/c.png"]
     frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
     write_json(folder / "transforms.json", {"fl_x": 10, "frames": frames})
-    with pytest.warns(DataWarning, match=r"3 images have paths of another place.*images/a\.png"):
+    with pytest.warns(DataWarning, match=r"3 images have paths of another machine.*images/a\.png"):
         views = load_dataset(folder, test_every=0).train
     greys = {view.name: round(255 * float(view.image[0, 0, 0])) for view in views}
     assert greys == {names[0]: 0, names[1]: 10, names[2]: 20}
     write_json(
         folder / "transforms.json", {"fl_x": 10, "frames": [frames[0] | {"file_path": "fox/images/d.png"}]}
     )
-    with pytest.warns(DataWarning, match=r"another name .*fox/images/d\.png: images/d\.png"):
+    with pytest.warns(DataWarning, match=r"other names .*fox/images/d\.png: images/d\.png"):
         (view,) = load_dataset(folder, test_every=0).train
     assert round(255 * float(view.image[0, 0, 0])) == 30
 
@@ -265,7 +265,7 @@ def test_half_of_them_renamed_is_a_whole_data_set(tmp_path):
     need_case(tmp_path)
     pictures(tmp_path / "images", ["a.png", "b.PNG"])
     text_model(tmp_path / "sparse/0", ["a.PNG", "b.PNG"])
-    with pytest.warns(DataWarning, match=r"1 images have another name .*\(images/a\.PNG: images/a\.png\)"):
+    with pytest.warns(DataWarning, match=r"1 images were found under .*\(images/a\.PNG: images/a\.png\)"):
         assert len(load_dataset(tmp_path).views) == 2
 
 
@@ -273,7 +273,7 @@ def test_transforms_take_the_only_file_too(tmp_path):
     pictures(tmp_path / "images", ["a.png"])
     frames = [{"file_path": "images/a.JPG", "transform_matrix": np.eye(4).tolist()}]
     write_json(tmp_path / "transforms.json", {"camera_angle_x": 1.0, "frames": frames})
-    with pytest.warns(DataWarning, match="another name"):
+    with pytest.warns(DataWarning, match="other names"):
         view = load_dataset(tmp_path, test_every=0).train[0]
     assert (view.camera.width, view.camera.height) == SIZE
 

@@ -60,7 +60,7 @@ def test_cutoff_below_the_opacities():
 def test_nothing_seen_is_no_measurement():
     mesh = joined(shell(1, 0.95, BLUE))
     away = [camera.relative_to(np.full(3, 1e4)) for camera in orbit(mesh, 2, width=50, height=50)]
-    with pytest.warns(DataWarning, match="not measured but 'blend': nothing is seen"):
+    with pytest.warns(DataWarning, match="'blend', without measurement: the images show nothing"):
         choice = choose_alpha(mesh, away)
     assert choice == AlphaChoice("blend")
     assert choice.in_words() is None

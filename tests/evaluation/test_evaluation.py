@@ -302,7 +302,7 @@ def test_columns_that_nothing_fills_are_left_out():
     view = replace(plain.methods[0].views[0], psnr_exposure=21.0, floaters=3)
     fitted = replace(plain, methods=(replace(plain.methods[0], views=(view,)),))
     table = markdown_table([fitted], notes=["Behind: grey."]).splitlines()
-    assert table[0].endswith("| SSIM | PSNR fitted | floater px |")
+    assert table[0].endswith("| SSIM | PSNR colour-corrected | floater px |")
     assert table[2].endswith("| 0.5000 | 21.00 | 3.0 |")
     assert table[-2:] == ["", "Behind: grey."]
 

@@ -665,7 +665,7 @@ def test_a_mesh_keeps_its_order_unless_another_is_asked_for():
         assert (state.triangles.order, state.result().order) == (expected, expected)
     cut = make_config(steps=1, opacity="cutoff")
     assert State.begin(by_splat, 2, cut, None).triangles.order == "fragment"
-    with pytest.raises(ValueError, match="order='splat' blends whole splats, but the mesh does not know"):
+    with pytest.raises(ValueError, match="order='splat' blends whole splats, but the mesh has no face_splat"):
         State.begin(
             replace(exact, face_splat=None, harmonics=None), 2, make_config(steps=1, order="splat"), None
         )

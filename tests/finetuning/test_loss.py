@@ -139,7 +139,7 @@ def test_weights_of_the_default_loss_are_refused_beside_another(scene, tmp_path)
         {"ssim_weight": 0.1, **cut},
         {"l2_weight": 1.0, "expected_share": 0.0, **cut},
     ):
-        with pytest.raises(ValueError, match="weighs the default loss: leave it out"):
+        with pytest.raises(ValueError, match="is a weight of the default loss: leave out"):
             finetune(mesh, dataset, steps=1, run=run, loss=reds, **options)
     assert not run.folder.exists()
     # There, it weighs the expected error, too.

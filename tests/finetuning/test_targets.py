@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,7 +46,9 @@ def test_cameras_of_the_model_folder_are_taken_unless_cameras_are_placed(tmp_pat
 @pytest.mark.parametrize("sees", [True, False])
 def test_cameras_of_a_record_are_taken_where_they_see_the_scene(tmp_path, sees):
     (tmp_path / "s.ply").touch()
-    cameras = [camera if sees else camera.relative_to((1e4, 0, 0)) for camera in cameras_around(9)]
+    behind = np.eye(4)
+    behind[2, 3] = -1e4
+    cameras = [camera if sees else replace(camera, world_to_camera=behind) for camera in cameras_around(9)]
     save_cameras(cameras, tmp_path / "s.ply.cameras.json")
     targets = Targets(views=4, held_out=1, width=24)
     with nullcontext() if sees else pytest.warns(DataWarning, match="none of the 9 cameras beside the file"):

@@ -402,7 +402,7 @@ def test_our_extras_renumbered_by_another_program_are_not_believed(tmp_path):
         del document["meshes"][0]["primitives"][0]["attributes"]["_FLAT"]
 
     edit_glb(tmp_path / "m.glb", renumber)
-    with pytest.warns(DataWarning, match="left out: face_splat, depth_group, the order of its splats, flat"):
+    with pytest.warns(DataWarning, match="ignored: face_splat, depth_group, the order of its splats, flat"):
         got = load_mesh(tmp_path / "m.glb")
     assert got.face_splat is None
     assert got.order == "fragment"
@@ -450,7 +450,7 @@ def test_a_ply_that_has_lost_its_splats_has_lost_their_order_and_filter(tmp_path
     save_mesh(mesh, tmp_path / "m.ply")
     whole = (tmp_path / "m.ply").read_bytes()
     (tmp_path / "m.ply").write_bytes(whole.replace(b"property int face_splat", b"property int other_name"))
-    with pytest.warns(DataWarning, match="left out: the filter of its splats, their order"):
+    with pytest.warns(DataWarning, match="ignored: the filter of its splats, their order"):
         got = load_mesh(tmp_path / "m.ply")
     assert (got.order, got.filter_px2) == ("fragment", 0)
 

@@ -113,9 +113,9 @@ def test_npz_that_do_not_hold_a_mesh(tmp_path):
         ({"up": np.zeros(3)}, "up must not be the zero vector"),
         ({"blending": np.array("additive")}, "blending must be one of display, linear"),
         ({"order": np.array("nearest")}, "order must be 'fragment' or 'splat', got 'nearest'"),
-        ({"order": np.array("splat")}, "order='splat' blends whole splats, but the mesh does not know"),
+        ({"order": np.array("splat")}, "order='splat' blends whole splats, but the mesh has no face_splat"),
         ({"order": np.array(1)}, "'order' must hold text"),
-        ({"filter_px2": np.array(0.3)}, "does not know its splats"),
+        ({"filter_px2": np.array(0.3)}, "the mesh has no face_splat"),
         ({"filter_px2": np.array(-1.0), "face_splat": np.array([0])}, "filter_px2 must be a variance"),
         ({"filter_px2": np.array([0.3])}, r"'filter_px2' has shape \(1,\), expected \(\)"),
         ({"filter_px2": np.array("0.3")}, "'filter_px2' must hold numbers"),
@@ -499,7 +499,7 @@ def test_a_filter_without_splats_is_left_out(tmp_path):
     line = b"comment meshsplats filter_px2 0.3\nelement vertex"
     (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes().replace(b"element vertex", line, 1))
     for name in ("m.glb", "m.ply"):
-        with pytest.warns(DataWarning, match="left out: the filter of its splats"):
+        with pytest.warns(DataWarning, match="ignored: the filter of its splats"):
             assert load_mesh(tmp_path / name).filter_px2 == 0
 
 

@@ -121,7 +121,7 @@ def test_splats_that_are_smaller_than_the_steps_of_their_file_are_named(tmp_path
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 read(path)
-            text = "in steps of 0.5, of what is 0.3 large: detail is lost"
+            text = "in steps of 0.5, of what is 0.3 large: precision is lost"
             assert sum(text in str(each.message) for each in caught) == said
     placed(load_gaussians(tmp_path / "double.ply"), FAR)
     with pytest.warns(DataWarning, match="in steps of 0.5") if size < 0.5 else nullcontext():
@@ -326,7 +326,7 @@ def test_formats_of_float32(tmp_path, kind):
     encode = {"compressed.ply": compressed_ply, "splat": dot_splat}[kind]
     path = tmp_path / f"a.{kind}"
     path.write_bytes(encode({k: v.astype(np.float32) for k, v in values.items()}))
-    with pytest.warns(DataWarning, match="detail is lost"):
+    with pytest.warns(DataWarning, match="precision is lost"):
         cloud = load_gaussians(path)
     assert np.abs(cloud.means).max() < 10
     np.testing.assert_allclose(places(cloud), near + FAR, atol=0.5)
@@ -508,7 +508,7 @@ def test_gltf_of_float32(tmp_path):
     stored = (TRIANGLE + FAR).astype("<f4")
     path = tmp_path / "a.gltf"
     path.write_text(json.dumps(mesh_gltf([(stored, "VEC3", False)])))
-    with pytest.warns(DataWarning, match="detail is lost"):
+    with pytest.warns(DataWarning, match="precision is lost"):
         mesh = load_mesh(path)
     assert mesh.origin.any()
     np.testing.assert_array_equal(places(mesh), stored.astype(np.float64))

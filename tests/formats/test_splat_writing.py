@@ -163,7 +163,7 @@ def test_positions_of_spz_are_within_half_a_step(tmp_path):
         assert 0.4 * step < np.abs(back.means - cloud.means).max() <= 0.5 * step + 1e-7
 
 
-@pytest.mark.filterwarnings("ignore:.*SPZ stores deviations:meshsplats.errors.DataWarning")
+@pytest.mark.filterwarnings("ignore:.*SPZ stores scales:meshsplats.errors.DataWarning")
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 100.0])
 def test_spz_is_as_fine_as_its_splats_in_any_unit(tmp_path, unit):
     cloud = cloud_of(degree=0)
@@ -190,7 +190,7 @@ def test_scales_out_of_the_range_of_spz_are_told(tmp_path, recwarn):
         (1e-6, f"{count} visible splats become larger and 0 smaller"),
         (1e6, rf"0 .*{count} smaller"),
     ):
-        with pytest.warns(DataWarning, match=rf"a.spz: SPZ stores deviations .*{words}"):
+        with pytest.warns(DataWarning, match=rf"a.spz: SPZ stores scales .*{words}"):
             ms.save_gaussians(cloud.transformed(np.eye(3) * unit), tmp_path / "a.spz")
     recwarn.clear()
     unseen = np.where(np.arange(count)[:, None] == 0, np.float32(1e3), cloud.scales)

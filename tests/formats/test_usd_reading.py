@@ -85,7 +85,7 @@ def test_splat_numbers_that_no_longer_fit_are_left_out(tmp_path, first):
     at = text.index("int[] primvars:face_splat = [") + len("int[] primvars:face_splat = [")
     arrays, report = read(tmp_path, text[:at] + first + text[text.index(",", at) + 1 :])
     lost = "face_splat, the order of its splats"
-    assert report["warnings"] == [f"another program has altered the file, left out: {lost}"]
+    assert report["warnings"] == [f"another program has changed the file, so this is ignored: {lost}"]
     assert "order" not in report
     assert "face_splat" not in arrays
     np.testing.assert_array_equal(arrays["depth_group"], MESH.depth_group)

@@ -391,10 +391,10 @@ def test_what_cannot_be_filtered():
         with pytest.raises(ValueError, match="filter_px2 must be a variance in square pixels"):
             render(mesh, camera(), filter_px2=px2)
     assert replace(mesh, filter_px2=np.float32(0.5)).filter_px2 == 0.5
-    with pytest.raises(ValueError, match="does not know its splats"):
+    with pytest.raises(ValueError, match="the mesh has no face_splat"):
         replace(mesh, face_splat=None)
     nameless = replace(mesh, filter_px2=0, face_splat=None)
-    with pytest.raises(ValueError, match="does not know its splats"):
+    with pytest.raises(ValueError, match="the mesh has no face_splat"):
         render(nameless, camera(), filter_px2=0.3)
     faces = mesh.faces.copy()
     faces[-1, 0] = faces[0, 0]

@@ -100,7 +100,7 @@ def test_long_images_are_announced(tmp_path, capsys):
 def test_costs_are_said_with_their_minutes():
     mesh, said = facing(20_000, 100.0), []
     announce_cost(mesh, [CAMERA.scaled(10)], 4, 2, said.append)
-    assert "layers lie over each other at each pixel: this may take about" in said.pop()
+    assert "layers overlap at each pixel (overdraw): this may take" in said.pop()
     announce_cost(mesh, [CAMERA], 1, 2, said.append)
     assert said == []
 
@@ -120,5 +120,5 @@ def test_the_alpha_of_real_scenes_is_measured(tmp_path):
     mesh = convert(small)
     assert layers(mesh, orbit(mesh, 1, width=400, height=400)[0]) < 100
     assert choose_alpha(mesh).blend is not None
-    with pytest.warns(DataWarning, match="the alpha mode is not measured but 'blend'"):
+    with pytest.warns(DataWarning, match="the alpha mode is 'blend', without measurement"):
         assert choose_alpha(facing(200_000, 100.0), [CAMERA.scaled(4)]).blend is None

@@ -168,7 +168,7 @@ def test_every_instruction_set_draws_the_same_bits(variant):
 def test_what_has_no_order_by_the_splat():
     mesh, view = soup(0), camera()
     for refused in (lambda: render(mesh, view, order="splat"), lambda: replace(mesh, order="splat")):
-        with pytest.raises(ValueError, match=r"order='splat' .*give face_splat, or order='fragment'"):
+        with pytest.raises(ValueError, match=r"order='splat' .*no face_splat: .* or order='fragment'"):
             refused()
     with pytest.raises(ValueError, match="order must be 'fragment' or 'splat', got 'file'"):
         render(mesh, view, order="file")

@@ -210,7 +210,7 @@ def test_joined_meshes_far_apart_keep_their_detail():
     both = SplatMesh.joined([one, two])
     assert both.origin.tolist() == [4e6, 0, 0]
     np.testing.assert_array_equal(both.vertices[len(one.vertices) :], two.vertices + np.float32([64, 0, 0]))
-    with pytest.warns(DataWarning, match="vertices near -4000000 0 .* steps of 0.25 .* detail is lost"):
+    with pytest.warns(DataWarning, match="vertices near -4000000 0 .* steps of 0.25 .* precision is lost"):
         assert SplatMesh.joined([fans(), one]).origin.tolist() == [4e6, 0, 0]
 
 

@@ -123,7 +123,7 @@ def test_the_advice_to_resume_is_for_what_was_ended_not_for_what_is_refused(spla
     assert main(words) == 3
     error = capsys.readouterr().err
     assert "--resume continues it, --force starts again" in error
-    assert "what is done stays" not in error
+    assert "finished work is kept" not in error
     assert main([*words, "--resume"]) == 0
 
 
@@ -260,7 +260,7 @@ def test_files_are_named_by_documents_of_any_depth(tmp_path):
 
 
 def test_a_file_is_taken_once(splats, tmp_path):
-    with pytest.raises(ValueError, match=r"city\.ply is given twice: .*; name it once"):
+    with pytest.raises(ValueError, match=r"city\.ply is given twice: .*; give it once"):
         build_tiles(ms.stream_gaussians([splats, splats]), tmp_path / "tiles", OPTIONS)
     link = tmp_path / "link.ply"
     try:

@@ -86,7 +86,7 @@ def test_exposures_are_those_of_the_training(ball, tmp_path, monkeypatch, exposu
 
 def test_a_training_without_time_for_a_step_gives_splats(ball, tmp_path):
     config, run = replace(CONFIG, steps=None, minutes=1e-4), RunOptions(tmp_path / "run")
-    with pytest.warns(DataWarning, match="over before the first step"):
+    with pytest.warns(DataWarning, match="spent before the first step"):
         mesh = train(ball, config, run=run)
     assert not (tmp_path / "run" / CHECKPOINT).exists()
     assert len(fit_splats(mesh, ball, config, run=run)) > 0

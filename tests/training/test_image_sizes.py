@@ -111,7 +111,7 @@ def test_a_run_says_its_size_and_keeps_it(command, scene, photographs, tmp_path,
     words = [command, *words, "-o", str(tmp_path / "mesh.npz")]
     assert main([*words, "--steps", "2"]) == 0
     shown = capsys.readouterr()
-    assert "1/2 of the photographs' sides, as time allows (--downscale 1: whole)" in shown.err
+    assert "downscaled by 2, to suit the time (--downscale 1: full resolution)" in shown.err
     assert f"of {SIDE // 2} x {SIDE // 2} pixels" in shown.err
     assert "--downscale 2" in shown.out.partition("next: ")[2]
     assert toml.load(tmp_path / "mesh.npz.run/command.toml")["options"]["downscale"] == 2
@@ -122,7 +122,7 @@ def test_a_run_says_its_size_and_keeps_it(command, scene, photographs, tmp_path,
     assert main([*words, "--steps", "3", "--force"]) == 0
     shown = capsys.readouterr()
     assert f"of {SIDE} x {SIDE} pixels" in shown.err
-    assert "as time allows" not in shown.err
+    assert "to suit the time" not in shown.err
     assert "--downscale" not in shown.out
     assert main([*words, "--steps", "2", "--downscale", "0", "--force"]) == 2
     assert "downscale must be a whole number from 1 to 64, got 0" in capsys.readouterr().err

@@ -149,7 +149,7 @@ def test_clear_corners_of_a_photograph_are_no_silhouette(room):
     views = [*room[:5], cornered(room[5]), *room[6:]]
     assert not has_silhouettes(views)
     assert not has_silhouettes([*map(cornered, room)])
-    with pytest.warns(DataWarning, match="1 of 24 photographs have clear pixels.*: 005. These pixels do not"):
+    with pytest.warns(DataWarning, match="1 of 24 .* have transparent pixels.*: 005. These pixels do not"):
         dataset = with_clear_pixels_masked(Dataset(views[:20], views[20:]))
     odd = dataset.train[5]
     assert odd.alpha is None

@@ -225,7 +225,8 @@ def test_cameras_are_found_and_written_beside_the_photographs(scene, under, meth
     save(place / "previews" / "p0.png", np.zeros((40, 60), np.uint8))
     lines = []
     with pytest.warns(
-        DataWarning, match=r"1 of 5 photographs found no place among the others and are left out: p4\.png"
+        DataWarning,
+        match=r"1 of 5 photographs could not be registered with the others and are left out: p4\.png",
     ):
         find_cameras(folder, lines.append)
     assert colmap.names == [f"p{i}.png" for i in range(5)]
@@ -393,7 +394,7 @@ def test_panoramas_are_refused_before_the_search(scene):
     folder, colmap, _ = scene()
     panoramas(folder, 7)
     with pytest.raises(
-        ValueError, match=r"7 of 13 photographs are panoramas, .*: q0\.jpg, q1\.jpg.*; export flat"
+        ValueError, match=r"7 of 13 photographs are panoramas, .*: q0\.jpg, q1\.jpg.*; convert them"
     ):
         find_cameras(folder)
     assert not colmap.lenses
@@ -549,7 +550,7 @@ def test_photographs_that_match_each_other_only_are_named_as_such(scene):
         find_cameras(folder)
     messages = [str(warning.message).partition(": ")[2] for warning in warned]
     assert messages == [
-        "1 of 8 photographs found no place among the others and are left out: p4.png",
+        "1 of 8 photographs could not be registered with the others and are left out: p4.png",
         "3 of 8 photographs match each other, but nothing joins them to the rest: left out: q0.png, q1.png,"
         " q2.png",
     ]
@@ -621,7 +622,7 @@ def test_photographs_that_are_added_later_are_named_and_found_on_demand(scene):
         assert ensure_cameras(folder) is None
     assert len(colmap.calls) == asked
     colmap.lenses.clear()
-    with pytest.warns(DataWarning, match="2 of 6 photographs found no place"):
+    with pytest.warns(DataWarning, match="2 of 6 photographs could not be registered"):
         assert ensure_cameras(folder, replacing=True) is None
     assert colmap.names == [*(f"p{i}.png" for i in range(5)), "q.png"]
     assert ensure_cameras(folder) is None

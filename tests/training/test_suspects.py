@@ -148,7 +148,7 @@ def test_messages_count_and_name():
     lines = Suspects(names, (("a.jpg", "b.jpg"),)).messages()
     named = "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, ..."
     assert lines[0].startswith(f"7 photographs are blurred beside the others: {named}")
-    assert lines[1].startswith("the same photograph twice: a.jpg and b.jpg.")
+    assert lines[1].startswith("duplicate photographs: a.jpg and b.jpg.")
     assert len(lines) == 2
     assert Suspects().messages() == []
 

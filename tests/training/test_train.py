@@ -238,7 +238,7 @@ def test_a_photograph_with_a_wrong_camera_is_named(scene, other, request):
     with pytest.warns(DataWarning) as said:
         mesh = train(Dataset(tuple(views)), train_config(steps=120, **size))
     *early, last = [str(warning.message) for warning in said]
-    assert any(line.startswith(f"the same photograph twice: 007 and 0{other}.") for line in early)
+    assert any(line.startswith(f"duplicate photographs: 007 and 0{other}.") for line in early)
     assert last.startswith("1 of 19 photographs do not fit the others: 007.")
     assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
 
@@ -862,14 +862,14 @@ def test_a_long_search_for_cameras_leaves_the_whole_schedule(ball, start, monkey
     assert fraction < 0.1
     assert phase._events == 0
     late = RunOptions(spent=480, report_every=0)
-    with pytest.warns(DataWarning, match=r"8\.\d of 8 minutes were over before the first step: more minutes"):
+    with pytest.warns(DataWarning, match=r"8\.\d of 8 minutes were spent before the first step: allow more"):
         train(ball, replace(config, minutes=8), run=late)
 
 
 def test_masks_that_are_dark_throughout_are_refused(ball):
     none = np.zeros((64, 64), bool)
     views = [replace(view, source=replace(view.load(), mask=none)) for view in ball.train]
-    with pytest.raises(ValueError, match=r"no pixel of the 20 training views counts: their masks are dark"):
+    with pytest.raises(ValueError, match=r"all pixels of the 20 training views are masked out"):
         train(Dataset(tuple(views)), train_config(steps=1, **SMALL))
     views[7] = ball.train[7]
     check_counting(views)
@@ -1128,7 +1128,7 @@ def test_splats_are_made_up_for_after_ctrl_c_while_they_were_fitted(ball, tmp_pa
     words = ["train", str(folder), "-o", str(tmp_path / "mesh.npz"), "--steps", "1", "--start-splats", "100"]
     words += ["--max-splats", "100", "--test-every", "0", "--as-splats", str(splats)]
     assert main(words) == 128 + signal.SIGINT
-    assert "--resume --force goes on to it" in capsys.readouterr().err
+    assert "add --resume --force to write it" in capsys.readouterr().err
     assert not splats.exists()
     mesh = load_mesh(tmp_path / "mesh.npz")
     monkeypatch.setattr(as_splats, "fit_splats", fit)

@@ -352,7 +352,7 @@ def test_interlaced_frames_that_the_filter_does_not_take_are_named(tmp_path):
     """Those that lie on a GPU, for one."""
     kind = av.VideoFormat("vaapi", 96, 64)
     frame = SimpleNamespace(width=96, height=64, format=kind, time_base=None)
-    with pytest.raises(FileFormatError, match=r"tape\.mpg: is interlaced, .* of vaapi .* deinterlace it"):
+    with pytest.raises(FileFormatError, match=r"tape\.mpg: is interlaced, .* format vaapi .* deinterlace it"):
         module._one_field(frame, tmp_path / "tape.mpg")
 
 

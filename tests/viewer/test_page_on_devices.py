@@ -372,7 +372,7 @@ def test_colours_of_the_view_that_do_not_fit_into_a_texture_are_left_out(
     address = write_page(mesh, "many colours", cameras=cameras)
     page = open_page(browser, address, cameras[0].width, cameras[0].height, before=LIMITED)
     plain(page)
-    assert "WebGL draws without view-dependent colours" in page.text("#notes")
+    assert "WebGL draws without view-dependent colour" in page.text("#notes")
     wanted = ms.render(replace(mesh, harmonics=None), cameras[0], samples=2).color
     assert ms.psnr(page.screenshot() / 255, wanted) > 26
     assert page.problems() == []

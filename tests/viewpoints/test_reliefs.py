@@ -232,9 +232,9 @@ def test_info_and_cameras_and_previews_say_so(tmp_path, capsys):
     assert facts["scene_confidence"] > 0.8
     assert first_impression(photograph()).extent == pytest.approx(facts["view_depth"])
     assert main(["cameras", str(path), "-o", str(tmp_path / "c.json"), "--count", "3"]) == 0
-    assert "a relief, a photograph with depth" in capsys.readouterr().out
+    assert "a single image with depth (2.5D)" in capsys.readouterr().out
     views, words = default_views(load_gaussians(path), path, 1)
-    assert "a relief, a photograph with depth" in words
+    assert "a single image with depth (2.5D)" in words
     np.testing.assert_allclose(views[0].center, 0, atol=1e-6)
     film, _ = default_views(load_gaussians(path), path, 8, film=True)
     assert all(camera.world_to_camera[2, 2] > 0.98 for camera in film)

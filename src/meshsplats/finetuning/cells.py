@@ -156,7 +156,7 @@ def finetune_cells(
         FileFormatError: the record of the run that is resumed is broken.
         FileExistsError: as ``finetune``.
         MemoryError, DivergenceError, Interrupted: as ``finetune``.
-        ClusterError: the workers are lost; what is done stays.
+        ClusterError: the workers are lost; finished work is kept.
     """
     if run.folder is None:
         raise ValueError("cells need a folder for the run")

@@ -138,8 +138,8 @@ def build_tiles(
             ones than the interrupted run had; no splat to convert; a file that is given twice; files that are
             too far apart for one origin.
         FileFormatError: the interrupted run has lost some of what it had done.
-        OSError: a full disk; what is done stays, for ``resume``.
-        ClusterError: the workers are lost; what is done stays.
+        OSError: a full disk; finished work is kept, for ``resume``.
+        ClusterError: the workers are lost; finished work is kept.
     """
     need(SplatStream, source=source)
     need_path(folder=folder)

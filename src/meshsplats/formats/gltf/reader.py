@@ -299,7 +299,7 @@ def _join(
     if "splats" in note:
         arrays |= in_order_of_splats(document, note["splats"], arrays["faces"])
     if stored is not None and not put_back(stored, tables, arrays):
-        warn(f"{document.path}: another program has altered the file, left out: harmonics")
+        warn(f"{document.path}: another program has changed the file, so this is ignored: harmonics")
     if arrays.get("binding") is not None and not fits(arrays["binding"], arrays["vertices"]):
         warn(f"{document.path}: another program has moved vertices, left out: the binding to a base mesh")
         arrays["binding"] = None

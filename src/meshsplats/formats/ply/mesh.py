@@ -315,7 +315,7 @@ def _read(
         ]
         if lost:
             warnings.warn(
-                f"{path}: another program has altered the file, left out: {', '.join(lost)}",
+                f"{path}: another program has changed the file, so this is ignored: {', '.join(lost)}",
                 DataWarning,
                 stacklevel=3,
             )

@@ -107,7 +107,9 @@ def restored(
         found[f"attribute_{len(report['attributes'])}"] = values.reshape(rows)
         report["attributes"].append(name)
     if lost:
-        report["warnings"].append(f"another program has altered the file, left out: {', '.join(lost)[:300]}")
+        report["warnings"].append(
+            f"another program has changed the file, so this is ignored: {', '.join(lost)[:300]}"
+        )
     return found
 
 

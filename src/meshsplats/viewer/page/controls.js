@@ -70,7 +70,8 @@ export class ViewController {
   #move(seconds) { this.view.move(...this.thrust.map(value => value * seconds), this.settings.radius); }
 }
 
-// They move the view of `controller`, a ViewController with command(name) and pick(x, y), and end its flight to another.
+// They move the view of `controller`, a ViewController with command(name) and pick(x, y), and end its flight
+// to another.
 // radius: of the scene.
 export function connect(stage, controller, radius) {
   const touches = new Map(), keys = new Set();
