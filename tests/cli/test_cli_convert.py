@@ -440,10 +440,10 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     assert float(figures[1]) == material(out)["alphaCutoff"]
     assert float(figures[2]) > float(figures[3])
     better = lines[lines.index(chosen) + 1]
-    assert better.startswith("better there: meshsplats finetune ")
-    words = words_of(better.partition(": meshsplats ")[2].rpartition(" (")[0])
+    assert better.startswith("better there: an order in the file, --alpha ordered ")
+    solid = lines[lines.index(better) + 1]
+    words = words_of(solid.partition("or solid triangles: meshsplats ")[2].rpartition(" (")[0])
     assert words[-4:] == ["--opacity", "cutoff", "--soft-share", "0.05"]
-    assert "--alpha ordered" in lines[lines.index(better) + 1]
     # A mesh gets the same choice, and what was asked for counts.
     assert run(source, "-o", tmp_path / "m.npz", "--json", "--no-preview") == 0
     assert json.loads(capsys.readouterr().out)["alpha"] is None

@@ -101,7 +101,7 @@ def test_a_far_move_goes_to_the_origin():
     matrix[:3, 3] = [300, 0, 0]
     assert near.transformed(matrix).origin.tolist() == [0, 0, 0]
     matrix[:3, 3] = far
-    with pytest.warns(DataWarning, match="means near 500000 4500000 .* given as origin, they keep it"):
+    with pytest.warns(DataWarning, match="means near 500000 4500000 .* \\(origin\\), they keep it"):
         coarse = near.transformed(matrix, origin=[0, 0, 0])
     coarse.transformed(similarity(0, 2.0))  # what is lost already is not lost again
     with pytest.warns(DataWarning, match="means near 500000 4500000"):

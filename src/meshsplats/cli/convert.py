@@ -58,10 +58,10 @@ if TYPE_CHECKING:
 
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream", "threads")
 """Options that do not change the mesh."""
-ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
+ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes of up to 0.3 million splats"
 """What meshes for a depth buffer gain in three.js with MSAA: docs/viewers.md."""
-ORDER_GAIN = "7 to 10 dB in three.js and Babylon.js in half a minute; not for ray tracers and CesiumJS"
-"""What a solved order gains there: benchmarks/results/viewers_ordered.md."""
+ORDER_GAIN = "3 to 10 dB in three.js and Babylon.js; not for ray tracers and CesiumJS"
+"""What a solved order gains there: benchmarks/results/viewers_ordered.md and large_captures.md."""
 
 
 @as_cli_options(presets=False)
@@ -266,8 +266,8 @@ class Convert(Command):
             if (alpha := result.get("alpha")) and (line := AlphaChoice(**alpha).in_words()):
                 lines.append(line)
                 if "splats" in result and job.shown != "-" and self.product.conversion.crop is None:
-                    lines.append(f"better there: {self._for_depth_buffers()}")
-                    lines.append(f"or, with an order in the file, --alpha ordered ({ORDER_GAIN})")
+                    lines.append(f"better there: an order in the file, --alpha ordered ({ORDER_GAIN})")
+                    lines.append(f"or solid triangles: {self._for_depth_buffers()}")
         if result["preview"]:
             as_sorted = ", sorted" if result.get("alpha") else ""
             lines.append(f"preview{as_sorted}: {result['preview']}")

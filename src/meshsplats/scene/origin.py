@@ -96,7 +96,7 @@ def lost_by_rounding(name: str, exact: ArrayLike) -> str:
     coarse = _coarse(sample)
     if coarse is None or (sample == sample.astype(np.float32)).all():
         return ""
-    return f"{name} {coarse}: precision is lost; relative to a point nearby, given as ``origin``, they keep it"
+    return f"{name} {coarse}: precision is lost; relative to a point nearby (``origin``), they keep it"
 
 
 def loses_detail(local: np.ndarray, shift: np.ndarray) -> bool:
