@@ -74,7 +74,7 @@ def test_float64_positions_that_lose_their_detail_are_told_of():
     ):
         for given in (far, far.tolist()):
             with pytest.warns(
-                DataWarning, match="steps of 0.5 across an extent of 0.09.* given as origin"
+                DataWarning, match="steps of 0.5 across an extent of 0.09.* \\(origin\\)"
             ) as told:
                 make(given)
             assert told[0].filename == __file__
