@@ -459,6 +459,16 @@ def test_standard_input(scans, tmp_path, monkeypatch, capsys):
     assert run("-", "-o", "b.npz") == 2
 
 
+@pytest.mark.parametrize("ending", [".usda", ".usdc"])
+def test_standard_input_may_be_usd(tmp_path, monkeypatch, capsys, ending):
+    """Whose library goes by the name of the file."""
+    pytest.importorskip("pxr", reason="install meshsplats[usd]")
+    save_mesh(convert(few_splats()), tmp_path / f"a{ending}")
+    monkeypatch.setattr(sys, "stdin", _Piped((tmp_path / f"a{ending}").read_bytes()))
+    assert main(["info", "-", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["kind"] == "mesh"
+
+
 @pytest.mark.parametrize(
     ("path", "name"),
     [

@@ -168,12 +168,16 @@ def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
     import tempfile
 
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
-        path = os.path.join(folder, "standard-input")
         try:
+            head = sys.stdin.buffer.read(8)
+            # What is USD, only its name tells the library that reads it.
+            name = "standard-input.usd" if head.startswith((b"PXR-USDC", b"#usda")) else "standard-input"
+            path = os.path.join(folder, name)
             with open(path, "wb") as file:
+                file.write(head)
                 shutil.copyfileobj(sys.stdin.buffer, file, 1 << 20)
         except OSError as error:
-            raise OSError(error.errno, f"cannot store standard input: {error.strerror}", path) from None
+            raise OSError(error.errno, f"cannot store standard input: {error.strerror}", folder) from None
         messages.read_from_standard_input(path)  # until the next command: errors are printed after this one
         yield [*arguments[: places[0]], path, *arguments[places[0] + 1 :]]
 
