@@ -522,6 +522,9 @@ def test_dense_clouds_begin_as_their_conversion(splats, tmp_path, capsys):
     assert not np.array_equal(mesh.colors, conversion.colors)
     record = json.loads((tmp_path / "t.npz.run" / "start.json").read_text())
     assert record == {"max_splats": None, "images": None, "brief_steps": 72}
+    # In the order of a file, small steps gain little.
+    assert run(splats, "-o", tmp_path / "t.glb", *dense, "--steps", "2", "--order", "file") == 0
+    assert json.loads((tmp_path / "t.glb.run" / "start.json").read_text())["brief_steps"] is None
     # A mesh that the user's own options make is not replaced.
     assert run(splats, "-o", tmp_path / "t.npz", *dense, "--steps", "2", "--set", "mode=flat") == 0
     assert json.loads((tmp_path / "t.npz.run" / "start.json").read_text())["brief_steps"] is None

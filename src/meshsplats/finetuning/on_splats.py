@@ -274,19 +274,22 @@ class SplatTuning:
         pixels = dataset.train[0].camera.width * dataset.train[0].camera.height
         limited = chosen.max_splats is not None or chosen.max_triangles is not None
         own = any(value is not None for value in (chosen.mode, chosen.detail, chosen.sides, chosen.rings))
-        may_be_brief = not config.cuts and dataset.look == "area" and not own
+        # In the order of a file, usual learning rates gain 2.5 dB where brief ones gain 1.0: a landscape of 4.2
+        # million splats, 1.6 million triangles, three minutes.
+        listed = config.order == "file"
+        may_be_brief = not config.cuts and not listed and dataset.look == "area" and not own
         steps: float | None = config.total_steps(len(dataset.train))
         count, seconds = len(run.cloud), self._setup.seconds
         timed = seconds is not None and count >= TIMED_SPLATS
         if not limited:
             count = min(count, most_splats(available_memory()) or count)
-            if config.order == "file":
+            if listed:
                 count = min(count, FILE_TRIANGLES // usual_triangles_each())
         if timed:
             self._setup.phase("timing steps")
             pace = measure_pace(run.cloud, dataset, config, self._options, run.threads, run.device)
             left = (1 - SETUP_SHARE) * (seconds or 0)
-            if (config.cuts or config.order == "file") and not limited:
+            if (config.cuts or listed) and not limited:
                 count = pace.splats(count, worthwhile_steps(config), left)
             steps = pace.steps(self._limited(count), left)
         brief = may_be_brief and steps is not None and is_brief(self._limited(count), pixels, steps, timed)
