@@ -274,8 +274,8 @@ class SplatTuning:
         pixels = dataset.train[0].camera.width * dataset.train[0].camera.height
         limited = chosen.max_splats is not None or chosen.max_triangles is not None
         own = any(value is not None for value in (chosen.mode, chosen.detail, chosen.sides, chosen.rings))
-        # In the order of a file, usual learning rates gain 2.5 dB where brief ones gain 1.0: a landscape of 4.2
-        # million splats, 1.6 million triangles, three minutes.
+        # In the order of a file, usual learning rates gain 2.5 dB where brief ones gain 1.0: a landscape of
+        # 4.2 million splats, 1.6 million triangles, three minutes.
         listed = config.order == "file"
         may_be_brief = not config.cuts and not listed and dataset.look == "area" and not own
         steps: float | None = config.total_steps(len(dataset.train))
