@@ -86,7 +86,7 @@ def test_other_programs_see_plain_colours(tmp_path, suffix, plain):
     if suffix == ".obj":
         with (
             pytest.warns(DataWarning, match=r"m\.obj: harmonics are left out"),
-            pytest.warns(DataWarning, match="left out: face_splat, flat"),
+            pytest.warns(DataWarning, match="ignored: face_splat, flat"),
         ):
             save_mesh(mesh, path)
         lines = path.read_text().splitlines()
@@ -250,7 +250,7 @@ def test_solid_and_translucent_triangles_have_theirs(tmp_path):
             np.testing.assert_allclose(shown, wanted, atol=0.02)
             assert np.abs(render(part.of_degree(0), camera).color - wanted).max() > 0.1
     edit_glb(tmp_path / "m.glb", lambda d: note_of(d)["splats"].update(crc32=1))
-    with pytest.warns(DataWarning, match="left out: harmonics"):
+    with pytest.warns(DataWarning, match="ignored: harmonics"):
         assert load_mesh(tmp_path / "m.glb").harmonics is None
     save_mesh(mesh.of_degree(0), tmp_path / "m.glb", alpha="hybrid")
     assert load_mesh(tmp_path / "m.glb").face_splat is None
@@ -311,7 +311,7 @@ def test_ply_without_splats_or_with_others(tmp_path):
     with pytest.raises(FileFormatError, match="harmonics"):
         load_mesh(path)
     path.write_bytes(whole.replace(b"int face_splat", b"int face_other"))
-    with pytest.warns(DataWarning, match="left out: their harmonics"):
+    with pytest.warns(DataWarning, match="ignored: their harmonics"):
         assert load_mesh(path).harmonics is None
 
 
@@ -361,7 +361,7 @@ def test_glb_whose_attributes_are_others(tmp_path):
 
     save_mesh(mesh, path)
     edit_glb(path, lambda d: attributes(d).pop("_SH_RED_1"))
-    with pytest.warns(DataWarning, match="left out: harmonics"):
+    with pytest.warns(DataWarning, match="ignored: harmonics"):
         got = load_mesh(path)
     assert got.harmonics is None
     np.testing.assert_allclose(got.colors[:, :3], mesh.plain_colors, atol=1e-4)
@@ -373,7 +373,7 @@ def test_glb_whose_attributes_are_others(tmp_path):
 
     save_mesh(mesh, path)
     edit_glb(path, lambda d: attributes(d).update(_SH_RED_1=attributes(d)["_BASE"]))  # not one of a splat
-    with pytest.warns(DataWarning, match="left out: harmonics"):
+    with pytest.warns(DataWarning, match="ignored: harmonics"):
         assert load_mesh(path).harmonics is None
 
 

@@ -152,6 +152,21 @@ def test_animation(tmp_path, suffix):
     assert frame[20, 20].min() > 250
 
 
+@pytest.mark.parametrize(("suffix", "unit"), [(".webp", 1), (".gif", 10), (".png", 1)])
+@pytest.mark.parametrize("fps", [10, 12, 15, 24, 30, 50])
+def test_animations_last_as_long_as_asked(tmp_path, suffix, unit, fps):
+    """GIF stores hundredths of a second, and 30 frames a second are 33.3 ms each."""
+    path = tmp_path / f"a{suffix}"
+    save_animation(path, moving_square(), fps=fps)
+    with Image.open(path) as image:
+        lasts = 0.0
+        for k in range(image.n_frames):
+            image.seek(k)
+            image.load()  # of WebP, the duration is known after the image
+            lasts += image.info["duration"]
+    assert lasts == pytest.approx(6 * 1000 / fps, abs=unit / 2 + 1e-6)
+
+
 def test_gif_keeps_the_background(tmp_path):
     """256 colours for thousands: those of the image may shift a little, the plain background must not."""
     frame = np.full((64, 64, 3), (250, 253, 251), np.uint8)
@@ -180,6 +195,7 @@ def test_animation_is_brought_to_size_and_keeps_alpha(tmp_path):
     [
         ("a.mp4", {}, moving_square(2), "written as"),
         ("a.gif", {"fps": 0}, moving_square(2), "fps"),
+        ("a.gif", {"fps": 60}, moving_square(2), "50 frames a second at most"),
         ("a.gif", {}, [], "at least one"),
         ("a.gif", {}, moving_square(2, 24, 4), "no translucency"),
     ],

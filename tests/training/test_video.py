@@ -40,10 +40,10 @@ RATE = 10
 
 
 def write_video(
-    path: Path, frames: list[np.ndarray], rotation: int = 0, ratio: Fraction | None = None
+    path: Path, frames: list[np.ndarray], rotation: int = 0, ratio: Fraction | None = None, start: int = 0
 ) -> Path:
     """``frames`` (h, w, 3) uint8, to be shown turned counter-clockwise by ``rotation`` degrees, with pixels
-    whose width by their height is ``ratio``."""
+    whose width by their height is ``ratio``; the first at ``start``, in frames."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=RATE)
         stream.height, stream.width = frames[0].shape[:2]
@@ -52,8 +52,10 @@ def write_video(
             stream.codec_context.sample_aspect_ratio = ratio
         if rotation:
             stream.set_display_rotation(rotation)
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        for number, frame in enumerate(frames):
+            image = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            image.pts, image.time_base = start + number, Fraction(1, RATE)
+            container.mux(stream.encode(image))
         container.mux(stream.encode())
     return path
 
@@ -113,6 +115,12 @@ def test_blurred_frames_are_passed_over(tmp_path):
     assert len(frames.sharpness) == 60
     assert frames.seconds == pytest.approx(5.9)
     assert set(choose_frames(frames, 12)) <= set(range(60)) - blurred
+
+
+@pytest.mark.parametrize("name", ["walk.mp4", "walk.ts"])
+def test_recordings_that_begin_at_hours_are_as_long_as_others(tmp_path, name):
+    clip = write_video(tmp_path / name, passing([3 * i for i in range(20)]), start=3600 * RATE)
+    assert look_at_frames(clip).seconds == pytest.approx(1.9)
 
 
 def test_frames_are_spread_over_the_way_not_the_time(tmp_path):

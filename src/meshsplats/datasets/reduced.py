@@ -77,7 +77,7 @@ def reduced_views(views: Sequence[View], factor: float, store: ImageCache) -> tu
 
 
 def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
-    """``image`` at a smaller size. Pixels that do not count are left out of the means; a new pixel counts if
+    """``image`` at a smaller size. Pixels that do not count are taken as black; a new pixel counts if
     all pixels that it covers do."""
 
     def mean(values: np.ndarray) -> np.ndarray:

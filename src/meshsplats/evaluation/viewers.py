@@ -173,7 +173,7 @@ def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int |
         if number > 1 and abs(max(masks) - blend) > CLEAR:
             break
     if not number:
-        text = "the alpha mode is not measured but 'blend': nothing is seen in the images"
+        text = "the alpha mode is 'blend', without measurement: the images show nothing of the scene"
         warnings.warn(text, DataWarning, stacklevel=2)
         return AlphaChoice("blend")
     sharp = _decibels(near[1:])

@@ -87,7 +87,7 @@ MESH_FORMATS: tuple[MeshFormat, ...] = (
         (".glb", ".gltf"),
         "gltf.mesh",
         (".glb",),
-        "`.glb` (linear colours of 16 bits, [harmonics](viewers.md#colours-that-depend-on-the-view) of 8;"
+        "`.glb` (linear colours of 16 bits, [harmonics](viewers.md#view-dependent-colours) of 8;"
         " unlit, or lit with `--lit`)",
         keeps=("binding", "harmonics"),
         takes=("lit", "color_type", "alpha", "compression", "order", "harmonics"),

@@ -126,7 +126,8 @@ def save_animation(
     scaled down to ``max_side`` pixels, as animations are large. GIF has 256 colours; the others lose little
     or nothing.
 
-    Raises ValueError for another suffix, no frames or a rate out of range (0.1 to 100 frames a second).
+    Raises ValueError for another suffix, no frames or a rate out of range (0.1 to 100 frames a second, of GIF
+    to 50).
     """
     from PIL import Image
 
@@ -135,6 +136,8 @@ def save_animation(
         raise ValueError(f"an animation is written as {', '.join(ANIMATIONS)}, got {Path(path).name!r}")
     if not 0.1 <= fps <= 100:
         raise ValueError(f"fps must lie between 0.1 and 100 frames a second, got {fps}")
+    if suffix == ".gif" and fps > 50:
+        raise ValueError(f"browsers play GIF at 50 frames a second at most, got fps {fps:g}: take .webp")
     images = [_fitting(Image.fromarray(frame), max_side) for frame in frames]
     if not images:
         raise ValueError("an animation needs at least one frame")
@@ -145,12 +148,14 @@ def save_animation(
     }
     if suffix == ".gif":
         images = [_paletted(image) for image in images]
+    unit = 10 if suffix == ".gif" else 1  # milliseconds
+    ends = unit * np.rint(np.arange(len(images) + 1) * (1000 / fps / unit)).astype(int)
     encoded = _encoded(
         images[0],
         format={".webp": "WEBP", ".gif": "GIF", ".png": "PNG"}[suffix],
         save_all=True,
         append_images=images[1:],
-        duration=round(1000 / fps),
+        duration=np.diff(ends).tolist(),
         loop=0,
         **options[suffix],
     )

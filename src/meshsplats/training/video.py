@@ -195,7 +195,7 @@ def look_at_frames(video: Path, say: Callable[[str], None] = lambda text: None) 
     """Sharpness and motion of every frame of ``video``. ``say`` is told now and then how far it has come.
     Errors are those of ``save_frames``."""
     sharpness, motion, before = [], [], None
-    seconds, said = 0.0, time.perf_counter()
+    first, seconds, said = None, 0.0, time.perf_counter()
     for frame in _decoded(video, warn=True):
         scale = min(1.0, LOOK_SIDE / max(frame.width, frame.height))
         size = {"width": max(1, round(scale * frame.width)), "height": max(1, round(scale * frame.height))}
@@ -211,7 +211,9 @@ def look_at_frames(video: Path, say: Callable[[str], None] = lambda text: None) 
         sharpness.append(_sharpness(grey))
         motion.append(0.0 if before is None else float(np.sqrt(np.square(now - before).mean())))
         before = now
-        seconds = max(seconds, float(frame.time or 0))
+        shown = float(frame.time or 0)
+        first = shown if first is None else min(first, shown)  # recordings of broadcasts begin at hours
+        seconds = max(seconds, shown - first)
         if time.perf_counter() - said >= SAID_EVERY:
             said = time.perf_counter()
             place = f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
