@@ -92,7 +92,7 @@ def test_more_layers_than_blender_follows_are_told(tmp_path):
     from meshsplats import DataWarning
 
     view = look_at((0.2, 0.1, -30), (0, 0, 0), width=12, height=12, fov=2)
-    with pytest.warns(DataWarning, match=r"up to 1[3-9]\d\d triangles.*1024.*100\.00%"):
+    with pytest.warns(DataWarning, match=r"up to 1[3-9]\d\d transparent triangles.*1024.*100\.00%"):
         draw(sheets(1400, 0.001), [view], images=[tmp_path / "a.png"])
 
 

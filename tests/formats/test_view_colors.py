@@ -86,7 +86,7 @@ def test_other_programs_see_plain_colours(tmp_path, suffix, plain):
     if suffix == ".obj":
         with (
             pytest.warns(DataWarning, match=r"m\.obj: harmonics are left out"),
-            pytest.warns(DataWarning, match="ignored: face_splat, flat"),
+            pytest.warns(DataWarning, match="left out: face_splat, flat"),
         ):
             save_mesh(mesh, path)
         lines = path.read_text().splitlines()
