@@ -32,21 +32,18 @@ def cameras_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0
     A DataWarning says where they cannot be read, and where a record is older than the file: it may be of
     another.
     """
-    record, folder = record_of(source), model_folder(source)
-    if record is None and folder is None:
+    record = record_of(source)
+    stored = model_folder(source) if record is None else record
+    if stored is None:
         return None
     try:
-        if record is None:
-            assert folder is not None
-            return load_cameras(folder, origin=origin)
-        if os.stat(record).st_mtime >= os.stat(source).st_mtime - _OLDER:
-            return load_cameras(record, origin=origin)
+        if record is None or os.stat(record).st_mtime >= os.stat(source).st_mtime - _OLDER:
+            return load_cameras(stored, origin=origin)
         said = f"{record} is older than {source.name} and may be of another: save it anew, or delete it"
     except (FileFormatError, OSError) as error:
         said = str(error)
-    where = "the model folder" if record is None else "the file"
-    beside_it = "of" if record is None else "beside"
-    warnings.warn(f"{said}; the cameras {beside_it} {where} are not used", DataWarning, stacklevel=2)
+    whose = "of the model folder" if record is None else "beside the file"
+    warnings.warn(f"{said}; the cameras {whose} are not used", DataWarning, stacklevel=2)
     return None
 
 
