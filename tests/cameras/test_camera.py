@@ -489,6 +489,22 @@ def test_names_that_no_camera_file_may_have_are_refused():
         Camera(np.eye(4), 10, 10, 8, 8, 16, 16, name="n" * 1001)
 
 
+@pytest.mark.parametrize("away", [10.0, 700.0, 4000.0])
+def test_projection_is_as_exact_far_from_the_origin(away):
+    """Of float32 points, with the same points in float64 as the truth: to a fiftieth of a pixel."""
+    rng = np.random.default_rng(0)
+    place = away * np.array([0.6, -0.64, 0.48])
+    camera = look_at(place, place + np.array([0.3, 0.2, 1.0]), width=1200, height=900)
+    points = (place + rng.uniform((-0.5, -0.5, 1), (0.5, 0.5, 2), (2000, 3))).astype(np.float32)
+    single, depths = camera.project(points)
+    exact, truths = camera.project(points.astype(np.float64))
+    assert single.dtype == depths.dtype == np.float32
+    seen = camera.in_image(exact)
+    assert np.count_nonzero(seen) > 500
+    assert np.abs(single - exact)[seen].max() < 0.02
+    assert np.abs(depths / truths - 1)[seen].max() < 1e-5
+
+
 def test_sees_what_projects_into_the_image():
     """Focal length 10, 40 x 20 pixels, principal point (15, 10), near 1: at depth 2, x from -3 to 5 and y
     from -2 to 2."""

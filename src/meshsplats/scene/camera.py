@@ -245,8 +245,10 @@ class Camera:
             raise ValueError(f"points must have shape (n, 3), got {points.shape}")
         if points.dtype != np.float32:
             points = points.astype(np.float64, copy=False)
-        matrix = self.world_to_camera.astype(points.dtype, copy=False)
-        x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
+        # Relative to the camera first: far from the origin, products of float32 would lose half a pixel.
+        turn, center = self.world_to_camera[:3, :3], self.center.astype(points.dtype)
+        rest = turn @ center.astype(np.float64) + self.world_to_camera[:3, 3]
+        x, y, z = turn.astype(points.dtype) @ (points - center).T + rest.astype(points.dtype)[:, None]
         beyond = np.where(z > (self.near or 0), z, points.dtype.type(np.nan))
         with np.errstate(over="ignore"):  # points right at the camera, beside the image
             return np.stack([self.fx * x / beyond + self.cx, self.fy * y / beyond + self.cy]).T, z
