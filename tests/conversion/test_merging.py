@@ -672,6 +672,16 @@ class TestShares:
         shares = merging._shares(np.array([1.0, 99.0, 0.0]), np.array([1000, 1000, 0]), 1000)
         assert shares.tolist() == [FEWEST_OF_BLOCK, 990, 0]  # of the first some stay
 
+    def test_of_many_splats_where_numbers_have_32_bits(self):
+        """By default, those of NumPy 1 on Windows, sums among them."""
+
+        class Counts(np.ndarray):
+            def sum(self):
+                return super().sum(dtype=self.dtype)
+
+        counts = np.full(20, 250_000, np.int32).view(Counts)
+        assert merging._shares(counts, counts, 2_500_000).tolist() == 20 * [125_000]
+
     @given(st.lists(st.integers(0, 5000), min_size=1, max_size=12), st.integers(0, 100), st.data())
     def test_laws(self, visible, seed, data):
         wanted = np.random.default_rng(seed).exponential(size=len(visible)) * (np.array(visible) > 0)

@@ -164,6 +164,7 @@ def simplify_in_blocks(
 def _shares(wanted: np.ndarray, visible: np.ndarray, total: int) -> np.ndarray:
     """(b,) int64 numbers of splats, ``total`` together, that blocks keep: in proportion to ``wanted`` (b,),
     but at most those that are ``visible`` (b,), and at least ``FEWEST_OF_BLOCK`` of them."""
+    wanted = wanted.astype(np.float64)  # products of the counts of NumPy 1 on Windows, int32, would overflow
     free, left = wanted > 0, float(total)
     while free.any() and ((full := free & (wanted * left > visible * wanted[free].sum())).any()):
         free &= ~full

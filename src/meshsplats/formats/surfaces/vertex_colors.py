@@ -13,7 +13,7 @@ from meshsplats.scene.mesh import SplatMesh
 
 TRIANGLES = 1_000_000
 """Triangles into which those of a texture are divided, at most, unless there are more of them already."""
-PARTS = np.unique(np.round(2 ** (np.arange(19) / 2)).astype(int))  # 1 to 512
+PARTS = np.unique(np.round(2 ** (np.arange(19) / 2)).astype(np.int64))  # 1 to 512
 """Parts into which the edges of a triangle are divided."""
 _AT_ONCE = 1_000_000
 
