@@ -22,6 +22,7 @@ from meshsplats.cameras.placing import has_surroundings, inside_cameras, outside
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.cli import main
 from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.photo_file import _resized
 from meshsplats.datasets.splat_targets import TRAINING_SAMPLES, splat_dataset, splat_views
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
@@ -766,3 +767,24 @@ def test_results_of_the_loader_can_be_saved_as_cameras(tmp_path):
     dataset = load_dataset(simple_colmap(tmp_path, 2))
     ms.save_cameras([view.camera for view in dataset.views], tmp_path / "c.json")
     assert [c["name"] for c in json.loads((tmp_path / "c.json").read_text())] == ["p01.png", "p00.png"]
+
+
+def shares(before: int, after: int) -> np.ndarray:
+    """(after, before) by how much of each of ``after`` equal spans each of ``before`` makes up."""
+    edges, cells = np.linspace(0, before, after + 1), np.arange(before)
+    overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
+    return np.maximum(overlap, 0) * after / before
+
+
+@pytest.mark.parametrize(("before", "after"), [(1921, 960), (400, 133), (100, 50), (64, 63)])
+def test_reduced_photographs_show_things_where_they_are(before, after):
+    """A ramp: the mean over a pixel's area is the value at its middle, whether or not the factor is whole."""
+    ramp = np.tile(np.arange(before, dtype=np.float32), (6, 1))
+    middles = (np.arange(after) + 0.5) * before / after - 0.5
+    np.testing.assert_allclose(_resized(ramp, (after, 6)), np.tile(middles, (6, 1)), atol=0.01)
+    np.testing.assert_allclose(_resized(ramp.T, (6, after)), np.tile(middles, (6, 1)).T, atol=0.01)
+    bytes_ = np.random.default_rng(0).integers(0, 256, (40, before, 3), dtype=np.uint8)
+    small = _resized(bytes_, (after, 17))
+    truth = np.einsum("rh,hwc,kw->rkc", shares(40, 17), bytes_.astype(float), shares(before, after))
+    assert small.dtype == np.uint8
+    assert np.abs(small - truth).max() <= 0.51

@@ -4,11 +4,12 @@ import os
 import stat
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from _local import make_link
 
-from meshsplats._files.atomic import atomic_path, refuse_existing, replace_folder, write_bytes
+from meshsplats._files.atomic import atomic_path, patiently, refuse_existing, replace_folder, write_bytes
 
 as_root = hasattr(os, "geteuid") and os.geteuid() == 0
 posix = pytest.mark.skipif(sys.platform == "win32", reason="permissions of POSIX")
@@ -31,16 +32,19 @@ def test_a_finished_file_replaces_the_old_one(tmp_path):
 def opened_fixture(monkeypatch):
     """Windows where another program has a file open for so many attempts to replace it."""
     attempts = []
-    real = os.replace
 
-    def replace(source, target):
-        if attempts:
-            attempts.pop()
-            raise PermissionError(13, "Access is denied", str(source), 5, str(target))
-        real(source, target)
+    def refused(real):
+        def call(source, *to):
+            if attempts:
+                attempts.pop()
+                raise PermissionError(13, "Access is denied", str(source), 5, *map(str, to))
+            real(source, *to)
+
+        return call
 
     monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setattr(os, "replace", replace)
+    for name in ("rename", "replace", "unlink"):
+        monkeypatch.setattr(os, name, refused(getattr(os, name)))
     monkeypatch.setattr(time, "sleep", lambda seconds: None)
     return attempts
 
@@ -54,12 +58,41 @@ def test_a_file_that_another_program_has_open_for_a_moment_is_replaced(tmp_path,
     assert os.listdir(tmp_path) == ["mesh.glb"]
 
 
+@pytest.mark.parametrize("old", [True, False])
+def test_a_folder_that_another_program_has_open_for_a_moment_is_moved(tmp_path, opened, old):
+    for folder in ["new", "site"][: 1 + old]:
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tile").write_text(folder)
+    opened += [None] * 5
+    replace_folder(tmp_path / "new", tmp_path / "site", lambda name: name == "tile")
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+    assert (tmp_path / "site" / "tile").read_text() == "new"
+
+
+def test_what_another_program_has_open_for_a_moment_is_removed(tmp_path, opened):
+    path = tmp_path / "records"
+    path.touch()
+    opened += [None] * 6
+    patiently(lambda: os.unlink(path))
+    assert not path.exists()
+    opened += [None] * 7
+    with pytest.raises(PermissionError):
+        patiently(lambda: os.unlink(path))
+
+
+def test_permissions_are_not_waited_for_on_other_systems(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(time, "sleep", None)
+    with pytest.raises(PermissionError):
+        patiently(lambda: _write_and_raise(Path(os.devnull), PermissionError()))
+
+
 def test_a_result_is_kept_beside_a_file_that_another_program_has_open(tmp_path, opened):
     """Not named by its temporary name, which nobody knows."""
     target = tmp_path / "mesh.glb"
     target.write_bytes(b"old")
     for kept in ("mesh.new.glb", "mesh.new1.glb"):
-        opened += [None] * 6
+        opened += [None] * 7
         with pytest.raises(PermissionError, match=f"so the new one is {kept}") as found:
             write_bytes(target, kept.encode())
         assert found.value.filename == str(target)

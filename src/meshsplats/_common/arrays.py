@@ -35,6 +35,25 @@ def subsample(items: Sequence[T] | np.ndarray, most: int) -> Sequence[T] | np.nd
     return tuple(chosen) if isinstance(items, tuple) else chosen
 
 
+def area_means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
+    """float32 means of ``values`` over ``size`` equal spans along an axis; entries at their borders count by
+    the share that lies in each."""
+    before = values.shape[axis]
+    edges = np.linspace(0, before, size + 1)
+    first = np.minimum(edges[:-1].astype(int), before - 1)
+    shape = [1] * values.ndim
+    shape[axis] = size
+    result = np.zeros((*values.shape[:axis], size, *values.shape[axis + 1 :]), np.float32)
+    for k in range(int((np.ceil(edges[1:] - 1e-9) - first).max())):
+        # Each span holds the k-th entry from its first one by this share.
+        share = np.minimum(edges[1:], first + k + 1) - np.maximum(edges[:-1], first + k)
+        share = np.maximum(share, 0) * (size / before)
+        entries = np.take(values, np.minimum(first + k, before - 1), axis=axis).astype(np.float32, copy=False)
+        entries *= share.astype(np.float32).reshape(shape)
+        result += entries
+    return result
+
+
 def block_means(values: np.ndarray, side: int) -> np.ndarray:
     """(h, w, ...) float32: means of blocks of ``side`` x ``side`` of ``values``, without what is left over at
     the ends of their first two axes. Several times as fast as ``mean`` over two axes."""

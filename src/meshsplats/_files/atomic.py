@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from meshsplats._files import DISK_FULL
@@ -25,7 +26,7 @@ from meshsplats._files.locks import LOCK, locked
 _LEFTOVER = re.compile(r"\..*\.([0-9a-f]+)-([0-9a-f]{8})\.[0-9a-f]{16}(\..*)?")
 """Names of temporary files: process and machine, then a random part."""
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""Seconds after each attempt to replace a file that another program has open, on Windows."""
+"""Seconds between attempts to move or remove what another program has open, on Windows."""
 _swept: set[Path] = set()
 """Folders that this process has searched for leftovers."""
 _promised: set[Path] | None = None
@@ -40,9 +41,23 @@ def replace_folder(finished: Path, target: Path, is_own: Callable[[str], bool]) 
     old = target.with_name(f".{target.name}.old")
     if target.exists():
         _hand_over(old, target, is_own)  # what a run left that was killed here
-        os.rename(target, old)
-    os.rename(finished, target)
+        patiently(partial(os.rename, target, old))
+    patiently(partial(os.rename, finished, target))
     _hand_over(old, target, is_own)
+
+
+def patiently(action: Callable[[], object]) -> None:
+    """Runs ``action``, which moves or removes a file or folder.
+
+    Windows refuses that while another program has it open: mostly a virus scanner, for a moment. There it is
+    tried for some seconds until the PermissionError is raised.
+    """
+    for pause in _PAUSES if sys.platform == "win32" else ():
+        with suppress(PermissionError):
+            action()
+            return
+        time.sleep(pause)
+    action()
 
 
 def _hand_over(old: Path, target: Path, is_own: Callable[[str], bool]) -> None:
@@ -54,7 +69,7 @@ def _hand_over(old: Path, target: Path, is_own: Callable[[str], bool]) -> None:
         for path in (place / name for name in (*files, *links)):
             inside = path.relative_to(old)
             if is_own(inside.as_posix()):
-                path.unlink()
+                patiently(path.unlink)
             elif not os.path.lexists(target / inside):
                 (target / inside).parent.mkdir(parents=True, exist_ok=True)
                 shutil.move(path, target / inside)  # to another disk where the older folder was a link
@@ -260,17 +275,15 @@ class _Finished:
 def _replace(temporary: Path, target: Path, shown: str) -> None:
     """Moves ``temporary`` to ``target``, in place of an older file.
 
-    Windows refuses that while another program has the older one open: a virus scanner for a moment, which is
-    waited for, or a viewer. Then the new file stays beside it, and a PermissionError says so.
+    Where another program keeps the older one open on Windows, a viewer say, the new file stays beside it, and
+    a PermissionError says so.
     """
-    if sys.platform != "win32":
-        os.replace(temporary, target)
+    try:
+        patiently(partial(os.replace, temporary, target))
         return
-    for pause in _PAUSES:
-        with suppress(PermissionError):
-            os.replace(temporary, target)
-            return
-        time.sleep(pause)
+    except PermissionError:
+        if sys.platform != "win32":
+            raise
     names = (f"{target.stem}.new{number or ''}{target.suffix}" for number in itertools.count())
     kept = next(path for path in map(target.with_name, names) if not os.path.lexists(path))
     os.rename(temporary, kept)
@@ -282,7 +295,7 @@ def _place_new(temporary: Path, target: Path, shown: str) -> None:
     """Moves ``temporary`` to ``target``. FileExistsError if ``target`` exists by then."""
     try:
         if sys.platform == "win32":
-            os.rename(temporary, target)  # never replaces a file on Windows
+            patiently(partial(os.rename, temporary, target))  # never replaces a file on Windows
             return
         try:
             os.link(temporary, target)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._common.arrays import area_means
 from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, undistort
 from meshsplats.datasets.views import ImageCache, ViewImage
 from meshsplats.images.reading import load_image
@@ -123,10 +124,19 @@ def light_of_mask(path: Path, turn: int = 0) -> np.ndarray:
 
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """``pixels`` (h, w) float32 or (h, w, 3) uint8 at ``size`` (width, height): each new pixel is the mean of
-    those it covers."""
+    """``pixels`` (h, w) float32 or (h, w, 3) uint8 at ``size`` (width, height): each new pixel is the mean
+    over its area."""
     from PIL import Image
 
-    if (pixels.shape[1], pixels.shape[0]) == size:
+    (height, width), (columns, rows) = pixels.shape[:2], size
+    if (width, height) == size:
         return pixels
-    return np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
+    if (width % columns == 0 and height % rows == 0) or columns > width or rows > height:
+        return np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
+    # Pillow's box takes whole pixels, by their centres, and shifts what it shows by up to a quarter of one.
+    result = np.empty((rows, columns, *pixels.shape[2:]), pixels.dtype)
+    for channel in np.ndindex(pixels.shape[2:]):  # one at a time: photographs are large
+        one = (..., *channel)
+        means = area_means(area_means(pixels[one], rows, 0), columns, 1)
+        result[one] = np.rint(means) if pixels.dtype == np.uint8 else means
+    return result

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from meshsplats._common.arrays import area_means
 from meshsplats.datasets.views import ImageCache, View, ViewImage
 
 _WHOLE = 1 - 1e-6
@@ -81,7 +82,7 @@ def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
     all pixels that it covers do."""
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return _means(_means(values.astype(np.float32), height, 0), width, 1)
+        return area_means(area_means(values, height, 0), width, 1)
 
     unit = np.float32(255 if image.color.dtype == np.uint8 else 1)
     known = image.color if image.mask is None else np.where(image.mask[..., None], image.color, 0)
@@ -89,21 +90,3 @@ def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
     alpha = None if image.alpha is None else (mean(image.alpha) / unit).astype(np.float16)
     mask = None if image.mask is None else mean(image.mask) >= _WHOLE
     return ViewImage(color, alpha, mask)
-
-
-def _means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """The means of float32 ``values`` over ``size`` equal spans along an axis."""
-    before = values.shape[axis]
-    edges = np.linspace(0, before, size + 1)
-    first = np.minimum(edges[:-1].astype(int), before - 1)
-    shape = [1] * values.ndim
-    shape[axis] = size
-    result = np.zeros((*values.shape[:axis], size, *values.shape[axis + 1 :]), np.float32)
-    for k in range(int((np.ceil(edges[1:] - 1e-9) - first).max())):
-        # Each span holds the k-th entry from its first one by this share.
-        share = np.minimum(edges[1:], first + k + 1) - np.maximum(edges[:-1], first + k)
-        share = np.maximum(share, 0) * (size / before)
-        entries = np.take(values, np.minimum(first + k, before - 1), axis=axis)
-        entries *= share.astype(np.float32).reshape(shape)
-        result += entries
-    return result

@@ -111,7 +111,7 @@ class Buckets:
                 counts = self._part(key, self._read(key) if key else records, size)
                 self._journal.add("sorted", key=key, counts=counts)
             if key:
-                self._path(key).unlink(missing_ok=True)
+                self.remove([key])
             todo += [(key + cell, n) for cell, n in counts.items() if n > self._bucket]
 
     def cells(self) -> dict[str, list[str]]:
@@ -140,7 +140,7 @@ class Buckets:
 
     def remove(self, files: Iterable[str]) -> None:
         for key in files:
-            self._path(key).unlink(missing_ok=True)
+            patiently(partial(self._path(key).unlink, missing_ok=True))
 
     def _sizes(self) -> dict[str, int]:
         """The splats in each file, by the journal."""

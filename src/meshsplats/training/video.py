@@ -164,7 +164,7 @@ def save_frames(
             if index == chosen[-1]:
                 break
         write_json(made / RECORD, record)
-        made.rename(folder)
+        patiently(partial(made.rename, folder))
     if interlaced and not can_mend:
         warnings.warn(
             f"{video}: is interlaced, which shows as combs where it moves, and this version of PyAV has no"
