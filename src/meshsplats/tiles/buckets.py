@@ -10,12 +10,14 @@ import errno
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from meshsplats._common.geometry import morton_codes
 from meshsplats._files import DISK_FULL
+from meshsplats._files.atomic import patiently
 from meshsplats.errors import FileFormatError
 from meshsplats.scene.gaussians import GaussianCloud, Kernel
 from meshsplats.tiles.journal import Journal

@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from meshsplats._common.foreign import VIDEO_SUFFIXES, frames_of, is_a_video
 from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
-from meshsplats._files.atomic import write_json
+from meshsplats._files.atomic import patiently, write_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image
