@@ -42,8 +42,8 @@ config = ms.make_config(minutes=5, ssim_weight=0.6)
 mesh = ms.convert(ms.load_gaussians("scene.ply"), sides=6)
 ```
 
-Lists have commas: `--set crop=-1,-1,-1,1,1,1`. Where a default is empty, in Python None, the text names it,
-or there is none.
+Lists have commas: `--set "crop=-1,-1,-1,1,1,1"`, in quotes for PowerShell. Where a default is empty, in
+Python None, the text names it, or there is none.
 """
 
 

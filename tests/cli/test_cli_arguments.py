@@ -37,6 +37,7 @@ from meshsplats.formats.gaussians import save_gaussians
 FIELDS = {"chain", "draw", "files", "laying", "light", "part", "reading", "target", "tuning"}
 """Names of groups of options that mean nothing to a reader: their titles are in words."""
 SMALL = ("--views", "4", "--held-out", "2", "--width", "32", "--steps", "3")
+NUMBERS = 'numbers with commas are one word, in quotes in PowerShell: "1,2,3"'
 
 
 def command(name: str) -> type[Command]:
@@ -163,6 +164,8 @@ def test_what_is_missing_is_named(capsys):
         ("compare a b", "--output is missing"),
         ("evaluate x", "--output is missing"),
         ("convert a -o x.glb y.glb", "'y.glb' comes after an option: give all inputs before the options"),
+        ("convert a -o x.glb --up 0.1 -1 0", f"'-1' comes after an option; {NUMBERS}"),
+        ("view a --up 0.1 -1 0", f"unexpected argument '-1'; {NUMBERS}"),
         ("render a -o a.png --no-force", "there is no option --no-force: leave --force out"),
         ("render a -o=/t/a.png --bogus", "there is no option --bogus"),
         ("render a -ofoo.png --bogus", "there is no option --bogus"),

@@ -138,6 +138,10 @@ def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
         ("win32", "C:\\my scans\\", '"C:\\my scans\\\\"'),
         ("win32", "torch>=2.4", '"torch>=2.4"'),
         ("win32", "", '""'),
+        ("win32", "activated=scales,colors", '"activated=scales,colors"'),
+        ("win32", "@new.ply", '"@new.ply"'),
+        ("win32", r"~\a.ply", r'"~\a.ply"'),
+        ("win32", r"C:\PROGRA~1\a@b.ply", r"C:\PROGRA~1\a@b.ply"),
     ],
 )
 def test_commands_are_quoted_for_the_shell_of_the_system(monkeypatch, platform, word, written):

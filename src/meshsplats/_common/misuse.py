@@ -169,14 +169,24 @@ def _of_places(plain: Sequence[str], runs: Sequence[str], given: Collection[str]
     if len(plain) > len(usage.places) and not endless:
         if all(word.lower().endswith(IMAGE_SUFFIXES) for word in plain):
             return "give the folder of the photographs, not the photographs themselves"
-        return f"unexpected argument {short(plain[len(usage.places)])}"
+        word = plain[len(usage.places)]
+        return f"unexpected argument {short(word)}{_of_numbers(word)}"
     if endless and len(runs) > 1:
-        return f"{short(runs[1])} comes after an option: give all inputs before the options"
+        advice = _of_numbers(runs[1]) or ": give all inputs before the options"
+        return f"{short(runs[1])} comes after an option{advice}"
     found = {*given, *usage.places[: len(plain)]}
     missing = [name if name[0] == "-" else f"the {name}" for name in usage.required if name not in found]
     if not missing:
         return ""
     return f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+
+
+def _of_numbers(word: str) -> str:
+    """Advice where ``word`` is a number: PowerShell makes several words of 1,2,3."""
+    with suppress(ValueError):
+        float(word)
+        return '; numbers with commas are one word, in quotes in PowerShell: "1,2,3"'
+    return ""
 
 
 def in_one_line(text: str) -> str:

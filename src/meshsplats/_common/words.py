@@ -128,10 +128,11 @@ def command_line(words: Iterable[object]) -> str:
 
 def quoted(word: str) -> str:
     """An argument of a command, in quotes where the shell of this system needs them. Those of Windows know no
-    single quotes, and a backslash is part of a path there."""
+    single quotes, and a backslash is part of a path there; in PowerShell, commas make lists, and @ and ~ have
+    meanings at the start of a word."""
     if sys.platform != "win32":
         return shlex.quote(word)
-    if re.fullmatch(r"[\w@+=:,./\\~-]+", word):
+    if re.fullmatch(r"[\w+=:./\\-][\w@+=:./\\~-]*", word):
         return word
     return '"' + re.sub(r"(\\+)$", r"\1\1", word) + '"'
 
