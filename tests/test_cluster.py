@@ -267,7 +267,7 @@ def test_addresses_that_are_refused(monkeypatch):
 
 def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[cluster\]'"):
+    with pytest.raises(MissingDependencyError, match=r'pip install "meshsplats\[cluster\]"'):
         open_workers("local").__enter__()
 
 

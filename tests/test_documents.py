@@ -15,7 +15,6 @@ from meshsplats.cli import COMMANDS
 from meshsplats.cli.arguments import options_of
 from meshsplats.cli.messages import flag
 from meshsplats.cli.train import Train
-from meshsplats.errors import PACKAGE
 from meshsplats.finetuning import cells, journal, pace
 from meshsplats.finetuning.run_files import RunFiles
 from meshsplats.training import run as training
@@ -98,14 +97,21 @@ def test_help_and_page_say_how_many_fans_become_splats():
 
 def test_no_index_is_asked_for_a_package_that_is_on_none(monkeypatch):
     """Where the package is there already, pip adds an extra by its name."""
-    by_name = re.compile(r"pip install '?meshsplats(?!\[)|-env/bin/pip install '?meshsplats")
+    by_name = re.compile(r"""pip install ["']?meshsplats(?!\[)|-env/bin/pip install ["']?meshsplats""")
     for path in [*DOCUMENTS, *(ROOT / "integrations").rglob("*.py")]:
         found = by_name.findall(path.read_text("utf-8"))
         assert len(found) == (path.name == "releasing.md"), path  # after the upload
     monkeypatch.delenv("MESHSPLATS_LIBRARY", raising=False)
     monkeypatch.setattr(library, "available_variants", list)
-    with pytest.raises(ImportError, match=rf"a clone or a wheel \(pip install {PACKAGE}\)"):
+    with pytest.raises(ImportError, match=r"a clone or a wheel \(pip install /path/to/meshsplats\)"):
         library.load_core.__wrapped__()
+
+
+def test_what_pip_installs_is_in_quotes_that_every_shell_takes():
+    """Single ones are part of the name in cmd."""
+    sources = [*(ROOT / "src").rglob("*.py"), *(ROOT / "integrations").rglob("*.py")]
+    single = re.compile(r"pip[\"'f\s]+install[\"f\s]+'[^\s\"]+\[")
+    assert [path for path in [*DOCUMENTS, *sources] if single.search(path.read_text("utf-8"))] == []
 
 
 def long_lines(text: str) -> list[str]:

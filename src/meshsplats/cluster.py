@@ -168,7 +168,7 @@ def _dask() -> Any:
         return importlib.import_module("distributed")
     except ModuleNotFoundError:
         raise MissingDependencyError(
-            "a cluster needs Dask: pip install 'meshsplats[cluster]' (or: pip install distributed)"
+            'a cluster needs Dask: pip install "meshsplats[cluster]" (or: pip install distributed)'
         ) from None
 
 

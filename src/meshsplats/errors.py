@@ -65,9 +65,9 @@ GET_TORCH = (
     "the build for processors will do: pip install torch --index-url https://download.pytorch.org/whl/cpu"
 )
 """For messages: on Linux, torch from most registries comes with gigabytes of CUDA libraries."""
-PACKAGE = "/path/to/meshsplats"
-"""For messages, what pip installs where the package is not installed yet: a clone or a wheel, as it is on no
-index."""
+PACKAGE = r"C:\path\to\meshsplats-...whl" if sys.platform == "win32" else "/path/to/meshsplats"
+"""For messages, what pip installs where the package is not installed yet, as it is on no index: a wheel, or a
+clone, which Visual C++ cannot compile."""
 
 
 class DataWarning(NamingOptions, UserWarning):

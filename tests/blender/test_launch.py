@@ -7,6 +7,8 @@ import errno
 import importlib.util
 import json
 import os
+import re
+import runpy
 import shutil
 import signal
 import stat
@@ -22,9 +24,9 @@ from pathlib import Path
 import pytest
 from _blender_scenes import cameras, random_mesh
 
-from meshsplats import MissingDependencyError, save_mesh
+from meshsplats import MissingDependencyError, errors, save_mesh
 from meshsplats._files.locks import locked
-from meshsplats.blender import BlenderError, SceneOptions, draw, launch
+from meshsplats.blender import BlenderError, SceneOptions, draw, inside, launch
 from meshsplats.cli import main
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes and libraries of Linux")
@@ -48,9 +50,17 @@ def program(tmp_path):
 def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bpy" else real(name))
-    install = r"blender-env/bin/pip install '/path/to/meshsplats\[blender\]'"
-    with pytest.raises(MissingDependencyError, match=rf"{install}.*--executable"):
+    install = r'--executable.*pip install ".*meshsplats.*\[blender\]"'
+    with pytest.raises(MissingDependencyError, match=install):
         draw(random_mesh(3), cameras()[:1], images=["a.png"])
+
+
+def test_missing_bpy_on_windows_is_said_as_its_shells_take_it(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(errors, "PACKAGE", runpy.run_path(errors.__file__)["PACKAGE"])
+    words = runpy.run_path(inside.__file__)["MISSING"]
+    assert r'blender-env\Scripts\pip install "C:\path' in words
+    assert not re.search(r"&&|/bin/|python3|/path| '|clone", words)
 
 
 def test_executable_that_is_not_blender(program, tmp_path):

@@ -342,7 +342,7 @@ def test_doctor(capsys, monkeypatch):
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
     assert f"pip install {quoted('no-such-thing>=1')}\n" in out
-    assert f"from a clone or a wheel: pip install '{PACKAGE}[blender]'\n" in out
+    assert f'from a clone or a wheel: pip install "{PACKAGE}[blender]"\n' in out
     assert "DOES NOT WORK" in out
 
 

@@ -52,7 +52,7 @@ def test_without_wgpu_commands_say_so_before_any_work(tmp_path, capsys, mesh_fil
         ["compare", str(tmp_path / "missing.ply"), mesh_file, "-o", str(tmp_path / "b"), "--device", "gpu"],
     ):
         assert main(command) == 5
-        assert "pip install 'meshsplats[gpu]'" in capsys.readouterr().err
+        assert 'pip install "meshsplats[gpu]"' in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.npz"]
     assert main(["doctor", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["gpu"]

@@ -489,7 +489,7 @@ def test_without_wgpu_there_is_an_error_and_nothing_is_written(scene, tmp_path, 
             "gpu",
         ]
         assert main(words) == 5
-        assert "pip install 'meshsplats[gpu]'" in capsys.readouterr().err
+        assert 'pip install "meshsplats[gpu]"' in capsys.readouterr().err
         assert main([*words, "--tuning.opacity", "cutoff"]) == 2
     finally:
         open_device.cache_clear()

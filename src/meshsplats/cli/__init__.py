@@ -163,7 +163,8 @@ def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
     if len(places) > 1:
         raise UsageError("- is standard input, which can be read once")
     if sys.stdin is None or sys.stdin.isatty():
-        raise UsageError("- reads standard input, a terminal here: redirect a file to it, as by < scene.ply")
+        where = ", in cmd" if sys.platform == "win32" else ""  # PowerShell has no <
+        raise UsageError(f"- reads standard input, a terminal here: redirect a file, < scene.ply{where}")
     import shutil
     import tempfile
 

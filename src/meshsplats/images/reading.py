@@ -246,7 +246,7 @@ def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...
     except ModuleNotFoundError:
         raise MissingDependencyError(
             f"{path}: a HEIF image (.heic), which needs the library pillow-heif: pip install"
-            " 'meshsplats[heic]'; or convert it to JPEG"
+            ' "meshsplats[heic]"; or convert it to JPEG'
         ) from None
     register_heif_opener()
     return (*FORMATS, "HEIF")

@@ -72,7 +72,7 @@ def in_words(findings: dict[str, Any]) -> list[str]:
         advice = f"; to install: pip install {missing}" if missing else ""
         if missing and extra == "blender":
             where = "in an environment of its own with Python 3.11 or 3.13, from a clone or a wheel"
-            advice = f"; to install, {where}: pip install '{PACKAGE}[blender]'"
+            advice = f'; to install, {where}: pip install "{PACKAGE}[blender]"'
         lines.append(f"extra {extra!r}: {_listed(libraries)}{advice}")
     return lines
 

@@ -23,7 +23,7 @@ try:
     import torch
 except ModuleNotFoundError as error:
     raise MissingDependencyError(
-        "meshsplats.rendering.reference_autograd needs torch: pip install 'meshsplats[torch]'"
+        'meshsplats.rendering.reference_autograd needs torch: pip install "meshsplats[torch]"'
     ) from error
 
 from meshsplats.rendering.autograd import Raster

@@ -60,7 +60,7 @@ TRIED = "estimated_from"
 that found no place."""
 FEWEST = 3
 """Photographs that must find their place."""
-NEEDS = "photographs without cameras need the library pycolmap: pip install 'meshsplats[photos]'"
+NEEDS = 'photographs without cameras need the library pycolmap: pip install "meshsplats[photos]"'
 
 
 def bare_photographs(folder: Path) -> list[Path]:

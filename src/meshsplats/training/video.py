@@ -51,7 +51,7 @@ WIDEST = 4
 DEINTERLACER = "estdif"
 """FFmpeg's filter of interlaced frames: of one frame alone, as frames that are taken are far from each
 other."""
-NEEDS = "videos need the library PyAV: pip install 'meshsplats[video]'"
+NEEDS = 'videos need the library PyAV: pip install "meshsplats[video]"'
 
 
 class Frames(NamedTuple):

@@ -10,7 +10,7 @@ from typing import Any
 
 from meshsplats.errors import DeviceError, MissingDependencyError
 
-GET_WGPU = "pip install 'meshsplats[gpu]'"
+GET_WGPU = 'pip install "meshsplats[gpu]"'
 
 BACKENDS = ("Vulkan", "Metal", "D3D12")
 KINDS = ("DiscreteGPU", "IntegratedGPU", "Unknown", "CPU")
