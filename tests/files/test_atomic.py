@@ -1,14 +1,24 @@
 """Files appear whole or not at all."""
 
+import ctypes
 import os
 import stat
 import sys
 import time
+from functools import partial
 
 import pytest
 from _local import make_link
 
-from meshsplats._files.atomic import atomic_path, patiently, refuse_existing, replace_folder, write_bytes
+from meshsplats._files import atomic
+from meshsplats._files.atomic import (
+    atomic_path,
+    patiently,
+    refuse_existing,
+    replace_folder,
+    temporary_beside,
+    write_bytes,
+)
 
 as_root = hasattr(os, "geteuid") and os.geteuid() == 0
 posix = pytest.mark.skipif(sys.platform == "win32", reason="permissions of POSIX")
@@ -102,6 +112,56 @@ def test_a_result_is_kept_beside_a_file_that_another_program_has_open(tmp_path, 
         assert (tmp_path / kept).read_bytes() == kept.encode()
     assert target.read_bytes() == b"old"
     assert sorted(os.listdir(tmp_path)) == ["mesh.glb", "mesh.new.glb", "mesh.new1.glb"]
+
+
+class Windows:
+    """What the kernel of Windows says about a process, and how many handles of it are open."""
+
+    def __init__(self, handle, state=0):
+        self.handle, self.state, self.open, self.asked = handle, state, 0, []
+        self.OpenProcess = partial(self._open)  # takes attributes, as functions of ctypes do
+
+    def _open(self, access, inherit, process):
+        self.open += self.handle is not None
+        self.asked.append((access, inherit, process.value))
+        return self.handle
+
+    def WaitForSingleObject(self, handle, milliseconds):
+        assert (handle.value, milliseconds) == (self.handle, 0)
+        return self.state
+
+    def CloseHandle(self, handle):
+        assert handle.value == self.handle
+        self.open -= 1
+
+
+@pytest.mark.parametrize(
+    ("kernel", "error", "alive"),
+    [
+        (Windows(1 << 40, state=0x102), 0, True),
+        (Windows(1 << 40, state=0), 0, False),  # another program still holds a handle of it
+        (Windows(None), 87, False),
+        (Windows(None), 5, True),  # another user's
+    ],
+)
+def test_processes_of_windows(monkeypatch, kernel, error, alive):
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(ctypes, "WinDLL", lambda name, use_last_error: kernel, raising=False)
+    monkeypatch.setattr(ctypes, "get_last_error", lambda: error, raising=False)
+    monkeypatch.setattr(os, "kill", None)
+    assert atomic._alive(4242) == alive
+    assert kernel.asked == [(0x100000, False, 4242)]
+    assert kernel.open == 0
+
+
+def test_what_killed_processes_of_windows_left_is_removed(tmp_path, monkeypatch):
+    left = temporary_beside(tmp_path / "mesh.glb")
+    left.touch()
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(atomic, "_alive", lambda process: process != os.getpid())
+    monkeypatch.setattr(atomic, "_swept", set())
+    with atomic_path(tmp_path / "a.glb"):
+        assert not left.exists()
 
 
 def _write_and_raise(path, error):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ctypes
 import json
 import math
+import runpy
 import signal
 import struct
 from dataclasses import replace
@@ -18,12 +19,13 @@ import pytest
 
 from meshsplats.cameras.placing import outside_cameras
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.cli import messages
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning import initial, memory
+from meshsplats.finetuning import initial, interruption, memory
 from meshsplats.finetuning.config import PRESETS, FinetuneConfig, is_long, learning_rates, make_config
 from meshsplats.finetuning.initial import (
     boundary_vertices,
@@ -519,6 +521,16 @@ def test_a_lost_terminal_stops_a_run_unless_that_is_ignored(before):
         assert signal.getsignal(signal.SIGHUP) == before
     finally:
         signal.signal(signal.SIGHUP, kept)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="a signal of POSIX stands in for that of Windows")
+def test_ctrl_break_stops_a_run_on_windows(monkeypatch):
+    monkeypatch.setattr(signal, "SIGBREAK", signal.SIGUSR1, raising=False)
+    with runpy.run_path(interruption.__file__)["StopSignals"]() as stop:
+        assert callable(signal.getsignal(signal.SIGUSR1))
+        signal.raise_signal(signal.SIGUSR1)
+        assert stop.received == signal.SIGUSR1
+    assert runpy.run_path(messages.__file__)["ENDINGS"][signal.SIGUSR1] == "ended by SIGBREAK"
 
 
 def test_a_handler_of_a_program_around_python_stays(monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import itertools
 import json
@@ -19,6 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from meshsplats._files import DISK_FULL
 from meshsplats._files.locks import LOCK, locked
@@ -364,7 +366,7 @@ def _machine() -> int:
 
 def _sweep(folder: Path) -> None:
     """Removes the temporary files and locks of killed processes from ``folder``, once for each folder."""
-    if folder in _swept or sys.platform == "win32":  # os.kill(.., 0) ends processes on Windows
+    if folder in _swept:
         return
     _swept.add(folder)
     with suppress(OSError), os.scandir(folder) as entries:
@@ -379,6 +381,9 @@ def _sweep(folder: Path) -> None:
 
 
 def _alive(process: int) -> bool:
+    if sys.platform == "win32":  # os.kill(.., 0) ends processes there
+        kernel32 = ctypes.WinDLL("kernel32", use_last_error=True)
+        return _alive_on_windows(process, kernel32, ctypes.get_last_error)
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -386,3 +391,17 @@ def _alive(process: int) -> bool:
     except (OSError, OverflowError):
         return True
     return True
+
+
+def _alive_on_windows(process: int, kernel32: Any, last_error: Callable[[], int]) -> bool:
+    """As ``_alive``, by the Windows API. Processes of others may not be opened, but are there."""
+    synchronize, invalid_parameter, signalled = 0x100000, 87, 0
+    kernel32.OpenProcess.restype = ctypes.c_void_p
+    handle = kernel32.OpenProcess(synchronize, False, ctypes.c_uint32(process))
+    if not handle:
+        return last_error() != invalid_parameter
+    handle = ctypes.c_void_p(handle)
+    try:
+        return bool(kernel32.WaitForSingleObject(handle, 0) != signalled)  # it is when the process has ended
+    finally:
+        kernel32.CloseHandle(handle)

@@ -95,9 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _signals_raise() -> Iterator[None]:
-    """While the block runs, SIGTERM and SIGHUP raise ``Terminated``, so that unfinished files are removed
-    as after Ctrl-C; once, as another one must not break off the tidying. Signals that are ignored (nohup)
-    stay so."""
+    """While the block runs, SIGTERM and its like raise ``Terminated``, so that unfinished files are removed
+    as after Ctrl-C; once, as another one must not break off the tidying. Ignored signals (nohup) stay so."""
 
     def end(number: int, frame: object) -> None:
         for other in ours:

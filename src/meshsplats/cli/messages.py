@@ -25,7 +25,9 @@ UNREAD = 128 + 13
 KINDS = {FAILED: "input", USAGE: "usage", EXISTS: "exists", NO_SPACE: "space", LACKING: "missing"}
 """Names of the exit codes in JSON."""
 ENDINGS = {signal.SIGINT: "interrupted"} | {
-    getattr(signal, name): f"ended by {name}" for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
+    getattr(signal, name): f"ended by {name}"
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK")
+    if hasattr(signal, name)
 }
 """Message for each signal that ends a command."""
 

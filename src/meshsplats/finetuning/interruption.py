@@ -1,4 +1,5 @@
-"""SIGINT, SIGTERM and SIGHUP, as where a terminal is closed, stop a run after the current step."""
+"""SIGINT, SIGTERM, and SIGHUP, as where a terminal is closed, or SIGBREAK of Windows (Ctrl-Break) stop a run
+after the current step."""
 
 from __future__ import annotations
 
@@ -6,8 +7,8 @@ import signal
 import threading
 from types import TracebackType
 
-_HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)
-"""Not on Windows."""
+_OF_SYSTEM = [getattr(signal, name) for name in ("SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+"""Of POSIX, of Windows."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -27,9 +28,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopSignals:
-    """Context manager that stores the first SIGINT, SIGTERM or SIGHUP in ``received`` instead of ending the
-    process. SIGHUP stays ignored where it is (nohup), and signals stay with the handler of a program around
-    Python, such as Blender.
+    """Context manager that stores the first SIGINT, SIGTERM, SIGHUP or SIGBREAK in ``received`` instead of
+    ending the process. SIGHUP stays ignored where it is (nohup), and signals stay with the handler of a
+    program around Python, such as Blender.
 
     A second SIGINT raises KeyboardInterrupt at once. Outside the main thread, where Python handles no
     signals, it has no effect.
@@ -41,10 +42,8 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
-            numbers = [signal.SIGINT, signal.SIGTERM]
-            if _HANGUP is not None and signal.getsignal(_HANGUP) != signal.SIG_IGN:
-                numbers.append(_HANGUP)
-            for number in numbers:
+            heeded = [number for number in _OF_SYSTEM if signal.getsignal(number) != signal.SIG_IGN]
+            for number in (signal.SIGINT, signal.SIGTERM, *heeded):
                 if signal.getsignal(number) is not None:  # else it could not be put back
                     self._before[number] = signal.signal(number, self._handle)
         return self
