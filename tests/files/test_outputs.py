@@ -562,3 +562,31 @@ def test_a_folder_that_nothing_may_be_written_in_says_why(tmp_path, monkeypatch,
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=flags))
     with pytest.raises(OSError, match=why):
         check_outputs([tmp_path / "a.glb"], False)
+
+
+@pytest.mark.parametrize("error", [PermissionError, FileNotFoundError])
+def test_folders_of_windows_are_tried(tmp_path, monkeypatch, error):
+    """access() knows nothing of the rights of users there."""
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "access", lambda *_: True)
+    check_outputs([tmp_path / "a.glb"], False)
+    assert os.listdir(tmp_path) == []
+    real = os.open
+
+    def refused(path, flags, *mode):
+        if flags & os.O_CREAT:
+            raise error(13, "Access is denied", str(path))
+        return real(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(PermissionError, match="no permission to write in this folder"):
+        check_outputs([tmp_path / "a.glb"], False)
+
+
+def test_a_full_disk_of_windows_is_no_lack_of_permission(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left")
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "open", full)
+    assert atomic.may_write_in(tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sqlite3
 import warnings
@@ -131,7 +130,7 @@ def test_photographs_without_a_camera_in_a_model_are_counted(tmp_path):
 
 def test_a_folder_that_may_not_be_written_says_what_to_do(tmp_path, monkeypatch):
     pictures(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
-    monkeypatch.setattr(os, "access", lambda *given: False)
+    monkeypatch.setattr("meshsplats.training.reconstruction.may_write_in", lambda folder: False)
     with pytest.raises(PermissionError, match="copy the folder to where you may write"):
         find_cameras(tmp_path)
 

@@ -460,7 +460,7 @@ def test_what_is_needed_is_asked_before_the_look_at_a_video(tmp_path, monkeypatc
         patch.setattr("meshsplats.training.reconstruction.find_spec", lambda name: None)
         with pytest.raises(MissingDependencyError, match=r"meshsplats\[photos\]"):
             PhotographOptions().with_cameras(clip, print)
-    monkeypatch.setattr(module.os, "access", lambda *given: False)
+    monkeypatch.setattr(module, "may_write_in", lambda folder: False)
     with pytest.raises(PermissionError, match="no permission to write the frames"):
         photographs_of(clip)
 

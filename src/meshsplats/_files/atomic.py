@@ -199,6 +199,25 @@ def temporary_beside(path: str | os.PathLike[str]) -> Path:
     return target.parent / f".{target.stem[:32]}.{owner}.{secrets.token_hex(8)}{target.suffix[:16]}"
 
 
+def may_write_in(folder: Path) -> bool:
+    """Whether this process has the permission to make files in ``folder``, which exists.
+
+    On Windows access() knows nothing of the rights of users: a file is made, and removed.
+    """
+    if sys.platform != "win32":
+        return os.access(folder, os.W_OK)
+    probe = temporary_beside(folder / "probe")
+    try:
+        os.close(os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+    except (PermissionError, FileNotFoundError):  # the latter by the protection of folders against ransomware
+        return False
+    except OSError:  # a full disk, say: whatever writes will name it
+        return True
+    with suppress(OSError):
+        patiently(probe.unlink)
+    return True
+
+
 def write_bytes(path: str | os.PathLike[str], content: bytes | memoryview) -> None:
     """Writes ``content`` to ``path`` whole or not at all."""
     with atomic_path(path, needs=len(content)) as temporary:

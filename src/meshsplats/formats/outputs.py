@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from meshsplats._files.atomic import refuse_existing
+from meshsplats._files.atomic import may_write_in, refuse_existing
 from meshsplats.errors import (
     DataWarning,
     EarlierRunError,
@@ -208,7 +208,7 @@ def check_outputs(
     for above in filter(None, places):
         if not above.is_dir():
             raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
-        if not os.access(above, os.W_OK):
+        if not may_write_in(above):
             if hasattr(os, "statvfs") and os.statvfs(above).f_flag & os.ST_RDONLY:
                 raise OSError(errno.EROFS, "this folder is on a read-only file system", str(above))
             raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from meshsplats._files.atomic import refuse_existing
+from meshsplats._files.atomic import may_write_in, refuse_existing
 from meshsplats._files.locks import lock_of, locked
 from meshsplats.errors import DataWarning, FileFormatError, OptionsError, OverwritingError
 from meshsplats.formats.mesh_formats import mesh_format_to_write, mesh_suffixes
@@ -47,7 +47,7 @@ class Job:
         """Within the block no other process does this job, unless with ``force``. FileExistsError if one is
         at it."""
         first = self.outputs[0]
-        if force or not os.access(first.absolute().parent, os.W_OK):  # reported with the other errors
+        if force or not may_write_in(first.absolute().parent):  # reported with the other errors
             yield
             return
         with locked(lock_of(first)) as ours:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import signal
 import sqlite3
 import tempfile
@@ -23,7 +22,7 @@ import numpy as np
 from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
 from meshsplats._core.library import thread_count
-from meshsplats._files.atomic import together, write_bytes, write_text
+from meshsplats._files.atomic import may_write_in, together, write_bytes, write_text
 from meshsplats.datasets.image_files import ImageIndex, inside
 from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
@@ -169,7 +168,7 @@ def find_cameras(
         )
     for name in tried:
         inside(folder, name, str(folder))
-    if not os.access(folder, os.W_OK):
+    if not may_write_in(folder):
         raise PermissionError(
             f"{folder}: no permission to write the cameras beside the photographs; copy the folder to where"
             " you may write"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 import time
 import warnings
@@ -18,7 +17,7 @@ import numpy as np
 from meshsplats._common.foreign import VIDEO_SUFFIXES, frames_of, is_a_video
 from meshsplats._common.json_files import read_json
 from meshsplats._common.words import plural
-from meshsplats._files.atomic import patiently, write_json
+from meshsplats._files.atomic import may_write_in, patiently, write_json
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.images.reading import MAX_PIXELS
 from meshsplats.images.writing import save_image
@@ -134,7 +133,7 @@ def save_frames(
     """
     if count is not None and count < 2:
         raise ValueError(f"at least 2 frames are needed, got {count}")
-    if not os.access(folder.parent, os.W_OK):
+    if not may_write_in(folder.parent):
         raise PermissionError(
             f"{folder.parent}: no permission to write the frames there; copy {video.name} to where you may"
         )
