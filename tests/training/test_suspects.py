@@ -71,7 +71,7 @@ def test_the_same_photograph_twice_is_named(photographs, kind):
         camera = replace(camera.within(32), name="copy")
     again = View(camera, ViewImage(np.asarray(picture)))
     found = find_suspects([*photographs, again])
-    assert found == Suspects(doubles=(("004", "copy"),))
+    assert found == Suspects(duplicates=(("004", "copy"),))
     moved = View(camera, ViewImage(np.roll(np.asarray(picture), 1, axis=1)))
     assert find_suspects([*photographs, moved]) == Suspects(), "a neighbour is another photograph"
 
@@ -86,7 +86,7 @@ def test_clear_pixels_do_not_make_neighbours_the_same(photographs):
     ]
     color = views[4].load().color
     copy = replace(views[4], camera=replace(views[4].camera, name="copy"))
-    assert find_suspects([*views, copy]) == Suspects(doubles=(("004", "copy"),))
+    assert find_suspects([*views, copy]) == Suspects(duplicates=(("004", "copy"),))
     neighbour = with_color(copy, np.where(alpha[..., None] > 0, color + 7, color).astype(np.uint8))
     assert find_suspects([*views, neighbour]) == Suspects()
 

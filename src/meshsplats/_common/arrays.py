@@ -35,9 +35,13 @@ def subsample(items: Sequence[T] | np.ndarray, most: int) -> Sequence[T] | np.nd
     return tuple(chosen) if isinstance(items, tuple) else chosen
 
 
-def area_means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """float32 means of ``values`` over ``size`` equal spans along an axis; entries at their borders count by
-    the share that lies in each."""
+def area_means(values: np.ndarray, height: int, width: int) -> np.ndarray:
+    """(height, width, ...) float32 means of ``values`` (h, w, ...) over as many equal areas; entries at their
+    borders count by the share that lies in each."""
+    return _span_means(_span_means(values, height, 0), width, 1)
+
+
+def _span_means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
     before = values.shape[axis]
     edges = np.linspace(0, before, size + 1)
     first = np.minimum(edges[:-1].astype(int), before - 1)

@@ -48,12 +48,12 @@ class Cameras(Command):
 
     def execute(self) -> None:
         from meshsplats._files.atomic import together
-        from meshsplats.cameras.files import model_folder, save_cameras
+        from meshsplats.cameras.files import save_cameras
         from meshsplats.cameras.framing import guess_up
         from meshsplats.formats.outputs import PREVIEW, beside, check_outputs
         from meshsplats.images.writing import save_image
         from meshsplats.scene.gaussians import GaussianCloud
-        from meshsplats.viewpoints.beside import cameras_beside, record_of
+        from meshsplats.viewpoints.beside import cameras_beside, stored_cameras
         from meshsplats.viewpoints.finding import find_cameras
         from meshsplats.viewpoints.sheet import contact_sheet
         from meshsplats.viewpoints.showing import opened_with
@@ -69,7 +69,7 @@ class Cameras(Command):
         up = optional_up(self.up)
         given = cameras_beside(self.input, scene.origin)
         if given is not None:
-            where = record_of(self.input) or model_folder(self.input)
+            where = stored_cameras(self.input)
             say(f"{where} has {len(given)} training cameras, which --cameras {where} takes")
             up = guess_up(scene, given) if up is None else up
         side = self.width, self.width if self.height is None else self.height

@@ -200,10 +200,10 @@ class PhotoLoader:
     renamed: list[str] = field(default_factory=list)
     unclear: list[str] = field(default_factory=list)
     """Masks that may be meant as they are stored or upright: of photographs taken upside down, or square."""
-    _shelf: ImageIndex = field(init=False, repr=False)
+    _index: ImageIndex = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._shelf = ImageIndex(self.folder)
+        self._index = ImageIndex(self.folder)
 
     def views(self, frames: Iterable[Frame], where: str) -> list[PhotoViews]:
         """Cameras and photographs of each frame, in order."""
@@ -267,7 +267,7 @@ class PhotoLoader:
     def alike(self, name: str) -> list[str]:
         """The files in the data set that may be meant by ``name``, which is not there: by its last parts, as
         many as possible, or by the last one in the folder of the images."""
-        return self._shelf.by_last_parts(name, self.images)
+        return self._index.by_last_parts(name, self.images)
 
     def _smaller(self, name: str, where: str, whole: Container[PurePosixPath]) -> Path | None:
         """The copy in ``images_<downscale>/``, if there is one. Folders of photographs that the data set

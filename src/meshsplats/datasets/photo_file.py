@@ -137,6 +137,6 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     result = np.empty((rows, columns, *pixels.shape[2:]), pixels.dtype)
     for channel in np.ndindex(pixels.shape[2:]):  # one at a time: photographs are large
         one = (..., *channel)
-        means = area_means(area_means(pixels[one], rows, 0), columns, 1)
+        means = area_means(pixels[one], rows, columns)
         result[one] = np.rint(means) if pixels.dtype == np.uint8 else means
     return result

@@ -82,7 +82,7 @@ def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
     all pixels that it covers do."""
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return area_means(area_means(values, height, 0), width, 1)
+        return area_means(values, height, width)
 
     unit = np.float32(255 if image.color.dtype == np.uint8 else 1)
     known = image.color if image.mask is None else np.where(image.mask[..., None], image.color, 0)

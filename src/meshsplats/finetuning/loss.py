@@ -60,7 +60,7 @@ class LossWeights(NamedTuple):
 @dataclass(frozen=True)
 class DefaultLoss:
     """The loss that ``FinetuneConfig`` defines, by the compiled core. An engine that has the same sums takes
-    the ``rates`` in its place."""
+    the ``weights`` in its place."""
 
     ssim_weight: float
     l2_weight: float
@@ -70,20 +70,20 @@ class DefaultLoss:
     def of(cls, config: FinetuneConfig, threads: int | None = None) -> DefaultLoss:
         return cls(config.ssim_weight, config.l2_weight, threads)
 
-    def rates(self, target: Target) -> LossWeights:
+    def weights(self, target: Target) -> LossWeights:
         mask, share = target.mask, self.ssim_weight
         count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
         return LossWeights((1 - share) / count, -share / count, self.l2_weight / count, share)
 
     def __call__(self, image: np.ndarray, target: Target, /) -> tuple[float, np.ndarray]:
         mask = target.mask
-        rates = self.rates(target)
+        weights = self.weights(target)
         compared = compare_images(
             image[None],
             target.color[None],
             None if mask is None else mask[None],
-            l1_weight=rates.l1,
-            ssim_weight=rates.ssim,
+            l1_weight=weights.l1,
+            ssim_weight=weights.ssim,
             gradient=True,
             threads=self.threads,
         )
@@ -94,9 +94,9 @@ class DefaultLoss:
             if mask is not None:
                 difference[~mask] = 0  # masked values may be anything
             squares = float(np.square(difference).sum())
-            difference *= np.float32(2 * rates.l2)
+            difference *= np.float32(2 * weights.l2)
             gradient += difference
-        return rates.loss(compared.l1, compared.ssim, squares), gradient
+        return weights.loss(compared.l1, compared.ssim, squares), gradient
 
 
 def loss_name(loss: Loss | None) -> str:

@@ -167,13 +167,13 @@ class _Weighted(torch.autograd.Function):
         x, y = (_batch(tensor, 4) for tensor in (image, target))
         inside = None if mask is None else _batch(mask, 3)
         l1_weight, ssim_weight, constant = weights
-        rates: dict[str, Any] = dict(
+        given: dict[str, Any] = dict(
             l1_weight=l1_weight / count, ssim_weight=ssim_weight / count, threads=threads
         )
         wanted = [needed and gradients for needed in ctx.needs_input_grad[:2]]
-        result = compare_images(x, y, inside, gradient=wanted[0], **rates)
+        result = compare_images(x, y, inside, gradient=wanted[0], **given)
         # Both sums are symmetric, so the gradient of the target is that of the image with both exchanged.
-        other = compare_images(y, x, inside, gradient=True, **rates).gradient if wanted[1] else None
+        other = compare_images(y, x, inside, gradient=True, **given).gradient if wanted[1] else None
         ctx.save_for_backward(
             *(
                 None if gradient is None else torch.from_numpy(gradient).view(image.shape)

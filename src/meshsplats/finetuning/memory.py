@@ -70,9 +70,10 @@ def available_memory(system: Path = Path("/")) -> int | None:
     """Bytes that this process may still allocate, by the system, the container and its Dask worker; None if
     unknown. ``system``: the root of the file system."""
     if sys.platform == "win32":
-        found = _of_windows(ctypes.windll.kernel32)
-        return min(filter(None, [found, memory_of_task()]), default=None)
-    return _of_linux(system)
+        free = _of_windows(ctypes.windll.kernel32)
+    else:
+        free = _of_linux(system)
+    return min((known for known in (free, memory_of_task()) if known is not None), default=None)
 
 
 class _MemoryStatus(ctypes.Structure):
@@ -95,6 +96,7 @@ def _of_windows(kernel32: Any) -> int | None:
 
 
 def _of_linux(system: Path) -> int | None:
+    """Free bytes by the system and by the container."""
     found = []
     try:
         for line in (system / "proc/meminfo").read_text().splitlines():
@@ -115,8 +117,7 @@ def _of_linux(system: Path) -> int | None:
                 found.append(max(int(most) - taken + _counted(file.with_name("memory.stat"), cached), 0))
         except (OSError, ValueError):
             continue
-    of_task = memory_of_task()
-    return min(found if of_task is None else [*found, of_task], default=None)
+    return min(found, default=None)
 
 
 def _counted(statistics: Path, name: str) -> int:

@@ -66,7 +66,6 @@ SAVE_SECONDS = 2e-6
 """Time to write a triangle, to choose its alpha mode and to draw it in the preview, with some to spare."""
 TIMED_SPLATS = 10_000
 """Steps are timed for clouds from this size on."""
-
 FILE_TRIANGLES = 4_000_000
 """Most triangles by default of a file that is tuned in its order: 200 MB, for viewers."""
 

@@ -343,7 +343,7 @@ def _fused_step(
 ) -> float:
     """``make_step`` where the loss and Adam are with the image, too."""
     image = StepImage(view.camera, tape_options(state, target.background, plan), target.color, target.mask)
-    by_sums = loss.rates(target)
+    by_sums = loss.weights(target)
     sums = state.fused_step(steps, image, by_sums, Rates(plan.color_rate, plan.position_rate))
     value = by_sums.loss(*sums[:3])
     if not (np.isfinite(value) and sums.finite):

@@ -90,9 +90,9 @@ def render(
     rule). Triangles are visible from both sides and are clipped at the near plane.
 
     With the order 'splat', whole splats are blended by the depth of their centres, as 3D Gaussian Splatting
-    does. A centre is the mean of the corners of the splat's triangles. At equal
-    depth the splat with the higher index is in front, and within a splat the later triangle: as with the
-    painter's algorithm, back to front, triangles in list order. Depth groups have no effect. This is faster.
+    does. A centre is the mean of the corners of the splat's triangles. At equal depth the splat with the
+    higher index is in front, and within a splat the later triangle: as with the painter's algorithm, back to
+    front, triangles in list order. Depth groups have no effect. This is faster.
 
     A mesh with a low-pass filter of s = ``filter_px2`` is drawn with the fan of each splat widened in screen
     space, as 3D Gaussian Splatting widens splats by 0.3 px^2 at any size of the image. With c and M the mean

@@ -27,7 +27,7 @@ BLURRED = 0.6
 """A photograph is blurred if its edges, across rows or columns, are less steep than usual by this factor, and
 less than in nearly all others: smooth subjects have edges of all kinds."""
 TINY, SMALL = 32, 128
-"""Pixels along the sides of images by which doubles are found, and told from neighbours..."""
+"""Pixels along the sides of images by which duplicates are found, and told from neighbours..."""
 DOUBLE = 0.01
 """... and their root mean square difference below which two photographs are one. Copies that were
 compressed again have 0.003 and 0.005; neighbours in bonsai 0.08, and two of lego's, a third of a degree
@@ -43,7 +43,7 @@ class Suspects:
     """Names of photographs that do harm."""
 
     blurred: tuple[str, ...] = ()
-    doubles: tuple[tuple[str, str], ...] = ()
+    duplicates: tuple[tuple[str, str], ...] = ()
     """Pairs that are the same photograph."""
 
     def messages(self) -> list[str]:
@@ -54,8 +54,8 @@ class Suspects:
                 f"{_photographs(len(self.blurred))} blurred beside the others: {shortened(self.blurred)}."
                 " Without, the mesh may be sharper; held out, they lower the scores"
             )
-        if self.doubles:
-            names = [f"{one} and {other}" for one, other in self.doubles]
+        if self.duplicates:
+            names = [f"{one} and {other}" for one, other in self.duplicates]
             lines.append(
                 f"duplicate photographs: {shortened(names)}. If one is held out, its score means nothing;"
                 " if their cameras differ, one is wrong"

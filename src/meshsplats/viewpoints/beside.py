@@ -32,8 +32,7 @@ def cameras_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0
     A DataWarning says where they cannot be read, and where a record is older than the file: it may be of
     another.
     """
-    record = record_of(source)
-    stored = model_folder(source) if record is None else record
+    record, stored = record_of(source), stored_cameras(source)
     if stored is None:
         return None
     try:
@@ -45,6 +44,11 @@ def cameras_beside(source: Path, origin: Sequence[float] | np.ndarray = (0, 0, 0
     whose = "of the model folder" if record is None else "beside the file"
     warnings.warn(f"{said}; the cameras {whose} are not used", DataWarning, stacklevel=2)
     return None
+
+
+def stored_cameras(source: Path) -> Path | None:
+    """Where ``cameras_beside`` reads: the record, else the model folder of ``source``; None: nowhere."""
+    return record_of(source) or model_folder(source)
 
 
 def record_of(source: Path) -> Path | None:
